@@ -1,0 +1,1 @@
+"""UfM*: how far to trust a monocular depth network, from the disagreement between its views."""

@@ -1,0 +1,122 @@
+"""Pinhole geometry: poses, projection of points and Gaussians, intrinsics under resize and crop.
+
+Camera frame: x right, y down, z forward [m]. Intrinsics are in pixels with the centre of the first
+pixel at (0, 0). Poses are camera-to-world, 4x4 (``T_world_cam``).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Newton-Schulz contracts a deviation e of R^T R from I to about 0.75 e^2: from the tolerated 0.1 five
+# steps reach float64 rounding with two to spare.
+_POLAR_STEPS = 6
+
+
+def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """Points of a depth map, x = ((u-cx)/fx d, (v-cy)/fy d, d) (section "Uncertainty Regression").
+
+    Args:
+        depth: [B, H, W] [m].
+        intrinsics: [B, 3, 3] [px].
+
+    Returns:
+        [B, H, W, 3] points in the camera frame [m].
+    """
+    return rays(depth.shape[-2], depth.shape[-1], intrinsics.to(depth.dtype)) * depth[..., None]
+
+
+def rays(height: int, width: int, intrinsics: Tensor) -> Tensor:
+    """[B, H, W, 3] the ray ((u-cx)/fx, (v-cy)/fy, 1) of every pixel; shapes as in :func:`unproject`."""
+    u = torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device)
+    v = torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device)
+    fx, fy, cx, cy = focal_and_centre(intrinsics)
+    x = ((u - cx[:, None]) / fx[:, None])[:, None, :].expand(-1, height, -1)
+    y = ((v - cy[:, None]) / fy[:, None])[:, :, None].expand(-1, -1, width)
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+
+def focal_and_centre(intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """fx, fy, cx, cy [px], each with the leading dimensions of ``intrinsics`` [..., 3, 3]."""
+    return intrinsics[..., 0, 0], intrinsics[..., 1, 1], intrinsics[..., 0, 2], intrinsics[..., 1, 2]
+
+
+def nearest_rotation(R: Tensor) -> Tensor:
+    """The rotation nearest to an almost orthonormal R [..., 3, 3], in its own dtype (polar factor).
+
+    Newton-Schulz, R <- R (3 I - R^T R) / 2, which needs no decomposition and so no wait for the device;
+    it converges to the polar factor when |R^T R - I| is well below 1, which the callers check.
+    """
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    for _ in range(_POLAR_STEPS):
+        R = R @ (1.5 * eye - 0.5 * R.mT @ R)
+    return R
+
+
+def rotation_deviation(R: Tensor) -> Tensor:
+    """[...] max |R^T R - I| of R [..., 3, 3]: how far R is from a rotation or reflection."""
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    return (R.mT @ R - eye).abs().amax((-2, -1))
+
+
+def invert_rigid(T: Tensor) -> Tensor:
+    """The inverse of rigid transforms [..., 4, 4]."""
+    R_inv = T[..., :3, :3].mT
+    t_inv = -(R_inv @ T[..., :3, 3:])
+    bottom = T[..., 3:, :]
+    return torch.cat([torch.cat([R_inv, t_inv], dim=-1), bottom], dim=-2)
+
+
+def relative_pose(T_world_a: Tensor, T_world_b: Tensor) -> tuple[Tensor, Tensor]:
+    """R_rel [..., 3, 3] and t_rel [..., 3] [m] that take points of camera a into camera b.
+
+    The translations are subtracted first, so that large world coordinates cancel before they are rotated.
+    """
+    R_b_world = T_world_b[..., :3, :3].mT
+    R_rel = R_b_world @ T_world_a[..., :3, :3]
+    t_rel = (R_b_world @ (T_world_a[..., :3, 3:] - T_world_b[..., :3, 3:]))[..., 0]
+    return R_rel, t_rel
+
+
+def project_gaussian(mean_cam: Tensor, covariance_cam: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Gaussians in the image plane (Eq. proj_to_image_plane_mean and _covar).
+
+    Args:
+        mean_cam: [B, K, 3] [m], z > 0 (callers mask what lies behind the near plane).
+        covariance_cam: [B, K, 3, 3] [m^2].
+        intrinsics: [B, 3, 3] [px].
+
+    Returns:
+        mean [B, K, 2] [px] and covariance A Sigma A^T [B, K, 2, 2] [px^2], A the Jacobian of the projection.
+    """
+    fx, fy, cx, cy = (value[:, None] for value in focal_and_centre(intrinsics))
+    x, y, z = mean_cam.unbind(-1)
+    mean = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    zero = torch.zeros_like(z)
+    A = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], dim=-1).unflatten(-1, (2, 3))
+    return mean, A @ covariance_cam @ A.mT
+
+
+def resize_intrinsics(intrinsics: Tensor, old: tuple[int, int], new: tuple[int, int]) -> Tensor:
+    """Intrinsics [..., 3, 3] after an image of ``old`` (H, W) was resized to ``new`` (H, W).
+
+    Resizing keeps the image's borders, which lie half a pixel outside the first pixel's centre at
+    (0, 0): u' + 1/2 = s (u + 1/2), so c' = s (c + 1/2) - 1/2 and f' = s f, as OpenCV, Pillow and
+    ``interpolate(align_corners=False)`` resample.
+
+    Raises:
+        ValueError: a size is not positive.
+    """
+    if min(*old, *new) <= 0:
+        raise ValueError(f"old and new must be positive sizes (H, W), got {old} and {new}")
+    sy, sx = new[0] / old[0], new[1] / old[1]
+    scale = intrinsics.new_tensor([[sx, sx, sx], [sy, sy, sy], [1.0, 1.0, 1.0]])
+    shift = intrinsics.new_tensor([[0.0, 0.0, (sx - 1) / 2], [0.0, 0.0, (sy - 1) / 2], [0.0, 0.0, 0.0]])
+    return intrinsics * scale + shift
+
+
+def crop_intrinsics(intrinsics: Tensor, top: int, left: int) -> Tensor:
+    """Intrinsics [..., 3, 3] after ``top`` rows and ``left`` columns [px] were cut off (negative: padded)."""
+    shift = intrinsics.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    return intrinsics - shift

@@ -1,0 +1,184 @@
+"""Settings of UfM*: frozen, checked, each with its symbol, unit, default and range.
+
+The metadata of a field carries what a reader of the paper wants to know: ``symbol`` (the paper's
+letter), ``unit`` and ``range``. Every value is checked when the config is made; an unknown name is a
+``TypeError`` as for any dataclass, an impossible value a ``ValueError`` that names the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+
+def _number(
+    default: float, symbol: str, unit: str, low: float, high: float = math.inf, *, open_low: bool = False
+) -> Any:
+    """A numeric field with its allowed range [low, high] (or (low, high] with ``open_low``)."""
+    range_ = (low, high, open_low)
+    return field(default=default, metadata={"symbol": symbol, "unit": unit, "range": range_})
+
+
+def _choice(default: str, *others: str) -> Any:
+    """A field that takes one of a few words."""
+    return field(default=default, metadata={"choices": (default, *others)})
+
+
+def _check_number(owner: str, name: str, value: object, range_: tuple[float, float, bool]) -> None:
+    low, high, open_low = range_
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise ValueError(f"{owner}.{name} must be a number, got {value!r}")
+    if value < low or value > high or (open_low and value == low):
+        raise ValueError(f"{owner}.{name} must lie in {'(' if open_low else '['}{low}, {high}], got {value!r}")
+
+
+class _Checked:
+    """What every config shares: value checks, and a dict form that refuses unknown keys."""
+
+    def __post_init__(self) -> None:
+        owner = type(self).__name__
+        for f in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, f.name)
+            if "range" in f.metadata and not (value is None and f.metadata.get("optional")):
+                _check_number(owner, f.name, value, f.metadata["range"])
+                if isinstance(f.default, int) and not isinstance(value, int):
+                    raise ValueError(f"{owner}.{f.name} must be a whole number, got {value!r}")
+            if "choices" in f.metadata and value not in f.metadata["choices"]:
+                raise ValueError(f"{owner}.{f.name} must be one of {f.metadata['choices']}, got {value!r}")
+            if isinstance(f.default, bool) and not isinstance(value, bool):
+                raise ValueError(f"{owner}.{f.name} must be True or False, got {value!r}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The config as plain nested values, ready for JSON."""
+        return asdict(self)  # type: ignore[call-overload]
+
+
+@dataclass(frozen=True)
+class SPGFConfig(_Checked):
+    """Single Pass Gaussian Fitting (section "3D Gaussian segmentation"; Li et al., ICRA 2022).
+
+    Lengths are metres. Thresholds in pixels, and ``adaptive_thresh_scale``, which multiplies 1/f,
+    are stated for an image of ``reference_size`` seen with ``reference_focal``; with
+    ``scale_with_image`` they follow the image they are applied to (see :meth:`scaled_to`).
+    """
+
+    adaptive_thresh_scale: float = _number(2.4, "a", "px/m", 0.0, open_low=True)
+    noise_floor: float = _number(0.08, "noise_floor", "m", 0.0, open_low=True)
+    noise_thresh: float = _number(0.2, "noise_thresh", "m", 0.0, open_low=True)
+    line_thresh: float = _number(0.3, "line_t", "m", 0.0, open_low=True)
+    occlusion_gap: int = _number(10, "occ_x", "px", 1)
+    n_check: int = _number(16, "n_check", "px", 1)
+    max_open: int = _number(2, "max_open", "segments", 1, 8)
+    angle_cosine: float = _number(0.5, "angle", "1", 0.0, 1.0)
+    sparse: int = _number(5, "sparse", "px", 0)
+    min_gaussian_length: float = _number(0.5, "L0", "m", 0.0, open_low=True)
+    frame_max_scale: float = _number(4.0, "frame_max_scale", "1", 1.0)
+    max_depth: float = _number(20.0, "max_depth", "m", 0.0, open_low=True)
+
+    min_pixels: int = _number(200, "min_pixels", "px", 1)
+    min_rows: int = _number(16, "min_rows", "segments", 1)
+    prune: str = _choice("both", "either", "none")
+
+    scale_with_image: bool = True
+    reference_focal: float = _number(525.0, "f_ref", "px", 0.0, open_low=True)
+    reference_height: int = _number(480, "H_ref", "px", 1)
+    reference_width: int = _number(640, "W_ref", "px", 1)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.noise_thresh < self.noise_floor or self.line_thresh < self.noise_floor:
+            raise ValueError(
+                "SPGFConfig.noise_thresh and .line_thresh are upper clamps and must not lie below "
+                f".noise_floor = {self.noise_floor}, got {self.noise_thresh} and {self.line_thresh}"
+            )
+
+    def scaled_to(self, height: int, width: int) -> SPGFConfig:
+        """The same thresholds for an image of height x width: counts of pixels along a row follow the
+        width, rows the height, areas the area. Off (``scale_with_image=False``): returned as it is.
+
+        ``adaptive_thresh_scale`` is not touched here, it follows the focal length (:meth:`slope`).
+        """
+        if not self.scale_with_image:
+            return self
+        across, down = width / self.reference_width, height / self.reference_height
+        return replace(
+            self,
+            occlusion_gap=max(1, round(self.occlusion_gap * across)),
+            n_check=max(1, round(self.n_check * across)),
+            sparse=round(self.sparse * across),
+            min_pixels=max(1, round(self.min_pixels * across * down)),
+            min_rows=max(1, round(self.min_rows * down)),
+            reference_height=height,
+            reference_width=width,
+        )
+
+    def slope(self, focal: Any) -> Any:
+        """a/f [1/m], the factor of z^2 in t = a z^2 / f, for f = min(fx, fy) [px] (a number or a tensor).
+
+        Scaling a by f/f_ref keeps the metric thresholds when an image is resized, so the quotient
+        is then a/f_ref whatever the image.
+        """
+        scale = focal / self.reference_focal if self.scale_with_image else 1.0
+        return self.adaptive_thresh_scale * scale / focal
+
+
+@dataclass(frozen=True)
+class UfMStarConfig(_Checked):
+    """Everything UfM* can be told. The defaults are the paper's unless a comment says otherwise."""
+
+    segment: SPGFConfig = field(default_factory=SPGFConfig)
+
+    # Correspondence (section "Multiview Gaussian Correspondence")
+    eta: float = _number(0.5, "eta", "1", 0.0, 1.0, open_low=True)
+    eta_occlusion: float = _number(0.7, "eta_occl", "1", 0.0, 1.0, open_low=True)
+    near_plane: float = _number(0.05, "z_near", "m", 0.0, open_low=True)
+
+    # Fusion (section "Multiview Fusion")
+    overlap_weighted: bool = False
+
+    # Regression (section "Uncertainty Regression")
+    prior_weight: float = _number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
+    prior_mean: float = _number(0.0, "mu_0", "m^2", 0.0)
+    regression: str = _choice("exact", "neighbourhood")
+    near_radius: float = _number(0.1, "r", "m", 0.0, open_low=True)
+    far_radius: float = _number(0.5, "R", "m", 0.0, open_low=True)
+    neighbourhood_sigmas: float = _number(2.0, "s", "1", 0.0, open_low=True)
+    ema_alpha: float = _number(0.5, "alpha", "1", 0.0, 1.0, open_low=True)
+    variance_floor: float = _number(0.0, "v_min", "m^2", 0.0)
+    add_aleatoric: bool = True
+    add_epistemic: bool = True
+
+    # State
+    features: int = _number(0, "dim H - 1", "1", 0)
+    initial_capacity: int = _number(256, "K_0", "components", 1)
+    max_components: int | None = field(
+        default=None, metadata={"symbol": "K_max", "unit": "components", "range": (1, math.inf, False), "optional": True}
+    )
+
+    # Input checks and speed
+    rotation_tolerance: float = _number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
+    on_bad_pose: str = _choice("raise", "skip")
+    backend: str = _choice("auto", "torch", "numba")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.segment, SPGFConfig):
+            raise ValueError(f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}")
+        if self.far_radius < self.near_radius:
+            raise ValueError(
+                f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"
+            )
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> UfMStarConfig:
+        """Rebuild a config from :meth:`to_dict`; an unknown key is a ``TypeError``."""
+        plain = dict(values)
+        if isinstance(plain.get("segment"), Mapping):
+            plain["segment"] = SPGFConfig(**plain["segment"])
+        return cls(**plain)
+
+    def replace(self, **changes: Any) -> UfMStarConfig:
+        """A copy with some fields changed, checked again."""
+        return replace(self, **changes)

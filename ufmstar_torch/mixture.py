@@ -1,0 +1,114 @@
+"""The Gaussian mixture over geometry X and disagreement H (section "Gaussian mixture model for geometry
+and uncertainty"): B independent streams of K slots, padded and masked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class GaussianMixture:
+    """B unnormalised mixtures of at most K components. A slot of weight 0 is empty and holds zeros.
+
+    Attributes:
+        mean: [B, K, 3] mu_X [m], in the frame that the owner states (``mean_cam``, first camera, ...).
+        covariance: [B, K, 3, 3] Sigma_XX [m^2], symmetric.
+        weight: [B, K] pi, the number of pixels observed so far [px]; 0 = empty slot.
+        disagreement: [B, K] m, the running squared 2-Wasserstein distance [m^2].
+        count: [B, K] number of observations fused into the component (1 when appended), int64.
+        features: [B, K, F] further entries of H, running averages in the caller's units.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    weight: Tensor
+    disagreement: Tensor
+    count: Tensor
+    features: Tensor
+
+    @classmethod
+    def empty(
+        cls, streams: int, capacity: int, *, features: int = 0, dtype: torch.dtype, device: torch.device | str
+    ) -> GaussianMixture:
+        """A mixture of empty slots."""
+
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(streams, capacity, *shape, dtype=dtype, device=device)
+
+        count = torch.zeros(streams, capacity, dtype=torch.int64, device=device)
+        return cls(zeros(3), zeros(3, 3), zeros(), zeros(), count, zeros(features))
+
+    @property
+    def streams(self) -> int:
+        """B."""
+        return self.mean.shape[0]
+
+    @property
+    def capacity(self) -> int:
+        """K, occupied or not."""
+        return self.mean.shape[1]
+
+    @property
+    def valid(self) -> Tensor:
+        """[B, K] True where a slot is occupied."""
+        return self.weight > 0
+
+    @property
+    def components(self) -> Tensor:
+        """[B] number of occupied slots, int64."""
+        return self.valid.sum(-1)
+
+    def bytes_per_component(self) -> int:
+        """Memory of one slot [bytes]."""
+        return sum(v[:1, :1].nelement() * v.element_size() for v in self.tensors().values())
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The fields by name, without copying."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def replace(self, **changes: Tensor) -> GaussianMixture:
+        """A copy with some fields exchanged."""
+        return GaussianMixture(**{**self.tensors(), **changes})
+
+    def to(self, *args: Any, **kwargs: Any) -> GaussianMixture:
+        """``Tensor.to`` on every field; ``count`` keeps its integer type."""
+        moved = {name: value.to(*args, **kwargs) for name, value in self.tensors().items()}
+        moved["count"] = moved["count"].to(torch.int64)
+        return GaussianMixture(**moved)
+
+    def rigid(self, R: Tensor, t: Tensor) -> GaussianMixture:
+        """The mixture in another frame (section "Projection to the Image Plane", step 1).
+
+        mu <- R mu + t, Sigma <- R Sigma R^T; empty slots stay zero.
+
+        Args:
+            R: [B, 3, 3] rotation from the present frame into the new one.
+            t: [B, 3] translation [m].
+        """
+        mean = torch.einsum("bij,bkj->bki", R, self.mean) + t[:, None]
+        covariance = torch.einsum("bij,bkjl,bml->bkim", R, self.covariance, R)
+        return self.replace(mean=torch.where(self.valid[..., None], mean, torch.zeros_like(mean)), covariance=covariance)
+
+    def padded(self, capacity: int) -> GaussianMixture:
+        """The same mixture with at least ``capacity`` slots, new ones empty."""
+        missing = capacity - self.capacity
+        if missing <= 0:
+            return self
+
+        def pad(value: Tensor) -> Tensor:
+            return torch.cat([value, value.new_zeros(value.shape[0], missing, *value.shape[2:])], dim=1)
+
+        return GaussianMixture(**{name: pad(value) for name, value in self.tensors().items()})
+
+    def __post_init__(self) -> None:
+        b, k = self.weight.shape
+        expected = {"mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k)}
+        for name, shape in expected.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}")
+        if self.features.shape[:2] != (b, k) or self.features.dim() != 3:
+            raise ValueError(f"features must have shape ({b}, {k}, F), got {tuple(self.features.shape)}")
