@@ -1,0 +1,21 @@
+"""Where the tests find the shared material (real sequences, weights, reference partitions)."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2] / "shared"
+
+
+def require_shared(relative: str) -> Path:
+    """The path of shared material; skips where it is missing, fails where it must not be (CI)."""
+    path = ROOT / relative
+    if not path.exists():
+        reason = f"needs the shared material {relative}, which lies beside the project in its own checkout only"
+        if os.environ.get("CI"):
+            pytest.fail(f"CI must have it: {reason}")
+        pytest.skip(reason)
+    return path
