@@ -1,0 +1,85 @@
+"""Step 3, multiview Gaussian correspondence: which components of the mixture the new ones should equal.
+
+Section "Multiview Gaussian Correspondence". The paper queries an R-tree for candidates; here the whole
+C x K overlap matrix is formed, which finds the same pairs: the tree only spares work on those with no overlap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.camera import project_gaussian
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.gaussian import PIXEL_VARIANCE, bhattacharyya
+from ufmstar_torch.mixture import GaussianMixture
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """Pairs of current (c) and previous (k) components.
+
+    Attributes:
+        match: [B, C, K] True where k is in the correspondence set F_c after the occlusion filter.
+        overlap: [B, C, K] Bhattacharyya coefficient beta_ck, 0 where c or k is no candidate.
+    """
+
+    match: Tensor
+    overlap: Tensor
+
+
+def correspond(
+    previous_cam: GaussianMixture,
+    current_cam: GaussianMixture,
+    intrinsics: Tensor,
+    size: tuple[int, int],
+    config: UfMStarConfig,
+) -> Correspondence:
+    """Match the current image's Gaussians with those of earlier views in the image plane.
+
+    A component is a candidate where its mean lies beyond ``config.near_plane`` and projects inside the
+    image. k corresponds to c when beta_ck >= eta, unless another member k' of c's set is nearer
+    (smaller depth of the mean) and overlaps k by more than eta_occl: then k is hidden. All hidden
+    members go at once, so the result depends on no order; a hidden member hides others still, as its
+    surface would. Many c may share one k and the other way round.
+
+    Args:
+        previous_cam: M_(i-1) in the current camera frame, [B, K].
+        current_cam: C_i in the current camera frame, [B, C].
+        intrinsics: [B, 3, 3] [px].
+        size: image height and width [px].
+        config: eta, eta_occlusion, near_plane.
+    """
+    dtype = torch.float64
+    seen_k, mean_k, cov_k = _candidates(previous_cam, intrinsics.to(dtype), size, config.near_plane)
+    seen_c, mean_c, cov_c = _candidates(current_cam, intrinsics.to(dtype), size, config.near_plane)
+    overlap = bhattacharyya(mean_c[:, :, None], cov_c[:, :, None], mean_k[:, None], cov_k[:, None])
+    overlap = overlap * (seen_c[:, :, None] & seen_k[:, None])
+    match = overlap >= config.eta
+    return Correspondence(match & ~_hidden(match, mean_k, cov_k, previous_cam.mean[..., 2], config), overlap)
+
+
+def _hidden(match: Tensor, mean: Tensor, covariance: Tensor, depth: Tensor, config: UfMStarConfig) -> Tensor:
+    """[B, C, K] True where a nearer member of the same set covers k."""
+    mutual = bhattacharyya(mean[:, :, None], covariance[:, :, None], mean[:, None], covariance[:, None])
+    hides = (mutual > config.eta_occlusion) & (depth[:, None, :] < depth[:, :, None])  # [B, k, k'] k' hides k
+    # Counts of hiding members, as a product of 0/1 matrices in float32: exact up to 2^24 of them.
+    return match.float() @ hides.float().mT > 0.5
+
+
+def _candidates(
+    mixture_cam: GaussianMixture, intrinsics: Tensor, size: tuple[int, int], near_plane: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mask [B, K], image-plane mean [B, K, 2] and covariance [B, K, 2, 2]; harmless values where masked."""
+    height, width = size
+    mean_cam = mixture_cam.mean.to(intrinsics.dtype)
+    in_front = mixture_cam.valid & (mean_cam[..., 2] > near_plane)
+    ahead = mean_cam.new_tensor([0.0, 0.0, 1.0])
+    safe_mean = torch.where(in_front[..., None], mean_cam, ahead)
+    mean, covariance = project_gaussian(safe_mean, mixture_cam.covariance.to(intrinsics.dtype), intrinsics)
+    eye = torch.eye(2, dtype=intrinsics.dtype, device=intrinsics.device)
+    u, v = mean.unbind(-1)
+    inside = (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+    return in_front & inside, mean, covariance + PIXEL_VARIANCE * eye

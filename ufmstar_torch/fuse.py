@@ -1,0 +1,117 @@
+"""Step 4, multiview fusion: measure the disagreement of matched Gaussians and fold it into the mixture.
+
+Section "Multiview Fusion". Both mixtures must be in one frame; distances are rigid invariants, so any
+frame serves. Everything is computed in float64 and stored in the mixture's dtype.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.correspond import Correspondence
+from ufmstar_torch.gaussian import geodesic
+from ufmstar_torch.mixture import GaussianMixture
+
+
+def fuse(
+    mixture: GaussianMixture,
+    current: GaussianMixture,
+    pairs: Correspondence,
+    config: UfMStarConfig,
+    *,
+    rounds: int | None = None,
+) -> GaussianMixture:
+    """Fuse every matched pair into the mixture.
+
+    For each k the matched c are applied one after the other in increasing index (SPGF's emission order);
+    different k are independent. With pi_c (times beta_ck if ``config.overlap_weighted``) and
+    lambda = pi_c / (pi_k + pi_c): m_k <- (1-lambda) m_k + lambda W2^2(G_k, G_c), features likewise, mean and
+    covariance move by lambda along the optimal-transport geodesic, pi_k <- pi_k + pi_c.
+    A c that matches several k is fused into each of them in full.
+
+    Args:
+        mixture: M_(i-1), [B, K].
+        current: C_i, [B, C].
+        pairs: their correspondence.
+        rounds: upper bound on the matches of any one k; None reads it (waits for an accelerator).
+
+    Returns:
+        The updated mixture, [B, K]; components without a match are unchanged to the last bit.
+    """
+    order = pairs.match.cumsum(dim=1)  # 1-based position of c among the matches of k
+    if rounds is None:
+        rounds = int(order[:, -1:].max()) if order.numel() else 0
+    for position in range(1, rounds + 1):
+        turn = pairs.match & (order == position)  # [B, C, K], at most one c for every k
+        mixture = _fuse_one_each(mixture, current, turn, pairs.overlap, config)
+    return mixture
+
+
+def _fuse_one_each(
+    mixture: GaussianMixture, current: GaussianMixture, turn: Tensor, overlap: Tensor, config: UfMStarConfig
+) -> GaussianMixture:
+    """Fuse at most one c into every k."""
+    dtype = torch.float64
+    used = turn.any(dim=1)
+    c = turn.to(torch.uint8).argmax(dim=1)  # [B, K]
+
+    def of_c(value: Tensor) -> Tensor:
+        index = c.view(*c.shape, *[1] * (value.dim() - 2)).expand(*c.shape, *value.shape[2:])
+        return torch.gather(value, 1, index).to(dtype)
+
+    pi_c, pi_k = of_c(current.weight), mixture.weight.to(dtype)
+    if config.overlap_weighted:
+        pi_c = pi_c * torch.gather(overlap, 1, c[:, None])[:, 0].to(dtype)
+    lam = torch.where(used, pi_c / (pi_k + pi_c).clamp_min(torch.finfo(dtype).tiny), torch.zeros_like(pi_c))
+
+    # Empty slots take part with unit covariances, so that no branch divides by zero; `used` discards them.
+    eye = torch.eye(3, dtype=dtype, device=c.device)
+    cov_k = torch.where(used[..., None, None], mixture.covariance.to(dtype), eye)
+    cov_c = torch.where(used[..., None, None], of_c(current.covariance), eye)
+    mean, covariance, distance = geodesic(mixture.mean.to(dtype), cov_k, of_c(current.mean), cov_c, lam)
+
+    def average(old: Tensor, new: Tensor, share: Tensor) -> Tensor:
+        return (1 - share) * old.to(dtype) + share * new
+
+    updated = {
+        "mean": mean,
+        "covariance": covariance,
+        "weight": pi_k + pi_c,
+        "disagreement": average(mixture.disagreement, distance, lam),
+        "count": mixture.count + 1,
+        "features": average(mixture.features, of_c(current.features), lam[..., None]),
+    }
+    return mixture.replace(**{name: _where(used, value, getattr(mixture, name)) for name, value in updated.items()})
+
+
+def _where(used: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    return torch.where(used.view(*used.shape, *[1] * (old.dim() - 2)), new.to(old.dtype), old)
+
+
+def append(mixture: GaussianMixture, current: GaussianMixture, new: Tensor) -> tuple[GaussianMixture, Tensor]:
+    """Add first observations to the mixture, M_i <- M_(i-1) with G_c: m = 0, count = 1.
+
+    Occupied slots are the first ones; the new components follow in increasing c.
+
+    Args:
+        new: [B, C] True where c is to be added.
+
+    Returns:
+        The mixture [B, K] and the number of components per stream [B] that found no free slot.
+    """
+    b, capacity = mixture.weight.shape
+    slot = mixture.components[:, None] + new.cumsum(dim=1) - 1
+    fits = new & (slot < capacity)
+    slot = torch.where(fits, slot, torch.full_like(slot, capacity))  # one slot more catches what is not added
+
+    def place(old: Tensor, value: Tensor) -> Tensor:
+        room = torch.cat([old, old.new_zeros(b, 1, *old.shape[2:])], dim=1)
+        index = slot.view(*slot.shape, *[1] * (old.dim() - 2)).expand(*slot.shape, *old.shape[2:])
+        return room.scatter(1, index, value.to(old.dtype))[:, :capacity]
+
+    placed = {name: place(old, getattr(current, name)) for name, old in mixture.tensors().items()}
+    placed["disagreement"] = place(mixture.disagreement, torch.zeros_like(current.disagreement))
+    placed["count"] = place(mixture.count, torch.ones_like(current.count))
+    return GaussianMixture(**placed), (new & ~fits).sum(dim=1)

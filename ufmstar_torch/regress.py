@@ -1,0 +1,150 @@
+"""Step 5, uncertainty regression: Gaussian mixture regression of the disagreement at any 3D point.
+
+Section "Uncertainty Regression". H is constant within a component, so the conditional mean is the
+average of m_k with weights w_k(x), a weak prior (pi_0, mu_0) taking over where no component explains x.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.camera import unproject
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.gaussian import cholesky3, inverse_lower3
+from ufmstar_torch.mixture import GaussianMixture
+
+# Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32.
+_CHUNK = 2**22
+
+
+@dataclass(frozen=True)
+class Regression:
+    """E[H | X = x] at P points.
+
+    Attributes:
+        disagreement: [B, P] m_hat(x) [m^2].
+        features: [B, P, F] the further entries of H; the prior's are 0.
+    """
+
+    disagreement: Tensor
+    features: Tensor
+
+
+def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Regression:
+    """Gaussian mixture regression, the exact sum over all components or the paper's neighbourhood.
+
+    m_hat(x) = (sum_k pi_k N(x; mu_k, Sigma_k) m_k + pi_0 mu_0) / (sum_k pi_k N(x; mu_k, Sigma_k) + pi_0).
+    With ``config.regression == "neighbourhood"`` only components near x take part: those whose
+    axis-aligned box of ``neighbourhood_sigmas`` standard deviations comes within ``near_radius`` of x
+    on every axis, or, where there are none, within ``far_radius``; none at all leaves the prior.
+
+    Args:
+        mixture: [B, K], covariances positive definite.
+        points: [B, P, 3] [m], in the mixture's frame; not finite points give NaN.
+        config: prior_weight, prior_mean, regression and its radii.
+
+    Returns:
+        The conditional mean at every point, in the dtype of ``points``; exactly the prior far from
+        every component.
+    """
+    dtype = points.dtype
+    whitening, log_peak = _densities(mixture, dtype)
+    per_chunk = max(1, _CHUNK // max(1, mixture.streams * mixture.capacity))
+    parts = [_chunk(mixture, whitening, log_peak, x, config) for x in points.split(per_chunk, dim=1)]
+    if not parts:
+        parts = [_chunk(mixture, whitening, log_peak, points, config)]
+    return Regression(torch.cat([p.disagreement for p in parts], 1), torch.cat([p.features for p in parts], 1))
+
+
+def regress_image(
+    mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig
+) -> Regression:
+    """:func:`regress` at every pixel of a depth map: disagreement [B, H, W], features [B, H, W, F].
+
+    Args:
+        mixture_cam: [B, K] in the camera frame.
+        depth: [B, H, W] [m]; pixels that are not finite give NaN.
+        intrinsics: [B, 3, 3] [px].
+    """
+    b, height, width = depth.shape
+    result = regress(mixture_cam, unproject(depth, intrinsics).flatten(1, 2), config)
+    shape = (b, height, width)
+    return Regression(result.disagreement.view(shape), result.features.view(*shape, -1))
+
+
+def _densities(mixture: GaussianMixture, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Inverse Cholesky factors [B, K, 3, 3] and log(pi_k N(mu_k; mu_k, Sigma_k)) [B, K], -inf for empty slots."""
+    valid = mixture.valid
+    eye = torch.eye(3, dtype=torch.float64, device=valid.device)
+    L_inv = inverse_lower3(cholesky3(torch.where(valid[..., None, None], mixture.covariance.double(), eye)))
+    log_det = torch.diagonal(L_inv, dim1=-2, dim2=-1).log().sum(-1)
+    weight = torch.where(valid, mixture.weight.double(), torch.ones_like(log_det))
+    log_peak = weight.log() - 1.5 * math.log(2 * math.pi) + log_det
+    return L_inv.to(dtype), torch.where(valid, log_peak, torch.full_like(log_peak, -math.inf)).to(dtype)
+
+
+def _chunk(
+    mixture: GaussianMixture, whitening: Tensor, log_peak: Tensor, points: Tensor, config: UfMStarConfig
+) -> Regression:
+    dtype = points.dtype
+    offset = points[:, :, None] - mixture.mean.to(dtype)[:, None]  # [B, P, K, 3]
+    dx, dy, dz = offset.unbind(-1)
+    squared = torch.zeros_like(dx)
+    for row in range(3):
+        L = whitening[:, None, :, row]
+        squared = squared + (L[..., 0] * dx + L[..., 1] * dy + L[..., 2] * dz) ** 2
+    density = torch.exp(log_peak[:, None] - 0.5 * squared)
+    if config.regression == "neighbourhood":
+        density = density * _near(mixture, offset, config)
+    evidence = density.sum(-1) + config.prior_weight
+    weighted = torch.einsum("bpk,bk->bp", density, mixture.disagreement.to(dtype))
+    disagreement = (weighted + config.prior_weight * config.prior_mean) / evidence
+    features = torch.einsum("bpk,bkf->bpf", density, mixture.features.to(dtype)) / evidence[..., None]
+    return Regression(disagreement, features)
+
+
+def _near(mixture: GaussianMixture, offset: Tensor, config: UfMStarConfig) -> Tensor:
+    """[B, P, K] True where component k is in the neighbourhood of the point."""
+    sigma = torch.diagonal(mixture.covariance, dim1=-2, dim2=-1).sqrt().to(offset.dtype)
+    gap = (offset.abs() - config.neighbourhood_sigmas * sigma[:, None]).amax(-1)
+    gap = torch.where(mixture.valid[:, None], gap, torch.full_like(gap, math.inf))
+    near = gap <= config.near_radius
+    return torch.where(near.any(-1, keepdim=True), near, gap <= config.far_radius)
+
+
+def smooth(previous: Tensor | None, current: Tensor, alpha: float) -> Tensor:
+    """Exponential moving average of the dense map, M_i <- (1-alpha) M_(i-1) + alpha M_i.
+
+    NaN marks a pixel without a value: where only one of the two maps has one, that one is kept.
+
+    Args:
+        previous: [B, H, W] [m^2] or None at the first frame.
+        current: [B, H, W] [m^2].
+        alpha: in (0, 1]; 1 switches the average off.
+    """
+    if previous is None or alpha == 1.0:
+        return current
+    mixed = (1 - alpha) * previous + alpha * current
+    return torch.where(current.isnan(), previous, torch.where(previous.isnan(), current, mixed))
+
+
+def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """A uniform sample of the valid pixels of each image, without replacement.
+
+    Args:
+        valid: [B, H, W] bool.
+        count: pixels per image, 1 <= count <= H W.
+        seed: of the random numbers, drawn on the CPU so that every device samples alike.
+
+    Returns:
+        index [B, count] into the flattened image and used [B, count]; fewer than ``count`` valid pixels
+        leave the rest of ``used`` False.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    keys = torch.rand(valid.shape, generator=generator).to(valid.device)
+    score, index = torch.where(valid, keys, torch.full_like(keys, -1.0)).flatten(1).topk(count, dim=1)
+    return index, score >= 0
