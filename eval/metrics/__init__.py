@@ -1,0 +1,42 @@
+"""Streaming metrics (section "Metrics for Uncertainty"): sums only, so that memory does not grow with frames.
+
+The names below load torchmetrics (seconds) when they are first used, not when this package is imported.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.metrics.accuracy import RMSE as RMSE
+    from ufmstar_torch.eval.metrics.accuracy import AbsRel as AbsRel
+    from ufmstar_torch.eval.metrics.accuracy import Delta1 as Delta1
+    from ufmstar_torch.eval.metrics.calibration import ECEDelta as ECEDelta
+    from ufmstar_torch.eval.metrics.calibration import ECEQuantile as ECEQuantile
+    from ufmstar_torch.eval.metrics.likelihood import NLL as NLL
+    from ufmstar_torch.eval.metrics.likelihood import EntropyHistogram as EntropyHistogram
+    from ufmstar_torch.eval.metrics.sequence import SequenceMetrics as SequenceMetrics
+    from ufmstar_torch.eval.metrics.sequence import mean_and_ci as mean_and_ci
+
+_HOME = {
+    "AbsRel": "accuracy",
+    "Delta1": "accuracy",
+    "ECEDelta": "calibration",
+    "ECEQuantile": "calibration",
+    "EntropyHistogram": "likelihood",
+    "NLL": "likelihood",
+    "RMSE": "accuracy",
+    "SequenceMetrics": "sequence",
+    "mean_and_ci": "sequence",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(_HOME)

@@ -1,0 +1,146 @@
+"""Calibration of N(d, v): ECE_delta and ECE_q with their curves (section "Metrics for Uncertainty")."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.pixels import Pixels, require_variance, select_pixels
+
+
+def interval_confidence(depth: Tensor, variance: Tensor, delta: float) -> Tensor:
+    """[...] mass of N(d, v) on [(1 - delta) d, (1 + delta) d] = erf(delta |d| / sqrt(2 v)).
+
+    v = 0 is a point mass at d, which the interval holds: 1. A depth d <= 0 mirrors the interval.
+    """
+    positive = variance > 0
+    sigma = torch.where(positive, variance, torch.ones_like(variance)).sqrt()
+    mass = torch.erf(delta * depth.abs() / (math.sqrt(2) * sigma))
+    return torch.where(positive, mass, torch.ones_like(mass))
+
+
+def _ece_delta_update(p: Pixels, delta: float, bins: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Per confidence bin [B]: sum of the confidence, accurate pixels, pixels."""
+    confidence = interval_confidence(p.depth, p.variance, delta)
+    accurate = (p.target - p.depth).abs() <= delta * p.depth.abs()
+    # Bin b is [b/B, (b+1)/B); a confidence of exactly 1 belongs to the last.
+    index = (confidence * bins).long().clamp(max=bins - 1)
+    pixels = torch.bincount(index, minlength=bins)
+    return (
+        torch.bincount(index, weights=confidence, minlength=bins),
+        torch.bincount(index[accurate], minlength=bins),
+        pixels,
+    )
+
+
+class ECEDelta(SumMetric):
+    """ECE_delta = sum_b |b|/S |acc(b) - conf(b)| and the delta calibration curve.
+
+    Confidence: mass of N(d, v) on [(1 - delta) d, (1 + delta) d]; accuracy: 1 if the ground truth lies
+    in that interval; B equal-width bins on [0, 1], of which three sums each are kept.
+    ``compute()``: ``ece_delta``, NaN without a pixel; curve [B] ``ece_delta_confidence``,
+    ``ece_delta_accuracy`` (NaN in empty bins) and ``ece_delta_pixels``; ``overconfidence`` = mean
+    confidence - mean accuracy, positive where the variance is too small.
+
+    A variant in circulation (the helper of the older MIT code) bins between the smallest and largest
+    confidence, takes bin centres for conf(b), and tests the accuracy around the ground truth. Its
+    figures differ, so do not compare them with these.
+
+    Args:
+        delta: half-width of the interval relative to the depth; the paper's .25.
+        bins: B; the paper names none, 10 here.
+    """
+
+    confidence: Tensor
+    accurate: Tensor
+    pixels: Tensor
+
+    def __init__(self, delta: float = 0.25, bins: int = 10, **kwargs: Any) -> None:
+        if not 0 < delta < 1 or bins < 1:
+            raise ValueError(f"delta must lie in (0, 1) and bins be >= 1, got delta={delta}, bins={bins}")
+        super().__init__({"delta": delta, "bins": bins}, **kwargs)
+        self.delta, self.bins = delta, bins
+        self.add_sum("confidence", bins)
+        self.add_count("accurate", bins)
+        self.add_count("pixels", bins)
+
+    def update(
+        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
+    ) -> None:
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
+        p = select_pixels(depth, require_variance(variance, "ECE_delta"), target, valid)
+        confidence, accurate, pixels = _ece_delta_update(p, self.delta, self.bins)
+        self.add(confidence=confidence, accurate=accurate, pixels=pixels)
+
+    def compute(self) -> dict[str, Tensor]:
+        """The error and curve of all updates so far."""
+        total = self.pixels.sum()
+        gap = self.confidence - self.accurate.double()
+        return {
+            "ece_delta": share(gap.abs().sum(), total),
+            "overconfidence": share(gap.sum(), total),
+            "ece_delta_confidence": share(self.confidence, self.pixels),
+            "ece_delta_accuracy": share(self.accurate, self.pixels),
+            "ece_delta_pixels": self.pixels.double(),
+        }
+
+
+def quantile_levels(bins: int) -> Tensor:
+    """[B] q_b = (b - 1/2) / B, b = 1..B: the levels 0 and 1, which are always right, stay out."""
+    return (torch.arange(bins, dtype=torch.float64) + 0.5) / bins
+
+
+def _ece_quantile_update(p: Pixels, thresholds: Tensor) -> Tensor:
+    """[B] pixels with g at or below d + sqrt(v) thresholds[b], thresholds rising."""
+    positive = p.variance > 0
+    sigma = torch.where(positive, p.variance, torch.ones_like(p.variance)).sqrt()
+    residual = p.target - p.depth
+    # v = 0: every quantile is d itself, so g is below all of them or above all.
+    side = torch.where(residual <= 0, -math.inf, math.inf).to(residual)
+    z = torch.where(positive, residual / sigma, side)
+    # right=False finds the first b with z <= thresholds[b]: from there on g is at or below.
+    first = torch.bucketize(z, thresholds, right=False)
+    return torch.bincount(first, minlength=thresholds.numel() + 1).cumsum(0)[:-1]
+
+
+class ECEQuantile(SumMetric):
+    """ECE_q = 1/B sum_b |obs(q_b) - q_b| and the quantile calibration curve.
+
+    The predicted quantile is the inverse CDF of N(d, v) at q_b, d itself where v = 0; obs(q_b) is the
+    share of pixels whose ground truth lies at or below it.
+    ``compute()``: ``ece_q``, NaN without a pixel; curve [B] ``ece_q_levels``, ``ece_q_observed``.
+
+    Args:
+        levels: q_b, rising, within (0, 1); None = .05, .15, ..., .95 (B = 10, which the paper leaves open).
+    """
+
+    at_or_below: Tensor
+    pixels: Tensor
+
+    def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
+        q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
+        if q.numel() == 0 or not bool(((q > 0) & (q < 1)).all() and (q.diff() > 0).all()):
+            raise ValueError(f"levels must rise within (0, 1), got {levels}")
+        super().__init__({"levels": q.tolist()}, **kwargs)
+        self.levels, self.thresholds = q, torch.special.ndtri(q)
+        self.add_count("at_or_below", q.numel())
+        self.add_count("pixels")
+
+    def update(
+        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
+    ) -> None:
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
+        p = select_pixels(depth, require_variance(variance, "ECE_q"), target, valid)
+        counts = _ece_quantile_update(p, self.thresholds.to(p.depth.device))
+        self.add(at_or_below=counts, pixels=torch.tensor(p.depth.numel()))
+
+    def compute(self) -> dict[str, Tensor]:
+        """The error and curve of all updates so far."""
+        levels = self.levels.to(self.pixels.device)
+        observed = share(self.at_or_below, self.pixels)
+        return {"ece_q": (observed - levels).abs().mean(), "ece_q_levels": levels, "ece_q_observed": observed}

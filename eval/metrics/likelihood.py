@@ -1,0 +1,112 @@
+"""Negative log-likelihood and predictive entropy of N(d, v) (section "Metrics for Uncertainty")."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.metrics.base import SumMetric, share
+from ufmstar_torch.eval.metrics.pixels import Pixels, require_variance, select_pixels
+
+
+def gaussian_nll(depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
+    """[...] (g - d)^2 / (2 v) + 0.5 ln(2 pi v), v > 0 [nats]."""
+    return (target - depth).square() / (2 * variance) + 0.5 * (2 * math.pi * variance).log()
+
+
+def gaussian_entropy(variance: Tensor) -> Tensor:
+    """[...] 0.5 ln(2 pi e v) [nats, of a depth in metres]; -inf where v = 0."""
+    return 0.5 * (2 * math.pi * math.e * variance).log()
+
+
+def _nll_update(p: Pixels) -> tuple[Tensor, Tensor]:
+    """[] sum of the NLL over v > 0, and [] how many these are."""
+    positive = p.variance > 0
+    nll = gaussian_nll(p.depth[positive], p.variance[positive], p.target[positive])
+    return nll.sum(), positive.sum()
+
+
+class NLL(SumMetric):
+    """Mean negative log-likelihood over the pixels with valid ground truth and v > 0.
+
+    ``compute()``: ``nll`` [nats], NaN without a pixel; ``nll_left_out_share``, of the pixels with valid
+    ground truth those without an NLL, because v = 0 there or the prediction is not finite: to be read
+    beside the NLL, since a method may leave out its worst pixels.
+    """
+
+    total: Tensor
+    pixels: Tensor
+    with_truth: Tensor
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_sum("total")
+        self.add_count("pixels")
+        self.add_count("with_truth")
+
+    def update(
+        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
+    ) -> None:
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
+        p = select_pixels(depth, require_variance(variance, "NLL"), target, valid)
+        total, pixels = _nll_update(p)
+        self.add(total=total, pixels=pixels, with_truth=p.with_truth)
+
+    def compute(self) -> dict[str, Tensor]:
+        """The figures of all updates so far."""
+        left_out = share(self.with_truth - self.pixels, self.with_truth)
+        return {"nll": share(self.total, self.pixels), "nll_left_out_share": left_out}
+
+
+def _entropy_update(variance: Tensor, edges: Tensor) -> Tensor:
+    """[bins + 2] counts of the entropy: below edges[0], in [edges[i], edges[i+1]), at or above edges[-1]."""
+    # v = 0 has the entropy -inf, which falls below the range by itself.
+    index = torch.bucketize(gaussian_entropy(variance), edges, right=True)
+    return torch.bincount(index, minlength=edges.numel() + 1)
+
+
+class EntropyHistogram(SumMetric):
+    """Histogram of the predictive entropy 0.5 ln(2 pi e v) over the pixels with valid ground truth.
+
+    ``compute()``: ``entropy_counts`` [bins + 2], first and last = under and over the range (v = 0 lies
+    under it); ``entropy_edges`` [bins + 1] [nats]; ``entropy`` the mean over v > 0.
+
+    Args:
+        bins: equal-width bins over ``low`` to ``high``.
+        low: [nats]; the default range is sigma = 81 um to 721 m.
+        high: [nats].
+    """
+
+    counts: Tensor
+    total: Tensor
+    pixels: Tensor
+
+    def __init__(self, bins: int = 64, low: float = -8.0, high: float = 8.0, **kwargs: Any) -> None:
+        if bins < 1 or not low < high:
+            raise ValueError(f"bins must be >= 1 and low < high, got bins={bins}, low={low}, high={high}")
+        super().__init__({"bins": bins, "low": low, "high": high}, **kwargs)
+        self.edges = torch.linspace(low, high, bins + 1, dtype=torch.float64)
+        self.add_count("counts", bins + 2)
+        self.add_sum("total")
+        self.add_count("pixels")
+
+    def update(
+        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
+    ) -> None:
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
+        v = select_pixels(depth, require_variance(variance, "the entropy"), target, valid).variance
+        positive = v[v > 0]
+        counts = _entropy_update(v, self.edges.to(v.device))
+        total = gaussian_entropy(positive).sum()
+        self.add(counts=counts, total=total, pixels=torch.tensor(positive.numel()))
+
+    def compute(self) -> dict[str, Tensor]:
+        """The histogram of all updates so far."""
+        return {
+            "entropy": share(self.total, self.pixels),
+            "entropy_counts": self.counts.double(),
+            "entropy_edges": self.edges.to(self.counts.device),
+        }

@@ -1,0 +1,424 @@
+"""Streaming metrics: against independent implementations, closed forms, and the field's known faults."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from torch import Tensor
+
+from ufmstar_torch.eval.metrics import (
+    NLL,
+    RMSE,
+    AbsRel,
+    Delta1,
+    ECEDelta,
+    ECEQuantile,
+    EntropyHistogram,
+    SequenceMetrics,
+    mean_and_ci,
+)
+from ufmstar_torch.eval.metrics.base import SumMetric
+from ufmstar_torch.eval.metrics.calibration import interval_confidence
+from ufmstar_torch.eval.metrics.sequence import over_sequences
+
+ALL = [Delta1, AbsRel, RMSE, NLL, ECEDelta, ECEQuantile, EntropyHistogram]
+UNCERTAIN = ALL[3:]
+
+
+def maps(*shape: int, seed: int = 0, scale: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
+    """Depth, variance and ground truth with g ~ N(d, scale^2 v) [float64]."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(2.0, 6.0, shape)
+    variance = rng.uniform(0.05, 1.0, shape) ** 2 * (depth / 6) ** 2
+    target = np.maximum(depth + scale * np.sqrt(variance) * rng.standard_normal(shape), 0.01)
+    return torch.tensor(depth), torch.tensor(variance), torch.tensor(target)
+
+
+def figures(metric: SumMetric, *args: Tensor | None) -> dict[str, Tensor]:
+    metric.update(*args)
+    return metric.compute()
+
+
+class TestAgainstIndependentImplementations:
+    def test_accuracy(self) -> None:
+        d, v, g = maps(40, 50)
+        dn, gn = d.numpy(), g.numpy()
+        delta1 = figures(Delta1(), d, v, g)
+        assert float(delta1["delta1"]) == np.mean(np.abs(dn - gn) <= 0.25 * gn)
+        assert float(delta1["delta1_ratio"]) == np.mean(np.maximum(dn / gn, gn / dn) < 1.25)
+        assert delta1["delta1"] != delta1["delta1_ratio"]
+        assert float(figures(AbsRel(), d, None, g)["abs_rel"]) == pytest.approx(np.mean(np.abs(dn - gn) / gn))
+        assert float(figures(RMSE(), d, None, g)["rmse"]) == pytest.approx(np.sqrt(np.mean((dn - gn) ** 2)))
+
+    def test_delta1_closed_form(self) -> None:
+        g = torch.full((5,), 4.0)
+        d = torch.tensor([3.0, 5.0, 2.99, 5.01, 3.125])
+        got = figures(Delta1(), d, None, g)
+        assert float(got["delta1"]) == 3 / 5  # 3, 5 and 3.125: the interval is closed and lies around g
+        assert float(got["delta1_ratio"]) == 0.0  # ratios 1.333, 1.25, 1.338, 1.2525, 1.28: open interval
+
+    def test_delta1_ratio_of_negative_depth_is_a_miss(self) -> None:
+        got = figures(Delta1(), torch.tensor([-1.0, 0.0, 1.0]), None, torch.ones(3))
+        assert float(got["delta1_ratio"]) == pytest.approx(1 / 3)
+
+    def test_nll_is_scipys(self) -> None:
+        d, v, g = maps(30, 40)
+        oracle = -stats.norm.logpdf(g.numpy(), d.numpy(), np.sqrt(v.numpy())).mean()
+        assert float(figures(NLL(), d, v, g)["nll"]) == pytest.approx(oracle, rel=1e-12)
+
+    def test_interval_confidence_is_scipys(self) -> None:
+        d, v, _ = maps(30, 40)
+        normal = stats.norm(d.numpy(), np.sqrt(v.numpy()))
+        oracle = normal.cdf(1.25 * d.numpy()) - normal.cdf(0.75 * d.numpy())
+        np.testing.assert_allclose(interval_confidence(d, v, 0.25).numpy(), oracle, atol=1e-14)
+
+    @pytest.mark.parametrize("bins", [7, 10, 15])
+    def test_ece_delta_is_torchmetrics(self, bins: int) -> None:
+        from torchmetrics.classification import BinaryCalibrationError
+
+        d, v, g = maps(60, 70, scale=1.7)
+        confidence = interval_confidence(d, v, 0.25)
+        accurate = ((g - d).abs() <= 0.25 * d).long()
+        oracle = BinaryCalibrationError(n_bins=bins, norm="l1")(confidence.flatten(), accurate.flatten())
+        assert float(figures(ECEDelta(bins=bins), d, v, g)["ece_delta"]) == pytest.approx(
+            float(oracle), abs=3e-6
+        )
+
+    def test_ece_delta_is_a_numpy_loop(self) -> None:
+        d, v, g = maps(20, 30, scale=2.0)
+        got = figures(ECEDelta(delta=0.1, bins=8), d, v, g)
+        dn, vn, gn = (x.numpy().ravel() for x in (d, v, g))
+        confidence = stats.norm.cdf(0.1 * dn / np.sqrt(vn)) - stats.norm.cdf(-0.1 * dn / np.sqrt(vn))
+        accurate, error = (gn >= 0.9 * dn) & (gn <= 1.1 * dn), 0.0
+        for b in range(8):
+            inside = (confidence >= b / 8) & ((confidence < (b + 1) / 8) | (b == 7))
+            assert float(got["ece_delta_pixels"][b]) == inside.sum()
+            if inside.any():
+                gap = accurate[inside].mean() - confidence[inside].mean()
+                assert float(got["ece_delta_accuracy"][b]) == pytest.approx(accurate[inside].mean())
+                assert float(got["ece_delta_confidence"][b]) == pytest.approx(confidence[inside].mean())
+                error += inside.mean() * abs(gap)
+        assert float(got["ece_delta"]) == pytest.approx(error, rel=1e-12)
+
+    def test_ece_quantile_is_scipys(self) -> None:
+        # Asymmetric levels: symmetric ones hide a residual with its sign flipped.
+        levels = [0.03, 0.1, 0.2, 0.6]
+        d, v, g = maps(40, 50)
+        g = g + 0.1  # biased, so that the sign of the residual shows
+        got = figures(ECEQuantile(levels), d, v, g)
+        observed = [np.mean(g.numpy() <= stats.norm.ppf(q, d.numpy(), np.sqrt(v.numpy()))) for q in levels]
+        assert all(o < q for o, q in zip(observed, levels, strict=True))
+        np.testing.assert_allclose(got["ece_q_observed"].numpy(), observed, rtol=0, atol=1e-15)
+        assert float(got["ece_q"]) == pytest.approx(np.mean(np.abs(np.array(observed) - levels)), rel=1e-12)
+
+    def test_entropy_is_scipys(self) -> None:
+        d, v, g = maps(30, 30)
+        oracle = stats.norm(0, np.sqrt(v.numpy())).entropy().ravel()
+        got = figures(EntropyHistogram(bins=5, low=-2.0, high=0.5), d, v, g)
+        assert float(got["entropy"]) == pytest.approx(oracle.mean())
+        edges = np.concatenate([[-np.inf], np.linspace(-2.0, 0.5, 6), [np.inf]])
+        counts = np.histogram(oracle, edges)[0]
+        assert counts.min() > 0  # under and over the range too
+        np.testing.assert_array_equal(got["entropy_counts"].numpy(), counts)
+
+
+class TestMeaning:
+    def test_calibrated_data_has_no_calibration_error(self) -> None:
+        d, v, g = maps(500, 800, seed=3)
+        # Standard error of a share over 400,000 pixels is below 8e-4; the clamp of g at 1 cm is out of reach.
+        assert float(figures(ECEDelta(), d, v, g)["ece_delta"]) < 5e-3
+        assert float(figures(ECEQuantile(), d, v, g)["ece_q"]) < 2e-3
+
+    @pytest.mark.parametrize(("scale", "sign"), [(3.0, 1), (0.3, -1)])
+    def test_wrong_variance_shows_with_its_sign(self, scale: float, sign: int) -> None:
+        d, v, g = maps(200, 300, scale=scale)  # errors `scale` times what the variance says
+        got = figures(ECEDelta(), d, v, g)
+        assert sign * float(got["overconfidence"]) > 0.02
+        assert float(got["ece_delta"]) > 0.02
+        observed = figures(ECEQuantile([0.1, 0.9]), d, v, g)["ece_q_observed"]
+        assert sign * (float(observed[0]) - stats.norm.cdf(stats.norm.ppf(0.1))) > 0
+        oracle = stats.norm.cdf(stats.norm.ppf([0.1, 0.9]) / scale)
+        np.testing.assert_allclose(observed.numpy(), oracle, atol=5e-3)
+
+    def test_nll_is_least_at_the_true_variance(self) -> None:
+        d, v, g = maps(200, 300)
+        nll = [float(figures(NLL(), d, s * v, g)["nll"]) for s in (0.5, 1.0, 2.0)]
+        assert nll[1] < min(nll[0], nll[2])
+
+    def test_too_deep_prediction_has_truth_below_its_quantiles(self) -> None:
+        g = torch.full((100,), 2.0)
+        got = figures(ECEQuantile([0.01, 0.3]), g + 10, torch.ones(100), g)
+        assert got["ece_q_observed"].tolist() == [1.0, 1.0]
+
+
+class TestZeroVariance:
+    def test_nll_leaves_it_out_and_says_so(self) -> None:
+        d, g = torch.full((4,), 2.0), torch.full((4,), 2.5)
+        got = figures(NLL(), d, torch.tensor([0.0, 0.25, 0.25, 0.0]), g)
+        assert float(got["nll"]) == pytest.approx(0.5 + 0.5 * math.log(2 * math.pi * 0.25))
+        assert float(got["nll_left_out_share"]) == 0.5
+
+    def test_quantile_is_the_depth_itself(self) -> None:
+        d, v = torch.full((4,), 2.0), torch.zeros(4)
+        got = figures(ECEQuantile([0.2, 0.8]), d, v, torch.tensor([1.0, 2.0, 2.1, 3.0]))
+        assert got["ece_q_observed"].tolist() == [0.5, 0.5]  # at or below: 1 and 2
+
+    def test_confidence_is_one(self) -> None:
+        d, v = torch.full((4,), 2.0), torch.zeros(4)
+        got = figures(ECEDelta(bins=5), d, v, torch.tensor([1.0, 2.0, 2.1, 3.0]))
+        assert got["ece_delta_pixels"].tolist() == [0, 0, 0, 0, 4]
+        assert float(got["ece_delta"]) == 0.5
+
+    def test_entropy_falls_below_the_range(self) -> None:
+        got = figures(EntropyHistogram(bins=2), torch.ones(3), torch.zeros(3), torch.ones(3))
+        assert got["entropy_counts"].tolist() == [3, 0, 0, 0]
+        assert math.isnan(got["entropy"])
+
+
+class TestMasks:
+    @pytest.mark.parametrize("kind", ALL)
+    def test_true_means_use(self, kind: type[SumMetric]) -> None:
+        """Metrics on the invalid pixels, or divided by their number, because the mask meant the opposite."""
+        d, v, g = maps(20, 30)
+        valid = torch.zeros(20, 30, dtype=torch.bool)
+        valid[3:9, 4:20] = True
+        kept = figures(kind(), d[valid], v[valid], g[valid])
+        poisoned = torch.where(valid, d, 1e6)
+        for name, value in figures(kind(), poisoned, v, g, valid).items():
+            torch.testing.assert_close(value, kept[name], rtol=0, atol=0, equal_nan=True)
+
+    @pytest.mark.parametrize("kind", ALL)
+    @pytest.mark.parametrize("nothing", [0.0, -1.0, math.nan, math.inf])
+    def test_no_ground_truth_is_left_out_by_itself(self, kind: type[SumMetric], nothing: float) -> None:
+        d, v, g = maps(20, 30)
+        kept = figures(kind(), d[:10], v[:10], g[:10])
+        holes = torch.cat([g[:10], torch.full_like(g[10:], nothing)])
+        for name, value in figures(kind(), d, v, holes).items():
+            torch.testing.assert_close(value, kept[name], rtol=0, atol=0, equal_nan=True)
+
+    @pytest.mark.parametrize("bad", [math.nan, math.inf, -0.1])
+    def test_unusable_variance_is_counted(self, bad: float) -> None:
+        d, v, g = maps(4, 5)
+        v[0, :] = bad
+        got = figures(NLL(), d, v, g)
+        assert float(got["nll_left_out_share"]) == 0.25
+        assert got["nll"] == figures(NLL(), d[1:], v[1:], g[1:])["nll"]
+        assert float(figures(ECEDelta(), d, v, g)["ece_delta_pixels"].sum()) == 15
+
+    def test_unusable_depth_is_counted(self) -> None:
+        d, v, g = maps(4, 5)
+        d[0, :] = math.nan
+        assert float(figures(Delta1(), d, v, g)["left_out_share"]) == 0.25
+        assert float(figures(NLL(), d, v, g)["nll_left_out_share"]) == 0.25
+
+    @pytest.mark.parametrize("kind", ALL)
+    def test_nothing_valid_is_nan_and_no_crash(self, kind: type[SumMetric]) -> None:
+        d, v, g = maps(4, 5)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            empty = [kind().compute(), figures(kind(), d, v, torch.zeros_like(g))]
+            empty.append(figures(kind(), d, v, g, torch.zeros_like(g, dtype=torch.bool)))
+        headline = {"delta1", "abs_rel", "rmse", "nll", "ece_delta", "ece_q", "entropy"}
+        for got in empty:
+            assert all(math.isnan(value) for name, value in got.items() if name in headline)
+            assert headline & got.keys()
+
+    def test_arguments_are_not_changed(self) -> None:
+        d, v, g = (x.float() for x in maps(6, 7))
+        g[0], v[1], d[2] = math.nan, -1.0, math.inf
+        before = [x.clone() for x in (d, v, g)]
+        SequenceMetrics().update(d, v, g, g > 2)
+        for old, new in zip(before, (d, v, g), strict=True):
+            torch.testing.assert_close(new, old, rtol=0, atol=0, equal_nan=True)
+
+
+class TestStreaming:
+    @settings(max_examples=20, deadline=None)
+    @given(cut=st.integers(0, 12), seed=st.integers(0, 99))
+    def test_parts_add_up_to_the_whole(self, cut: int, seed: int) -> None:
+        d, v, g = maps(12, 9, seed=seed, scale=1.5)
+        whole, first, second = SequenceMetrics(), SequenceMetrics(), SequenceMetrics()
+        whole.update(d, v, g)
+        first.update(d[:cut], v[:cut], g[:cut])
+        second.update(d[cut:], v[cut:], g[cut:])
+        first.merge_state(second)
+        assert first.compute() == pytest.approx(whole.compute(), rel=1e-12, abs=1e-15, nan_ok=True)
+        for name, curve in whole.curves().items():
+            np.testing.assert_allclose(first.curves()[name], curve, rtol=1e-12)
+
+    def test_order_of_frames_does_not_matter(self) -> None:
+        d, v, g = maps(9, 20, 20)
+        forwards, backwards = SequenceMetrics(), SequenceMetrics()
+        for i in range(9):
+            forwards.update(d[i], v[i], g[i])
+            backwards.update(d[8 - i], v[8 - i], g[8 - i])
+        assert forwards.compute() == pytest.approx(backwards.compute(), rel=1e-12)
+
+    @pytest.mark.parametrize("shape", [(24,), (4, 6), (2, 3, 4), (2, 1, 3, 4)])
+    def test_any_leading_shape(self, shape: tuple[int, ...]) -> None:
+        d, v, g = maps(24)
+        flat, shaped = SequenceMetrics(), SequenceMetrics()
+        flat.update(d, v, g)
+        shaped.update(d.reshape(shape), v.reshape(shape), g.reshape(shape))
+        assert flat.compute() == shaped.compute()
+
+    def test_memory_does_not_grow(self) -> None:
+        metrics = SequenceMetrics()
+        d, v, g = maps(30, 30)
+
+        def size() -> int:
+            return sum(value.nelement() * value.element_size() for value in metrics.state_dict().values())
+
+        before = size()
+        for _ in range(5):
+            metrics.update(d, v, g)
+        assert size() == before < 4096
+
+    def test_sums_keep_counting_beyond_float32(self) -> None:
+        metric, one = RMSE(), torch.ones(1)
+        metric.add(total=torch.tensor(2.0**40), pixels=torch.tensor(2**40))
+        metric.update(one + 1, None, one)
+        assert int(metric.pixels) == 2**40 + 1
+        assert float(metric.total) == 2.0**40 + 1
+
+    def test_half_precision_is_computed_in_double(self) -> None:
+        d, v, g = (x.half() for x in maps(20, 20))
+        low, high = SequenceMetrics(), SequenceMetrics()
+        low.update(d, v, g)
+        high.update(d.double(), v.double(), g.double())
+        assert low.compute() == high.compute()
+
+    def test_state_dict_continues(self) -> None:
+        d, v, g = maps(2, 10, 10)
+        whole, first, second = SequenceMetrics(), SequenceMetrics(), SequenceMetrics()
+        for i in range(2):
+            whole.update(d[i], v[i], g[i])
+        first.update(d[0], v[0], g[0])
+        stale = first.compute()
+        second.load_state_dict(first.state_dict())
+        assert second.compute() == stale
+        second.update(d[1], v[1], g[1])
+        assert second.compute() == whole.compute()
+        assert first.compute() == stale
+
+    def test_merging_after_compute_is_not_stale(self) -> None:
+        d, v, g = maps(10, 10)
+        a, b = Delta1(), Delta1()
+        a.update(d, v, g)
+        assert float(a.compute()["pixels"]) == 100
+        b.update(d, v, g)
+        a.merge_state(b)
+        assert float(a.compute()["pixels"]) == 200
+
+    def test_other_settings_do_not_merge(self) -> None:
+        with pytest.raises(ValueError, match=r"settings.*0\.25.*0\.5"):
+            ECEDelta(0.25).merge_state(ECEDelta(0.5))
+        with pytest.raises(ValueError, match="other must hold"):
+            SequenceMetrics().merge_state(SequenceMetrics(with_variance=False))
+
+    def test_reset(self) -> None:
+        d, v, g = maps(10, 10)
+        metrics = SequenceMetrics()
+        metrics.update(d, v, g)
+        metrics.reset()
+        assert metrics.compute()["pixels"] == 0
+
+
+class TestSequence:
+    def test_figures_are_plain_floats(self) -> None:
+        d, v, g = maps(10, 10)
+        metrics = SequenceMetrics()
+        metrics.update(d, v, g)
+        text = json.dumps(metrics.compute() | metrics.curves(), allow_nan=True)
+        names = {
+            "delta1",
+            "delta1_ratio",
+            "abs_rel",
+            "rmse",
+            "nll",
+            "nll_left_out_share",
+            "ece_delta",
+            "ece_q",
+        }
+        assert names <= json.loads(text).keys()
+
+    def test_depth_alone(self) -> None:
+        d, _, g = maps(10, 10)
+        metrics = SequenceMetrics(with_variance=False)
+        metrics.update(d, None, g)
+        assert "nll" not in metrics.compute()
+        assert metrics.compute()["pixels"] == 100
+
+    def test_sequence_keeps_the_left_out_share(self) -> None:
+        d, v, g = maps(4, 5)
+        v[0], d[1] = math.nan, math.nan
+        metrics = SequenceMetrics()
+        metrics.update(d, v, g)
+        assert metrics.compute()["nll_left_out_share"] == 0.5
+        assert metrics.compute()["left_out_share"] == 0.25
+
+    def test_mean_and_ci_is_scipys(self) -> None:
+        values = [0.2, 0.4, 0.35, 0.9, 0.1]
+        mean, half = mean_and_ci(values)
+        low, high = stats.t.interval(0.95, 4, np.mean(values), stats.sem(values))
+        assert (mean - half, mean + half) == pytest.approx((low, high), rel=1e-12)
+
+    def test_mean_and_ci_edges(self) -> None:
+        assert mean_and_ci([0.5, math.nan])[0] == 0.5
+        assert math.isnan(mean_and_ci([0.5])[1])
+        assert all(math.isnan(x) for x in mean_and_ci([]))
+        with pytest.raises(ValueError, match="level"):
+            mean_and_ci([1.0, 2.0], level=95)
+
+    def test_ci_covers(self) -> None:
+        rng = np.random.default_rng(0)
+        hits = [abs(m - 1.0) <= h for m, h in (mean_and_ci(rng.normal(1.0, 2.0, 6)) for _ in range(2000))]
+        assert np.mean(hits) == pytest.approx(0.95, abs=0.02)
+
+    def test_over_sequences(self) -> None:
+        got = over_sequences([{"a": 1.0, "b": 2.0}, {"a": 3.0}])
+        assert got["a"] == mean_and_ci([1.0, 3.0])
+        assert got["b"][0] == 2.0
+
+
+class TestErrors:
+    @pytest.mark.parametrize("kind", ALL)
+    def test_shapes_and_types_are_named(self, kind: type[SumMetric]) -> None:
+        d, v, g = maps(4, 5)
+        with pytest.raises(ValueError, match="target must have the depth's shape"):
+            kind().update(d, v, g[:3])
+        with pytest.raises(ValueError, match="valid must be a bool mask"):
+            kind().update(d, v, g, torch.ones(4, 5))
+        with pytest.raises(ValueError, match="target must be floating point"):
+            kind().update(d, v, g.long())
+
+    @pytest.mark.parametrize("kind", UNCERTAIN)
+    def test_missing_variance_is_named(self, kind: type[SumMetric]) -> None:
+        d, _, g = maps(4, 5)
+        with pytest.raises(ValueError, match="variance must be given"):
+            kind().update(d, None, g)
+
+    def test_settings(self) -> None:
+        with pytest.raises(ValueError, match="tolerance"):
+            Delta1(0.0)
+        with pytest.raises(ValueError, match="delta must lie"):
+            ECEDelta(1.0)
+        with pytest.raises(ValueError, match="levels must rise"):
+            ECEQuantile([0.5, 0.5])
+        with pytest.raises(ValueError, match="low < high"):
+            EntropyHistogram(low=1.0, high=1.0)
+
+    def test_package_is_light_and_complete(self) -> None:
+        from ufmstar_torch.eval import metrics
+
+        assert all(hasattr(metrics, name) for name in dir(metrics))
+        with pytest.raises(AttributeError, match="no attribute"):
+            _ = metrics.nothing
