@@ -31,7 +31,9 @@ def _check_number(owner: str, name: str, value: object, range_: tuple[float, flo
     if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
         raise ValueError(f"{owner}.{name} must be a number, got {value!r}")
     if value < low or value > high or (open_low and value == low):
-        raise ValueError(f"{owner}.{name} must lie in {'(' if open_low else '['}{low}, {high}], got {value!r}")
+        raise ValueError(
+            f"{owner}.{name} must lie in {'(' if open_low else '['}{low}, {high}], got {value!r}"
+        )
 
 
 class _Checked:
@@ -154,18 +156,21 @@ class UfMStarConfig(_Checked):
     features: int = _number(0, "dim H - 1", "1", 0)
     initial_capacity: int = _number(256, "K_0", "components", 1)
     max_components: int | None = field(
-        default=None, metadata={"symbol": "K_max", "unit": "components", "range": (1, math.inf, False), "optional": True}
+        default=None,
+        metadata={"symbol": "K_max", "unit": "components", "range": (1, math.inf, False), "optional": True},
     )
 
     # Input checks and speed
     rotation_tolerance: float = _number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
-    on_bad_pose: str = _choice("raise", "skip")
+    on_bad_frame: str = _choice("raise", "skip")
     backend: str = _choice("auto", "torch", "numba")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.segment, SPGFConfig):
-            raise ValueError(f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}")
+            raise ValueError(
+                f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}"
+            )
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"

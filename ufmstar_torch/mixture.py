@@ -91,7 +91,9 @@ class GaussianMixture:
         """
         mean = torch.einsum("bij,bkj->bki", R, self.mean) + t[:, None]
         covariance = torch.einsum("bij,bkjl,bml->bkim", R, self.covariance, R)
-        return self.replace(mean=torch.where(self.valid[..., None], mean, torch.zeros_like(mean)), covariance=covariance)
+        return self.replace(
+            mean=torch.where(self.valid[..., None], mean, torch.zeros_like(mean)), covariance=covariance
+        )
 
     def padded(self, capacity: int) -> GaussianMixture:
         """The same mixture with at least ``capacity`` slots, new ones empty."""

@@ -1,0 +1,90 @@
+"""The one seam between the algorithm and its kernels: which implementation of each step is used."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from ufmstar_torch import correspond as _correspond
+from ufmstar_torch import fuse as _fuse
+from ufmstar_torch import regress as _regress
+from ufmstar_torch import segment as _segment
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The four replaceable steps; every implementation has the torch reference's signature."""
+
+    name: str
+    spgf: Callable[..., Any]
+    correspond: Callable[..., Any]
+    fuse: Callable[..., Any]
+    regress_image: Callable[..., Any]
+
+
+TORCH = Backend("torch", _segment.spgf, _correspond.correspond, _fuse.fuse, _regress.regress_image)
+
+
+def select(name: str, device_type: str) -> Backend:
+    """The kernels for a device.
+
+    Args:
+        name: "torch": the reference on every device; it waits for the device only where the mixture may
+            have to grow. "numba": compiled CPU kernels, CPU tensors only. "auto": numba on the CPU where it can be
+            imported; on an accelerator the torch reference, except that the segmentation, a long chain of
+            tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
+        device_type: ``torch.device.type`` of the depth.
+
+    Raises:
+        ValueError: "numba" was asked for tensors of another device.
+        ImportError: "numba" was asked for by name and cannot be imported.
+    """
+    if name == "torch":
+        return TORCH
+    if name == "numba":
+        if device_type != "cpu":
+            raise ValueError(f"backend='numba' needs CPU tensors, got device type {device_type!r}")
+        return _numba_backend()
+    if device_type == "meta":
+        return TORCH
+    compiled = _numba_or_none()
+    if compiled is None or device_type == "cpu":
+        return compiled or TORCH
+    return Backend("torch, host segmentation", _on_host(compiled.spgf), *_steps_after_segmentation(TORCH))
+
+
+def _steps_after_segmentation(backend: Backend) -> tuple[Callable[..., Any], ...]:
+    return backend.correspond, backend.fuse, backend.regress_image
+
+
+def _numba_backend() -> Backend:
+    from ufmstar_torch.kernels import regress_cpu, segment_cpu
+
+    return Backend("numba", segment_cpu.spgf, _correspond.correspond, _fuse.fuse, regress_cpu.regress_image)
+
+
+@functools.cache
+def _numba_or_none() -> Backend | None:
+    """The compiled kernels, or None with one warning where numba cannot be imported."""
+    try:
+        return _numba_backend()
+    except ImportError as error:
+        warnings.warn(f"numba cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
+        return None
+
+
+def _on_host(spgf: Callable[..., Any]) -> Callable[..., Any]:
+    """A CPU segmentation for tensors of another device."""
+
+    def moved(depth: Any, intrinsics: Any, config: Any = None, **options: Any) -> Any:
+        def to_cpu(value: Any) -> Any:
+            return value.cpu() if hasattr(value, "cpu") else value
+
+        options = {name: to_cpu(value) for name, value in options.items()}
+        mixture, labels = spgf(to_cpu(depth), to_cpu(intrinsics), config, **options)
+        return mixture.to(depth.device), labels.to(depth.device)
+
+    return moved

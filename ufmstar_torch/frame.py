@@ -1,0 +1,196 @@
+"""One frame's input, checked: what UfM* is given per image, before the algorithm sees it.
+
+What a shape or dtype tells is an error at once. What only values tell (a pose that is not rigid, bad
+intrinsics) becomes a code per stream, so that on an accelerator nothing waits for the check; the caller
+raises or skips. What is wrong with single pixels becomes ``valid = False`` and is counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.camera import nearest_rotation, rotation_deviation
+
+# Index = code. Each text finishes the sentence "stream b: ...".
+FRAME_FAULTS = (
+    "fine",
+    "pose holds NaN or infinity; expected a finite camera-to-world matrix",
+    "pose has a last row other than (0, 0, 0, 1); expected a rigid 4x4 camera-to-world matrix",
+    "pose has a rotation that is not orthonormal within rotation_tolerance; expected a rigid 4x4 matrix",
+    "pose has a reflection (negative determinant); expected a rotation",
+    "intrinsics hold NaN or infinity; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
+    "intrinsics are not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0",
+)
+
+
+@dataclass(frozen=True)
+class FrameInput:
+    """A checked frame of B streams, all on the depth's device.
+
+    Attributes:
+        depth: [B, H, W] [m], float32 or float64; 0 where not valid.
+        T_world_cam: [B, 4, 4] float64 camera-to-world, rotation projected onto SO(3); identity if faulty.
+        intrinsics: [B, 3, 3] float64 [px]; a harmless camera if faulty.
+        aleatoric, epistemic: [B, H, W] [m^2] in the depth's dtype, or None.
+        features: [B, F, H, W] or None.
+        valid: [B, H, W] True where depth is finite and positive, A and E are finite and not negative,
+            features are finite, the caller's mask agrees and the stream has no fault.
+        fault: [B] int64 index into ``FRAME_FAULTS``, 0 = fine.
+        rotation_deviation: [B] float64 max |R^T R - I| of the pose as given.
+    """
+
+    depth: Tensor
+    T_world_cam: Tensor
+    intrinsics: Tensor
+    aleatoric: Tensor | None
+    epistemic: Tensor | None
+    features: Tensor | None
+    valid: Tensor
+    fault: Tensor
+    rotation_deviation: Tensor
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image height and width [px]."""
+        return self.depth.shape[-2], self.depth.shape[-1]
+
+
+def check_frame(
+    depth: Tensor,
+    pose: Tensor,
+    intrinsics: Tensor,
+    aleatoric: Tensor | None,
+    epistemic: Tensor | None,
+    valid: Tensor | None,
+    features: Tensor | None,
+    *,
+    feature_count: int,
+    rotation_tolerance: float,
+) -> FrameInput:
+    """Check and normalise one frame (shapes as in :meth:`ufmstar_torch.UfMStar.forward`).
+
+    Raises:
+        TypeError: an argument is no tensor or has the wrong kind of dtype.
+        ValueError: an argument has the wrong shape or lies on another device than ``depth``.
+    """
+    _require_float("depth", depth)
+    shape = tuple(depth.shape)
+    if not (len(shape) == 3 or (len(shape) == 4 and shape[1] == 1)) or 0 in shape:
+        raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}")
+    dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
+    plain = depth.detach().reshape(shape[0], *shape[-2:]).to(dtype)
+    a = _like_depth("aleatoric", aleatoric, depth, plain)
+    e = _like_depth("epistemic", epistemic, depth, plain)
+    extra = _features(features, feature_count, plain)
+
+    T = _matrix("pose", pose, 4, plain)
+    K = _matrix("intrinsics", intrinsics, 3, plain)
+    deviation = rotation_deviation(T[..., :3, :3])
+    fault = _frame_fault(T, K, deviation, rotation_tolerance).to(plain.device)
+    fine = fault == 0
+
+    use = plain.isfinite() & (plain > 0) & fine[:, None, None]
+    for variance in (a, e):
+        if variance is not None:
+            use = use & variance.detach().isfinite() & (variance.detach() >= 0)
+    if extra is not None:
+        use = use & extra.isfinite().all(1)
+    if valid is not None:
+        use = use & _mask(valid, depth).reshape(plain.shape)
+    T_safe, K_safe = _harmless(T.to(plain.device), K.to(plain.device), fine)
+    safe_depth = torch.where(use, plain, torch.zeros_like(plain))
+    return FrameInput(safe_depth, T_safe, K_safe, a, e, extra, use, fault, deviation.to(plain.device))
+
+
+def _require_float(name: str, value: object) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+    if not value.is_floating_point():
+        raise TypeError(f"{name} must have a floating-point dtype, got {value.dtype}")
+
+
+def _on_device(name: str, value: Tensor, depth: Tensor) -> None:
+    if value.device != depth.device:
+        raise ValueError(f"{name} must lie on the depth's device {depth.device}, got {value.device}")
+
+
+def _like_depth(name: str, value: Tensor | None, depth: Tensor, plain: Tensor) -> Tensor | None:
+    if value is None:
+        return None
+    _require_float(name, value)
+    _on_device(name, value, depth)
+    if value.shape not in (depth.shape, plain.shape):
+        raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
+    return value.reshape(plain.shape).to(plain.dtype)
+
+
+def _mask(valid: object, depth: Tensor) -> Tensor:
+    if not isinstance(valid, Tensor) or valid.dtype != torch.bool:
+        kind = valid.dtype if isinstance(valid, Tensor) else type(valid).__name__
+        raise TypeError(f"valid must be a torch.bool tensor (True = use), got {kind}")
+    _on_device("valid", valid, depth)
+    if (
+        valid.numel() != depth.numel()
+        or valid.shape[0] != depth.shape[0]
+        or valid.shape[-2:] != depth.shape[-2:]
+    ):
+        raise ValueError(f"valid must have the depth's shape {tuple(depth.shape)}, got {tuple(valid.shape)}")
+    return valid
+
+
+def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | None:
+    expected = (plain.shape[0], count, *plain.shape[1:])
+    if features is None:
+        if count:
+            raise ValueError(f"features must be given with shape {expected}: the config asks for {count}")
+        return None
+    _require_float("features", features)
+    _on_device("features", features, plain)
+    if tuple(features.shape) != expected:
+        raise ValueError(
+            f"features must have shape {expected} (config.features = {count}), got {tuple(features.shape)}"
+        )
+    return features.detach().to(plain.dtype)
+
+
+def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
+    """[B, n, n] float64 on the device where it was given (a pose on the CPU is checked without waiting)."""
+    _require_float(name, value)
+    if value.shape[-2:] != (n, n) or value.dim() not in (2, 3):
+        raise ValueError(f"{name} must be [B, {n}, {n}] or [{n}, {n}], got {tuple(value.shape)}")
+    if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):
+        raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
+    return value.detach().to(torch.float64).expand(plain.shape[0], n, n)
+
+
+def _frame_fault(T: Tensor, K: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
+    """[B] the first fault of each stream; later entries of the list do not overwrite earlier ones."""
+    zero = torch.zeros((), dtype=T.dtype, device=T.device)
+    last = torch.stack([zero, zero, zero, zero + 1])
+    K = K.to(T.device)
+    off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
+    checks = [
+        ~T.isfinite().all((-2, -1)),
+        (T[:, 3] - last).abs().amax(-1) > tolerance,
+        deviation > tolerance,
+        (torch.linalg.cross(T[:, 0, :3], T[:, 1, :3]) * T[:, 2, :3]).sum(-1) < 0,  # the determinant
+        ~K.isfinite().all((-2, -1)),
+        (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0),
+    ]
+    fault = torch.zeros(T.shape[0], dtype=torch.int64, device=T.device)
+    for code, bad in reversed(list(enumerate(checks, start=1))):
+        fault = torch.where(bad, torch.full_like(fault, code), fault)
+    return fault
+
+
+def _harmless(T: Tensor, K: Tensor, fine: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses with exact rotations, and an identity or a unit camera in place of faulty ones."""
+    eye4 = torch.eye(4, dtype=T.dtype, device=T.device)
+    eye3 = torch.eye(3, dtype=K.dtype, device=K.device)
+    mask = fine[:, None, None]
+    T = torch.where(mask, T, eye4)
+    upper = torch.cat([nearest_rotation(T[:, :3, :3]), T[:, :3, 3:]], dim=-1)
+    return torch.cat([upper, eye4[3:].expand(T.shape[0], 1, 4)], dim=1), torch.where(mask, K, eye3)

@@ -1,0 +1,192 @@
+"""Step 1 and the rest together: network(s), their alternation and UfM* on one device.
+
+Section "Single DNN inference": one inference per image, by the members of an ensemble in turn, by a
+stochastic network, or by a single one; or, for comparison, by all of them at once ("Full").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
+
+# image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
+Preprocess = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class UncertainPrediction:
+    """A depth prediction with its total variance.
+
+    Attributes:
+        prediction: what the network said (for "full": the predictive mean, mean A and E over the members).
+        ufm: the output of UfM*; ``ufm.variance`` [m^2] is the answer.
+        intrinsics: [B, 3, 3] of the predicted depth map [px].
+        member: index of the network that was run, or None if all were.
+    """
+
+    prediction: DepthPrediction
+    ufm: UfMStarOutput
+    intrinsics: Tensor
+    member: int | None
+
+    @property
+    def depth(self) -> Tensor:
+        """[B, H, W] [m]."""
+        return self.prediction.depth
+
+    @property
+    def variance(self) -> Tensor:
+        """[B, H, W] V [m^2]."""
+        return self.ufm.variance
+
+    @property
+    def std(self) -> Tensor:
+        """[B, H, W] sqrt(V) [m]."""
+        return self.ufm.std
+
+    @property
+    def disagreement(self) -> Tensor:
+        """[B, H, W] M [m^2]."""
+        return self.ufm.disagreement
+
+
+class UncertainDepth(nn.Module):
+    """Depth with a variance from any pretrained network(s): image, pose and intrinsics in.
+
+    Args:
+        networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
+            separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`.
+        config: of UfM*.
+        mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
+            single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
+            (or ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean
+            aleatoric variance and the variance between the members as epistemic variance.
+        samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
+            network must sample by itself in eval mode). None: the network is deterministic.
+        preprocess: maps image and intrinsics to the network's input; None passes both through.
+
+    The networks are put into eval mode here and run without gradients. A stochastic network decides itself
+    to sample in eval mode, as decoder dropout at test time does.
+
+    Raises:
+        ValueError: no network, an unknown mode, or ``samples`` that fit neither.
+    """
+
+    image_index: Tensor
+
+    def __init__(
+        self,
+        networks: nn.Module | Sequence[nn.Module],
+        config: UfMStarConfig | None = None,
+        *,
+        mode: str = "alternate",
+        samples: int | None = None,
+        preprocess: Preprocess | None = None,
+    ) -> None:
+        super().__init__()
+        members = [networks] if isinstance(networks, nn.Module) else list(networks)
+        if not members or not all(isinstance(m, nn.Module) for m in members):
+            raise ValueError("networks must be an nn.Module or a non-empty sequence of them")
+        if mode not in ("alternate", "full"):
+            raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
+        if samples is not None and (samples < 2 or len(members) > 1 or mode != "full"):
+            raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
+        if mode == "full" and len(members) == 1 and samples is None:
+            raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
+        self.networks = nn.ModuleList(members).eval()
+        self.ufm = UfMStar(config)
+        self.mode = mode
+        self.samples = samples
+        self.preprocess = preprocess
+        self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
+        self._next = 0
+
+    def forward(
+        self, image: Tensor, pose: Tensor, intrinsics: Tensor, valid: Tensor | None = None
+    ) -> UncertainPrediction:
+        """Predict depth and its variance for the next image of every stream.
+
+        Args:
+            image: [B, 3, H, W] as the preprocessing (or the network) expects it.
+            pose: [B, 4, 4] or [4, 4] camera-to-world [m].
+            intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
+            valid: [B, h, w] bool at the depth map's size, True = use.
+
+        Raises:
+            ValueError, TypeError: as :meth:`UfMStar.forward`; the alternation has not advanced then.
+        """
+        if image.dim() != 4 or image.shape[1] != 3:
+            raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
+        K = intrinsics.expand(image.shape[0], 3, 3)
+        with torch.no_grad():
+            x, K = (image, K) if self.preprocess is None else self.preprocess(image, K)
+            member = None if self.mode == "full" else self._next % len(self.networks)
+            prediction = self._all(x) if member is None else self._one(member, x)
+        ufm = self.ufm(
+            prediction.depth, pose, K, prediction.aleatoric_variance, prediction.epistemic_variance, valid
+        )
+        self._next += 1
+        self.image_index = torch.full_like(self.image_index, self._next)
+        return UncertainPrediction(prediction, ufm, K, member)
+
+    def _one(self, member: int, x: Tensor) -> DepthPrediction:
+        prediction = self.networks[member](x)
+        if not isinstance(prediction, DepthPrediction):
+            raise TypeError(
+                f"network {member} must return a DepthPrediction, got {type(prediction).__name__}"
+            )
+        return prediction
+
+    def _all(self, x: Tensor) -> DepthPrediction:
+        members = range(len(self.networks)) if self.samples is None else [0] * self.samples
+        return combine([self._one(n, x) for n in members])
+
+    def reset(self, streams: Sequence[int] | Tensor | None = None) -> None:
+        """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
+        self.ufm.reset(streams)
+        if streams is None:
+            self._next = 0
+            self.image_index = torch.zeros_like(self.image_index)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._next = int(self.image_index)
+
+    def train(self, mode: bool = True) -> UncertainDepth:
+        """The networks stay in eval mode: a prediction must not depend on the caller's training flag."""
+        super().train(mode)
+        self.networks.eval()
+        return self
+
+
+def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:
+    """The mixture of an ensemble's predictions (Lakshminarayanan et al. 2017).
+
+    depth = mean d_n; A = mean A_n (None unless every member has one); E = the variance of d_n between
+    the members, 1/N sum d_n^2 - (mean d_n)^2, plus the mean of their own E_n where every member has one.
+
+    Raises:
+        ValueError: no prediction.
+    """
+    if not predictions:
+        raise ValueError("predictions must not be empty")
+    depth = torch.stack([p.depth for p in predictions])
+
+    def mean_of(values: list[Tensor | None]) -> Tensor | None:
+        present = [v for v in values if v is not None]
+        return torch.stack(present).mean(0) if len(present) == len(values) else None
+
+    own = mean_of([p.epistemic_variance for p in predictions])
+    between = depth.var(0, correction=0)
+    return DepthPrediction(
+        depth.mean(0),
+        mean_of([p.aleatoric_variance for p in predictions]),
+        between if own is None else between + own,
+    )

@@ -1,0 +1,274 @@
+"""One image through steps 2 to 5: a pure function from state and frame to state and output.
+
+The mixture is kept in the frame of each stream's first camera: poses are taken relative to it in
+float64, so large world coordinates never reach the float32 state, and components nobody touches never change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.backend import Backend
+from ufmstar_torch.camera import focal_and_centre, relative_pose, unproject
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.correspond import Correspondence
+from ufmstar_torch.frame import FRAME_FAULTS, FrameInput
+from ufmstar_torch.fuse import append
+from ufmstar_torch.gaussian import floor_covariance, pixel_footprint
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import Regression, regress, smooth
+
+
+@dataclass(frozen=True)
+class UfMStarState:
+    """All that is remembered between images.
+
+    Attributes:
+        mixture: M_i in the frame of each stream's first camera.
+        T_world_first: [B, 4, 4] float64 pose of that camera; identity before the first frame.
+        started: [B] bool, True once a stream has seen a frame.
+        frames: [B] int64 number of frames used.
+        skipped: [B] int64 number of frames skipped for a fault.
+        smoothed: [B, H, W] moving average of the dense disagreement [m^2], NaN without a value; None at the start.
+    """
+
+    mixture: GaussianMixture
+    T_world_first: Tensor
+    started: Tensor
+    frames: Tensor
+    skipped: Tensor
+    smoothed: Tensor | None
+
+    @classmethod
+    def initial(
+        cls, streams: int, config: UfMStarConfig, dtype: torch.dtype, device: torch.device | str
+    ) -> UfMStarState:
+        """The empty state of ``streams`` independent streams."""
+        capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
+        counter = torch.zeros(streams, dtype=torch.int64, device=device)
+        return cls(
+            mixture=GaussianMixture.empty(
+                streams, capacity, features=config.features, dtype=dtype, device=device
+            ),
+            T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
+            started=counter.bool(),
+            frames=counter,
+            skipped=counter.clone(),
+            smoothed=None,
+        )
+
+
+@dataclass(frozen=True)
+class FrameStatistics:
+    """What happened to one frame, per stream [B].
+
+    Attributes:
+        components: K, occupied components after the frame.
+        segments: C, Gaussians segmented from the frame.
+        matched: segments fused with at least one earlier component.
+        pairs: fused (c, k) pairs.
+        new: segments appended to the mixture.
+        dropped: segments lost because ``max_components`` was reached.
+        valid_pixels: pixels used.
+        fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
+        rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
+    """
+
+    components: Tensor
+    segments: Tensor
+    matched: Tensor
+    pairs: Tensor
+    new: Tensor
+    dropped: Tensor
+    valid_pixels: Tensor
+    fault: Tensor
+    rotation_deviation: Tensor
+
+
+@dataclass(frozen=True)
+class StepOutput:
+    """The regressed disagreement and what led to it.
+
+    Attributes:
+        disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
+        features: regressed features [B, H, W, F] or [B, n, F].
+        labels: [B, H, W] int64 the segment of every pixel, -1 = none.
+        current_cam: C_i in the camera frame.
+        statistics: of this frame.
+    """
+
+    disagreement: Tensor
+    features: Tensor
+    labels: Tensor
+    current_cam: GaussianMixture
+    statistics: FrameStatistics
+
+
+def step(
+    state: UfMStarState,
+    frame: FrameInput,
+    config: UfMStarConfig,
+    backend: Backend,
+    *,
+    pixels: Tensor | None = None,
+    average: bool = True,
+) -> tuple[UfMStarState, StepOutput]:
+    """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
+
+    Args:
+        state: of the previous image; not modified.
+        frame: checked input of B streams.
+        config, backend: what to do and by which kernels.
+        pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
+        average: apply the exponential moving average.
+
+    Returns:
+        The new state and the output. A stream whose frame is at fault keeps its state and gets NaN.
+
+    Raises:
+        ValueError: a frame is at fault and ``config.on_bad_frame == "raise"``, before anything changes.
+    """
+    if config.on_bad_frame == "raise" and frame.fault.device.type == "cpu":
+        raise_faults(frame.fault.tolist())
+    fine = frame.fault == 0
+    first = torch.where((fine & ~state.started)[:, None, None], frame.T_world_cam, state.T_world_first)
+
+    current_cam, labels = segment(frame, config, backend)
+    R_cam, t_cam = relative_pose(first, frame.T_world_cam)
+    previous_cam = state.mixture.to(torch.float64).rigid(R_cam, t_cam)
+    pairs = backend.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
+    new = current_cam.valid & ~pairs.match.any(dim=2)
+
+    mixture, rounds = _make_room(state.mixture, pairs, new, frame.fault, config)
+    pairs = _pad_pairs(pairs, mixture.capacity)
+    R_first, t_first = relative_pose(frame.T_world_cam, first)
+    current_first = current_cam.rigid(R_first, t_first)
+    mixture = backend.fuse(mixture, current_first, pairs, config, rounds=rounds)
+    mixture, dropped = append(mixture, current_first, new)
+
+    mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
+    result = _read_out(mixture_cam, frame, config, backend, pixels)
+    disagreement, smoothed = _average(state.smoothed, result.disagreement, frame, config, pixels, average)
+
+    statistics = FrameStatistics(
+        components=mixture.components,
+        segments=current_cam.components,
+        matched=pairs.match.any(dim=2).sum(1),
+        pairs=pairs.match.sum((1, 2)),
+        new=new.sum(1) - dropped,
+        dropped=dropped,
+        valid_pixels=frame.valid.sum((1, 2)),
+        fault=frame.fault,
+        rotation_deviation=frame.rotation_deviation,
+    )
+    updated = UfMStarState(
+        mixture, first, state.started | fine, state.frames + fine, state.skipped + ~fine, smoothed
+    )
+    return updated, StepOutput(disagreement, result.features, labels, current_cam, statistics)
+
+
+def raise_faults(faults: list[int]) -> None:
+    """Raise a ValueError that names every stream at fault.
+
+    Raises:
+        ValueError: an entry of ``faults`` is not 0.
+    """
+    bad = [f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code]
+    if bad:
+        raise ValueError("; ".join(bad))
+
+
+def segment(frame: FrameInput, config: UfMStarConfig, backend: Backend) -> tuple[GaussianMixture, Tensor]:
+    """Step 2: C_i in the camera frame, float64, eigenvalues at least the pixel footprint; and its labels."""
+    mixture, labels = backend.spgf(
+        frame.depth, frame.intrinsics, config.segment, valid=frame.valid, features=frame.features
+    )
+    mixture = mixture.to(torch.float64)
+    fx, fy, _, _ = focal_and_centre(frame.intrinsics)
+    floor = pixel_footprint(mixture.mean[..., 2], torch.minimum(fx, fy)[:, None])
+    return mixture.replace(covariance=floor_covariance(mixture.covariance, floor)), labels
+
+
+def _make_room(
+    mixture: GaussianMixture, pairs: Correspondence, new: Tensor, fault: Tensor, config: UfMStarConfig
+) -> tuple[GaussianMixture, int]:
+    """Double the capacity as often as needed, and bound the rounds of fusion.
+
+    This holds the only wait for an accelerator: one small read, which growth needs, and which also
+    brings the number of rounds and, where they are to raise, the faults. With a capacity that cannot grow
+    and faults that skip, nothing is read and the static bounds serve.
+    """
+    limit = config.max_components
+    fixed = limit is not None and mixture.capacity >= limit and config.on_bad_frame == "skip"
+    if fixed and mixture.mean.device.type != "cpu":
+        return mixture, pairs.match.shape[1]
+    if mixture.mean.device.type == "meta":
+        raise ValueError("device 'meta' needs max_components <= initial_capacity and on_bad_frame='skip'")
+    needed = mixture.components + new.sum(1)
+    most = pairs.match.sum(1).amax(1) if mixture.capacity else torch.zeros_like(needed)
+    needed_, rounds, faults = torch.stack([needed, most, fault]).tolist()
+    if config.on_bad_frame == "raise":
+        raise_faults(faults)
+    capacity = mixture.capacity
+    while capacity < max(needed_):
+        capacity *= 2
+    return mixture.padded(capacity if limit is None else min(capacity, limit)), max(rounds)
+
+
+def _pad_pairs(pairs: Correspondence, capacity: int) -> Correspondence:
+    """The pairs for a mixture that has grown: the new slots match nothing."""
+    missing = capacity - pairs.match.shape[2]
+    if not missing:
+        return pairs
+    pad = torch.nn.functional.pad
+    return Correspondence(pad(pairs.match, (0, missing)), pad(pairs.overlap, (0, missing)))
+
+
+def _read_out(
+    mixture_cam: GaussianMixture,
+    frame: FrameInput,
+    config: UfMStarConfig,
+    backend: Backend,
+    pixels: Tensor | None,
+) -> Regression:
+    """Step 5 at every pixel, or at some; NaN where not valid."""
+    if pixels is None:
+        result = backend.regress_image(mixture_cam, frame.depth, frame.intrinsics, config)
+        valid = frame.valid
+    else:
+        points = unproject(frame.depth, frame.intrinsics).flatten(1, 2)
+        chosen = torch.gather(points, 1, pixels[..., None].expand(*pixels.shape, 3))
+        result = regress(mixture_cam, chosen, config)
+        valid = torch.gather(frame.valid.flatten(1), 1, pixels)
+    nan = torch.full_like(result.disagreement, torch.nan)
+    features = torch.where(valid[..., None], result.features, nan[..., None])
+    return replace(result, disagreement=torch.where(valid, result.disagreement, nan), features=features)
+
+
+def _average(
+    smoothed: Tensor | None,
+    disagreement: Tensor,
+    frame: FrameInput,
+    config: UfMStarConfig,
+    pixels: Tensor | None,
+    average: bool,
+) -> tuple[Tensor, Tensor | None]:
+    """The moving average for output (NaN where not valid now) and for the state.
+
+    It restarts when the image size changes. On a subset the dense map serves as memory at those pixels.
+    """
+    if not average or config.ema_alpha == 1.0:
+        return disagreement, smoothed
+    if smoothed is not None and smoothed.shape[1:] != frame.size:
+        smoothed = None
+    if pixels is None:
+        mixed = smooth(smoothed, disagreement, config.ema_alpha)
+        return torch.where(frame.valid, mixed, torch.nan), mixed
+    memory = torch.full_like(frame.depth, torch.nan) if smoothed is None else smoothed
+    memory = memory.to(disagreement.dtype).flatten(1)
+    mixed = smooth(torch.gather(memory, 1, pixels), disagreement, config.ema_alpha)
+    valid = torch.gather(frame.valid.flatten(1), 1, pixels)
+    return torch.where(valid, mixed, torch.nan), memory.scatter(1, pixels, mixed).view(frame.depth.shape)

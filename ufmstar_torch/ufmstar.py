@@ -1,0 +1,409 @@
+"""UfM* as a module: the only stateful class of the core."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.backend import select
+from ufmstar_torch.camera import invert_rigid
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput, check_frame
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import Regression, regress, sample_pixels
+from ufmstar_torch.step import FrameStatistics, StepOutput, UfMStarState, step
+
+_MIXTURE = ("mean", "covariance", "weight", "disagreement", "count", "features")
+_STATE = (*_MIXTURE, "T_world_first", "started", "frames", "skipped", "smoothed")
+
+
+@dataclass(frozen=True)
+class UfMStarOutput:
+    """The prediction of one frame with its variance. Maps have the layout in which ``depth`` was given.
+
+    Attributes:
+        depth: the depth as given [m].
+        variance: V, the total variance of the depth [m^2]: M, plus A and E where given (and not switched
+            off in the config), at least ``config.variance_floor``. NaN where not valid.
+        disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
+        aleatoric, epistemic: A and E as given [m^2], or None.
+        features: regressed further entries of H, [B, H, W, F], in the caller's units.
+        valid: True where the pixel was used.
+        labels: [B, H, W] the pixel's segment in ``current_cam``, -1 = none.
+        current_cam: C_i, the segments of this frame in the camera frame, float64.
+        statistics: per-stream counts of this frame.
+    """
+
+    depth: Tensor
+    variance: Tensor
+    disagreement: Tensor
+    aleatoric: Tensor | None
+    epistemic: Tensor | None
+    features: Tensor
+    valid: Tensor
+    labels: Tensor
+    current_cam: GaussianMixture
+    statistics: FrameStatistics
+
+    @property
+    def std(self) -> Tensor:
+        """sqrt(variance) [m]."""
+        return self.variance.sqrt()
+
+
+@dataclass(frozen=True)
+class MeanUncertainty:
+    """An image average of the total variance from a sample of pixels, per stream [B].
+
+    Attributes:
+        mean: average of V over the sampled pixels [m^2]; NaN without a valid pixel.
+        standard_error: of that average as an estimate of the mean over all valid pixels [m^2];
+            NaN with fewer than two pixels.
+        pixels: number of pixels averaged.
+        statistics: per-stream counts of this frame.
+    """
+
+    mean: Tensor
+    standard_error: Tensor
+    pixels: Tensor
+    statistics: FrameStatistics
+
+
+class UfMStar(nn.Module):
+    """Uncertainty from Motion*: feed it one predicted depth map per image, read a variance per pixel.
+
+    The state (the mixture of every stream) lives in buffers: ``.to()``, ``deepcopy`` and ``state_dict``
+    carry it, and a run continued from a saved state equals an uninterrupted one to the last bit. The
+    state is float32 or float64 (``.half()`` leaves it alone); poses and the fusion are float64 throughout,
+    also under autocast. A frame that raises leaves the state as it was. Nothing is learned: gradients flow to
+    ``aleatoric`` and ``epistemic`` through ``variance``, and to nothing else.
+
+    Args:
+        config: see :class:`UfMStarConfig`; None = the paper's.
+        dtype: of the state, torch.float32 or torch.float64.
+        device: of the state until ``.to()``; it follows the first frame otherwise.
+
+    Example::
+
+        ufm = UfMStar()
+        for image, T_world_cam in video:
+            out = ufm(network(image), T_world_cam, K)   # depth [B, H, W]
+            trust = out.std                              # [m]
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    weight: Tensor
+    disagreement: Tensor
+    count: Tensor
+    features: Tensor
+    T_world_first: Tensor
+    started: Tensor
+    frames: Tensor
+    skipped: Tensor
+    smoothed: Tensor
+
+    def __init__(
+        self,
+        config: UfMStarConfig | None = None,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        if config is not None and not isinstance(config, UfMStarConfig):
+            raise TypeError(f"config must be a UfMStarConfig or None, got {type(config).__name__}")
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+        self.config = config if config is not None else UfMStarConfig()
+        for name, value in _to_buffers(UfMStarState.initial(0, self.config, dtype, device or "cpu")).items():
+            self.register_buffer(name, value)
+
+    # ---- the algorithm ----
+
+    def forward(
+        self,
+        depth: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        aleatoric: Tensor | None = None,
+        epistemic: Tensor | None = None,
+        valid: Tensor | None = None,
+        *,
+        features: Tensor | None = None,
+    ) -> UfMStarOutput:
+        """Take in one predicted depth map per stream and return its variance.
+
+        Args:
+            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype.
+                Pixels that are NaN, infinite, zero or negative are left out and counted.
+            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m]. Rotations off by at most
+                ``config.rotation_tolerance`` are projected onto SO(3) and reported.
+            intrinsics: [B, 3, 3] or [3, 3] in pixels of this depth map, first pixel's centre at (0, 0).
+            aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it is not a
+                finite number >= 0 are left out.
+            epistemic: likewise E [m^2].
+            valid: like ``depth``, bool, True = use.
+            features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed.
+
+        Returns:
+            The variance and its parts.
+
+        Raises:
+            TypeError: wrong kind of argument or dtype.
+            ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first);
+                a pose that is not rigid or bad intrinsics (``config.on_bad_frame == "skip"``: counted instead).
+        """
+        frame = self._check(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
+        out = self._advance(frame)
+        shape = depth.shape
+        disagreement = out.disagreement.reshape(shape)
+        variance = self._total(
+            disagreement,
+            None if frame.aleatoric is None else frame.aleatoric.reshape(shape),
+            None if frame.epistemic is None else frame.epistemic.reshape(shape),
+        )
+        return UfMStarOutput(
+            depth=depth,
+            variance=variance,
+            disagreement=disagreement,
+            aleatoric=aleatoric,
+            epistemic=epistemic,
+            features=out.features,
+            valid=frame.valid.reshape(shape),
+            labels=out.labels,
+            current_cam=out.current_cam,
+            statistics=out.statistics,
+        )
+
+    def mean_uncertainty(
+        self,
+        depth: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        aleatoric: Tensor | None = None,
+        epistemic: Tensor | None = None,
+        valid: Tensor | None = None,
+        *,
+        features: Tensor | None = None,
+        pixels: int | None = None,
+        fraction: float | None = None,
+        seed: int = 0,
+        average: bool = False,
+    ) -> MeanUncertainty:
+        """Like :meth:`forward`, but regress only a seeded sample of pixels: an average per image for
+        active learning at a fraction of the cost (section "Compute- and memory efficiency").
+
+        Args:
+            pixels: size of the sample per image; or
+            fraction: the same as a share of all pixels, in (0, 1]. Neither: 1000 pixels.
+            seed: of the sample; frame i of a stream uses another sample than frame j only if told so.
+            average: apply the exponential moving average at the sampled pixels.
+
+        Raises:
+            ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
+        """
+        frame = self._check(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
+        index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
+        out = self._advance(frame, pixels=index, average=average)
+
+        def chosen(value: Tensor | None) -> Tensor | None:
+            return None if value is None else torch.gather(value.flatten(1), 1, index)
+
+        variance = self._total(out.disagreement, chosen(frame.aleatoric), chosen(frame.epistemic))
+        count = used.sum(1)
+        value = torch.where(used, variance, torch.zeros_like(variance))
+        mean = value.sum(1) / count  # 0/0 = NaN where no pixel is valid
+        squares = torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)).sum(1)
+        error = (squares / (count - 1).clamp_min(0) / count).sqrt()
+        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, out.statistics)
+
+    def query(self, points: Tensor, frame: str = "world") -> Regression:
+        """The disagreement at any 3D point, from the present mixture, without touching the state.
+
+        Args:
+            points: [B, N, 3] [m].
+            frame: "world" (the poses' frame) or "first" (each stream's first camera).
+
+        Returns:
+            disagreement [B, N] [m^2] and features [B, N, F]; the prior far from everything seen.
+
+        Raises:
+            ValueError: wrong shape or frame, or no frame has been taken in yet.
+        """
+        if frame not in ("world", "first"):
+            raise ValueError(f"frame must be 'world' or 'first', got {frame!r}")
+        streams = self.mean.shape[0]
+        if streams == 0:
+            raise ValueError("query needs a mixture: call the module on a frame first")
+        if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
+            raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
+        with torch.no_grad(), torch.autocast(points.device.type, enabled=False):
+            local = points.detach()
+            if frame == "world":
+                T = invert_rigid(self.T_world_first)
+                local = torch.einsum("bij,bnj->bni", T[:, :3, :3], local.double()) + T[:, None, :3, 3]
+            dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
+            return regress(self.mixture, local.to(dtype), self.config)
+
+    # ---- the state ----
+
+    @property
+    def mixture(self) -> GaussianMixture:
+        """M_i, [B, K], in the frame of each stream's first camera (``T_world_first`` takes it to the world)."""
+        return GaussianMixture(**{name: getattr(self, name) for name in _MIXTURE})
+
+    @property
+    def state(self) -> UfMStarState:
+        """The state as the pure function :func:`ufmstar_torch.step.step` takes it."""
+        smoothed = self.smoothed if self.smoothed.shape[-1] else None
+        return UfMStarState(
+            self.mixture, self.T_world_first, self.started, self.frames, self.skipped, smoothed
+        )
+
+    def reset(self, streams: Sequence[int] | Tensor | None = None) -> None:
+        """Forget everything, or only some streams.
+
+        Args:
+            streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
+
+        Raises:
+            IndexError: an index is out of range.
+            ValueError: a mask of the wrong length.
+        """
+        dtype, device, b = self.mean.dtype, self.mean.device, self.mean.shape[0]
+        if streams is None:
+            self._store(UfMStarState.initial(0, self.config, dtype, device))
+            return
+        chosen = torch.as_tensor(streams, device=device)
+        if chosen.dtype == torch.bool and chosen.shape != (b,):
+            raise ValueError(f"streams as a mask must have shape ({b},), got {tuple(chosen.shape)}")
+        keep = torch.ones(b, dtype=torch.bool, device=device)
+        keep[chosen if chosen.numel() else chosen.long()] = False
+        fresh = {"T_world_first": torch.eye(4, dtype=torch.float64, device=device), "smoothed": torch.nan}
+        for name in _STATE:
+            old = getattr(self, name)
+            mask = keep.view(-1, *[1] * (old.dim() - 1))
+            setattr(
+                self,
+                name,
+                torch.where(mask, old, torch.as_tensor(fresh.get(name, 0), dtype=old.dtype, device=device)),
+            )
+
+    def _advance(self, frame: FrameInput, pixels: Tensor | None = None, average: bool = True) -> StepOutput:
+        """Run the pure step and keep its state. Normal tensors also under inference_mode: they must
+        outlive it."""
+        with (
+            torch.inference_mode(False),
+            torch.no_grad(),
+            torch.autocast(frame.depth.device.type, enabled=False),
+        ):
+            backend = select(self.config.backend, frame.depth.device.type)
+            state, out = step(
+                self._state_for(frame), frame, self.config, backend, pixels=pixels, average=average
+            )
+        self._store(state)
+        return out
+
+    def _state_for(self, frame: FrameInput) -> UfMStarState:
+        streams, device = frame.depth.shape[0], frame.depth.device
+        if self.mean.shape[0] == 0:
+            return UfMStarState.initial(streams, self.config, self.mean.dtype, device)
+        if self.mean.shape[0] != streams:
+            raise ValueError(
+                f"depth has {streams} streams but the state holds {self.mean.shape[0]}: call reset() first"
+            )
+        if self.mean.device != device:
+            raise ValueError(
+                f"depth lies on {device} but the state on {self.mean.device}: move one with .to()"
+            )
+        return self.state
+
+    def _store(self, state: UfMStarState) -> None:
+        for name, value in _to_buffers(state).items():
+            setattr(self, name, value)
+
+    def _check(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
+        aleatoric, epistemic, valid, features = optional
+        return check_frame(
+            depth, pose, intrinsics, aleatoric, epistemic, valid, features,
+            feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
+        )  # fmt: skip
+
+    def _total(self, disagreement: Tensor, aleatoric: Tensor | None, epistemic: Tensor | None) -> Tensor:
+        """V = M + A + E, at least the floor (section "Uncertainty Regression"); NaN stays NaN."""
+        total = disagreement
+        if aleatoric is not None and self.config.add_aleatoric:
+            total = total + aleatoric
+        if epistemic is not None and self.config.add_epistemic:
+            total = total + epistemic
+        return total.clamp_min(self.config.variance_floor) if self.config.variance_floor else total
+
+    # ---- nn.Module plumbing ----
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> UfMStar:
+        """``.to()`` and friends, except that half precision is refused for the state and that the
+        pose of the first camera stays float64: a world coordinate of kilometres needs it."""
+        before = {name: getattr(self, name) for name in _STATE}
+        super()._apply(fn, recurse)
+        for name, old in before.items():
+            moved = getattr(self, name)
+            narrowed = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
+            if (narrowed or name == "T_world_first") and moved.dtype != old.dtype:
+                setattr(self, name, old.to(moved.device))
+        return self
+
+    def get_extra_state(self) -> Tensor:
+        """The config as bytes, so that a checkpoint (safetensors too) says what it was made with."""
+        return torch.tensor(list(json.dumps(self.config.to_dict()).encode()), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Warn where the config of a loaded state differs from this module's."""
+        saved = json.loads(bytes(state.tolist()).decode())
+        ours = self.config.to_dict()
+        changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
+        if changed:
+            warnings.warn(
+                f"the loaded state was made with another config: {', '.join(changed)} differ", stacklevel=2
+            )
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Take the shapes of a saved state (streams, capacity, image size) before its values are copied."""
+        for name in _STATE:
+            saved, own = state_dict.get(prefix + name), getattr(self, name)
+            if isinstance(saved, Tensor) and saved.shape != own.shape:
+                setattr(self, name, torch.empty(saved.shape, dtype=own.dtype, device=own.device))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def extra_repr(self) -> str:
+        """Streams and components."""
+        return f"streams={self.mean.shape[0]}, capacity={self.mean.shape[1]}, backend={self.config.backend!r}"
+
+
+def _to_buffers(state: UfMStarState) -> dict[str, Tensor]:
+    """The state as named tensors; an absent moving average is a map of size 0 x 0."""
+    mean = state.mixture.mean
+    smoothed = state.smoothed if state.smoothed is not None else mean.new_zeros(mean.shape[0], 0, 0)
+    rest = {name: getattr(state, name) for name in ("T_world_first", "started", "frames", "skipped")}
+    return {**state.mixture.tensors(), **rest, "smoothed": smoothed}
+
+
+def _sample_size(frame: FrameInput, pixels: int | None, fraction: float | None) -> int:
+    total = frame.depth.shape[-1] * frame.depth.shape[-2]
+    if pixels is not None and fraction is not None:
+        raise ValueError("give pixels or fraction, not both")
+    if fraction is not None:
+        if not 0 < fraction <= 1:
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
+        return max(1, round(fraction * total))
+    if pixels is None:
+        return min(1000, total)
+    if isinstance(pixels, bool) or not isinstance(pixels, int) or not 1 <= pixels <= total:
+        raise ValueError(f"pixels must be a whole number from 1 to H*W = {total}, got {pixels!r}")
+    return pixels
