@@ -1,0 +1,217 @@
+"""UfM* steps 2 to 6 in NumPy float64 loops, straight from the paper; slow, plain, and independent.
+
+Imports neither torch nor the package. Component lists are plain Python lists of dicts with keys mean,
+cov, weight, m, count, features; the mixture is kept in the first camera's frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from oracle_spgf import spgf_oracle
+
+PIXEL_VARIANCE = 1.0 / 12.0
+
+
+def sqrtm(S):
+    values, vectors = np.linalg.eigh((S + S.T) / 2)
+    return vectors @ np.diag(np.sqrt(np.maximum(values, 0))) @ vectors.T
+
+
+def w2_squared(mean_a, cov_a, mean_b, cov_b):
+    root = sqrtm(cov_a)
+    Q = root @ cov_b @ root
+    return float(np.sum((mean_b - mean_a) ** 2) + max(0.0, np.trace(cov_a + cov_b - 2 * sqrtm(Q))))
+
+
+def geodesic(mean_k, cov_k, mean_c, cov_c, lam):
+    root = sqrtm(cov_k)
+    inverse = np.linalg.inv(root)
+    Z = inverse @ sqrtm(root @ cov_c @ root) @ inverse
+    T = (1 - lam) * np.eye(3) + lam * Z
+    return (1 - lam) * mean_k + lam * mean_c, T @ cov_k @ T.T
+
+
+def bhattacharyya(mean_a, cov_a, mean_b, cov_b):
+    S = (cov_a + cov_b) / 2
+    d = mean_a - mean_b
+    log_ratio = np.log(np.linalg.det(S) / np.sqrt(np.linalg.det(cov_a) * np.linalg.det(cov_b)))
+    return float(np.exp(-d @ np.linalg.solve(S, d) / 8 - log_ratio / 2))
+
+
+def project(mean, cov, K):
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    x, y, z = mean
+    A = np.array([[fx / z, 0, -fx * x / z**2], [0, fy / z, -fy * y / z**2]])
+    return np.array([fx * x / z + cx, fy * y / z + cy]), A @ cov @ A.T + PIXEL_VARIANCE * np.eye(2)
+
+
+def floor_eigenvalues(cov, floor):
+    values, vectors = np.linalg.eigh(cov)
+    if values[0] >= floor:
+        return cov
+    return vectors @ np.diag(np.maximum(values, floor)) @ vectors.T
+
+
+def transform(component, R, t):
+    return {**component, "mean": R @ component["mean"] + t, "cov": R @ component["cov"] @ R.T}
+
+
+def relative(T_world_a, T_world_b):
+    """Rotation and translation from camera a into camera b."""
+    T = np.linalg.inv(T_world_b) @ T_world_a
+    return T[:3, :3], T[:3, 3]
+
+
+def segment(depth, K, config, *, valid=None, features=None):
+    """C_i with the pixel-footprint floor; config is a dict of SPGF settings (already scaled)."""
+    components = []
+    for g in spgf_oracle(depth, K, config, valid=valid, features=features):
+        floor = (g["mean"][2] / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
+        components.append({**g, "cov": floor_eigenvalues(g["cov"], floor), "m": 0.0, "count": 1})
+    return components
+
+
+def candidate(component_cam, K, size, near):
+    if component_cam["mean"][2] <= near:
+        return None
+    mean, cov = project(component_cam["mean"], component_cam["cov"], K)
+    inside = -0.5 <= mean[0] < size[1] - 0.5 and -0.5 <= mean[1] < size[0] - 0.5
+    return (mean, cov) if inside else None
+
+
+def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
+    """For every c the list of matched k, and the overlaps."""
+    projected = [candidate(k, K, size, near) for k in previous_cam]
+    matches, overlaps = [], {}
+    for c, component in enumerate(current_cam):
+        own = candidate(component, K, size, near)
+        found = []
+        for k, other in enumerate(projected):
+            if own is None or other is None:
+                continue
+            overlaps[c, k] = bhattacharyya(*other, *own)
+            if overlaps[c, k] >= eta:
+                found.append(k)
+        kept = []
+        for k in found:
+            hidden = False
+            for other in found:
+                nearer = previous_cam[other]["mean"][2] < previous_cam[k]["mean"][2]
+                if nearer and bhattacharyya(*projected[other], *projected[k]) > eta_occl:
+                    hidden = True
+            if not hidden:
+                kept.append(k)
+        matches.append(kept)
+    return matches, overlaps
+
+
+def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False):
+    """M_i from M_(i-1) and C_i, both in one frame; returns a new list."""
+    fused = [dict(k) for k in mixture]
+    for c, ks in enumerate(matches):  # increasing c for every k
+        for k in ks:
+            g, new = fused[k], current[c]
+            pi_c = new["weight"] * (overlaps[c, k] if overlap_weighted else 1.0)
+            lam = pi_c / (g["weight"] + pi_c)
+            distance = w2_squared(g["mean"], g["cov"], new["mean"], new["cov"])
+            g["mean"], g["cov"] = geodesic(g["mean"], g["cov"], new["mean"], new["cov"], lam)
+            g["m"] = (1 - lam) * g["m"] + lam * distance
+            g["features"] = (1 - lam) * g["features"] + lam * new["features"]
+            g["weight"] += pi_c
+            g["count"] += 1
+    for c, ks in enumerate(matches):
+        if not ks:
+            fused.append({**current[c], "m": 0.0, "count": 1})
+    return fused
+
+
+def density(x, mean, cov):
+    d = x - mean
+    return np.exp(-d @ np.linalg.solve(cov, d) / 2) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(cov))
+
+
+def neighbours(x, mixture, sigmas, radius):
+    chosen = []
+    for g in mixture:
+        gap = np.abs(x - g["mean"]) - sigmas * np.sqrt(np.diag(g["cov"]))
+        if np.max(gap) <= radius:
+            chosen.append(g)
+    return chosen
+
+
+def regress_point(x, mixture, *, prior_weight, prior_mean, neighbourhood=None):
+    """m_hat(x) and the features; neighbourhood = (sigmas, near, far) or None for the exact sum."""
+    used = mixture
+    if neighbourhood is not None:
+        sigmas, near, far = neighbourhood
+        used = neighbours(x, mixture, sigmas, near) or neighbours(x, mixture, sigmas, far)
+    evidence, m = prior_weight, prior_weight * prior_mean
+    features = np.zeros_like(mixture[0]["features"]) if mixture else np.zeros(0)
+    for g in used:
+        w = g["weight"] * density(x, g["mean"], g["cov"])
+        evidence += w
+        m += w * g["m"]
+        features = features + w * g["features"]
+    return m / evidence, features / evidence
+
+
+def dense(mixture_cam, depth, valid, K, **prior):
+    """m_hat at every valid pixel of a depth map, NaN elsewhere."""
+    out = np.full(depth.shape, np.nan)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if valid[v, u]:
+                d = depth[v, u]
+                x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
+                out[v, u] = regress_point(x, mixture_cam, **prior)[0]
+    return out
+
+
+class Oracle:
+    """The whole algorithm for one stream."""
+
+    def __init__(self, spgf, *, eta=0.5, eta_occl=0.7, near=0.05, prior_weight=1.0, prior_mean=0.0,
+                 alpha=0.5, overlap_weighted=False, neighbourhood=None):  # fmt: skip
+        self.spgf, self.eta, self.eta_occl, self.near = spgf, eta, eta_occl, near
+        self.prior = {"prior_weight": prior_weight, "prior_mean": prior_mean, "neighbourhood": neighbourhood}
+        self.alpha, self.overlap_weighted = alpha, overlap_weighted
+        self.mixture, self.T_first, self.smoothed = [], None, None
+        self.matches = []
+
+    def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None):
+        valid = np.isfinite(depth) & (depth > 0)
+        if self.T_first is None:
+            self.T_first = T_world_cam
+        current = segment(np.where(valid, depth, 0.0), K, self.spgf, valid=valid)
+        to_cam = relative(self.T_first, T_world_cam)
+        to_first = relative(T_world_cam, self.T_first)
+        previous_cam = [transform(g, *to_cam) for g in self.mixture]
+        self.matches, overlaps = correspond(
+            previous_cam, current, K, depth.shape, self.eta, self.eta_occl, self.near
+        )
+        current_first = [transform(g, *to_first) for g in current]
+        self.mixture = fuse(
+            self.mixture, current_first, self.matches, overlaps, overlap_weighted=self.overlap_weighted
+        )
+        mixture_cam = [transform(g, *to_cam) for g in self.mixture]
+        M = dense(mixture_cam, depth, valid, K, **self.prior)
+        if self.smoothed is not None:
+            both = (1 - self.alpha) * self.smoothed + self.alpha * M
+            M = np.where(np.isnan(M), self.smoothed, np.where(np.isnan(self.smoothed), M, both))
+        self.smoothed = M
+        M = np.where(valid, M, np.nan)
+        V = M + (0 if aleatoric is None else aleatoric) + (0 if epistemic is None else epistemic)
+        return V, M
+
+
+def barycenter(means, covs, weights, iterations=500):
+    """Wasserstein-Bures barycenter by the fixed point of Alvarez-Esteban et al. (2016)."""
+    w = np.asarray(weights) / np.sum(weights)
+    mean = sum(w_j * m for w_j, m in zip(w, means, strict=True))
+    S = sum(w_j * c for w_j, c in zip(w, covs, strict=True))
+    for _ in range(iterations):
+        root = sqrtm(S)
+        inverse = np.linalg.inv(root)
+        inner = sum(w_j * sqrtm(root @ c @ root) for w_j, c in zip(w, covs, strict=True))
+        S = inverse @ inner @ inner @ inverse
+    return mean, S

@@ -1,0 +1,346 @@
+"""Dense Gaussian mixture regression on the CPU, the exact sum with bounded culling (numba).
+
+Every 16 x 16 tile of pixels evaluates only the components that matter to it. For a tile, interval
+arithmetic over the bounding box of its points gives for each component k a lower and an upper bound of the
+squared Mahalanobis distance, and so bounds l_k <= pi_k N(x; mu_k, Sigma_k) <= h_k for all its points. A component is
+left out when h_k <= eps D / K, with D = pi_0 + sum_k l_k, a lower bound of every pixel's denominator.
+What is left out then adds up to at most eps times the denominator, which bounds the error
+
+    |m_hat - m_hat_culled| <= 2 eps max(m_k, mu_0)
+
+(tests/test_regress.py checks it; the 2 is for the two levels, blocks of tiles first, then tiles).
+Within a tile, points are taken relative to the tile's centre, so that float32 loses nothing to the distance from the camera.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange, types
+from numba.extending import overload
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import Regression
+
+# Share of the denominator that culling may leave out at each of the two levels: about the rounding of a
+# sum in the dtype, so that culling is no coarser than the arithmetic itself.
+EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
+
+_TILE = 16  # pixels; 256 points fill vector registers and still lie close together
+_BLOCK = 4  # tiles; a block of 64 x 64 pixels is culled first
+_HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
+
+
+def regress_image(
+    mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig
+) -> Regression:
+    """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors."""
+    dtype = np.float64 if depth.dtype == torch.float64 else np.float32
+    b, height, width = depth.shape
+    maps = np.empty((b, height, width), dtype)
+    features = np.empty((b, height, width, mixture_cam.features.shape[2]), dtype)
+    arguments = (
+        depth.detach().to(torch.float64 if dtype == np.float64 else torch.float32).contiguous().numpy(),
+        intrinsics.detach().double().contiguous().numpy(),
+        mixture_cam.mean.detach().double().contiguous().numpy(),
+        mixture_cam.covariance.detach().double().contiguous().numpy(),
+        mixture_cam.weight.detach().double().contiguous().numpy(),
+        mixture_cam.disagreement.detach().double().contiguous().numpy(),
+        mixture_cam.features.detach().double().contiguous().numpy(),
+    )
+    if config.regression == "exact":
+        _exact(*arguments, config.prior_weight, config.prior_mean, EPSILON[depth.dtype], maps, features)
+    else:
+        radii = (config.neighbourhood_sigmas, config.near_radius, config.far_radius)
+        _neighbourhood(*arguments, config.prior_weight, config.prior_mean, *radii, maps, features)
+    return Regression(torch.from_numpy(maps), torch.from_numpy(features))
+
+
+@njit(cache=True, nogil=True)
+def _prepare(mean, covariance, weight):
+    """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
+    index = np.flatnonzero(weight > 0)
+    whitening = np.empty((index.size, 6))
+    log_peak = np.empty(index.size)
+    for i in range(index.size):
+        S = covariance[index[i]]
+        l00 = math.sqrt(S[0, 0])
+        l10, l20 = S[1, 0] / l00, S[2, 0] / l00
+        l11 = math.sqrt(S[1, 1] - l10 * l10)
+        l21 = (S[2, 1] - l20 * l10) / l11
+        l22 = math.sqrt(S[2, 2] - l20 * l20 - l21 * l21)
+        whitening[i, 0] = 1 / l00
+        whitening[i, 1], whitening[i, 2] = -l10 / (l00 * l11), 1 / l11
+        whitening[i, 4], whitening[i, 5] = -l21 / (l11 * l22), 1 / l22
+        whitening[i, 3] = -(l20 * whitening[i, 0] + l21 * whitening[i, 1]) / l22
+        log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - _HALF_LOG_TWO_PI_CUBED
+    return index, whitening, log_peak
+
+
+@njit(cache=True, nogil=True)
+def _squares(centre, radius):
+    """Least and greatest square of a value that lies within ``radius`` of ``centre``."""
+    low = max(abs(centre) - radius, 0.0)
+    high = abs(centre) + radius
+    return low * low, high * high
+
+
+@njit(cache=True, nogil=True)
+def _cull(candidates, count, centre, half, mean, whitening, log_peak, prior, epsilon, kept):
+    """Write the components that matter inside the box centre +- half to ``kept``; return how many."""
+    least = prior
+    high = np.empty(count)
+    for j in range(count):
+        k = candidates[j]
+        W = whitening[k]
+        dx, dy, dz = centre[0] - mean[k, 0], centre[1] - mean[k, 1], centre[2] - mean[k, 2]
+        low0, high0 = _squares(W[0] * dx, W[0] * half[0])
+        low1, high1 = _squares(W[1] * dx + W[2] * dy, abs(W[1]) * half[0] + W[2] * half[1])
+        low2, high2 = _squares(W[3] * dx + W[4] * dy + W[5] * dz, abs(W[3]) * half[0] + abs(W[4]) * half[1] + W[5] * half[2]
+        )
+        least += math.exp(log_peak[k] - 0.5 * (high0 + high1 + high2))
+        high[j] = log_peak[k] - 0.5 * (low0 + low1 + low2)
+    threshold = math.log(epsilon * least / max(count, 1))
+    n = 0
+    for j in range(count):
+        if high[j] > threshold:
+            kept[n] = candidates[j]
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _box(depth, K, v0, v1, u0, u1, centre, half):
+    """Bounding box of the points of a patch of pixels; False where it has no positive depth."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
+    for v in range(v0, v1):
+        ry = (v - cy) / fy
+        for u in range(u0, u1):
+            z = np.float64(depth[v, u])
+            if not (z > 0 and z < np.inf):
+                continue
+            x, y = (u - cx) / fx * z, ry * z
+            low[0], high[0] = min(low[0], x), max(high[0], x)
+            low[1], high[1] = min(low[1], y), max(high[1], y)
+            low[2], high[2] = min(low[2], z), max(high[2], z)
+    if low[2] > high[2]:
+        return False
+    for i in range(3):
+        centre[i] = 0.5 * (low[i] + high[i])
+        # Rounding of the bounds, and of points computed in float32 relative to the centre.
+        half[i] = 0.5 * (high[i] - low[i]) * (1 + 1e-6) + 1e-12
+    return True
+
+
+def exp_(t):
+    """exp(t) for t <= 88 in t's own precision; compiled code only (see the overload)."""
+    return math.exp(t)
+
+
+@overload(exp_, inline="always")
+def _exp_overload(t):
+    if t is not types.float32:
+        return lambda t: math.exp(t)
+
+    def exp32(t):
+        # 2^n e^r with |r| <= ln(2)/2: Cody-Waite reduction and the Taylor polynomial of degree 7 (2e-7
+        # relative), as code without branches, which the compiler turns into vector instructions.
+        t = t if t > np.float32(-87.0) else np.float32(-87.0)
+        n = np.floor(t * np.float32(1.4426950408889634) + np.float32(0.5))
+        r = (t - n * np.float32(0.693145751953125)) - n * np.float32(1.42860682030941723212e-6)
+        p = np.float32(1.0 / 5040.0)
+        p = p * r + np.float32(1.0 / 720.0)
+        p = p * r + np.float32(1.0 / 120.0)
+        p = p * r + np.float32(1.0 / 24.0)
+        p = p * r + np.float32(1.0 / 6.0)
+        p = p * r + np.float32(0.5)
+        p = p * r + np.float32(1.0)
+        p = p * r + np.float32(1.0)
+        scale = np.int32((np.int32(n) + np.int32(127)) << np.int32(23))
+        return p * scale.view(np.float32)
+
+    return exp32
+
+
+@njit(cache=True, nogil=True)
+def _points(depth, K, v0, v1, u0, u1, centre, x, y, z):
+    """Points of a patch relative to ``centre``, in the arrays' precision; pixels without depth give NaN."""
+    i = 0
+    for v in range(v0, v1):
+        ry = (v - K[1, 2]) / K[1, 1]
+        for u in range(u0, u1):
+            d = np.float64(depth[v, u])
+            if not (d > 0 and d < np.inf):
+                d = np.nan
+            x[i] = (u - K[0, 2]) / K[0, 0] * d - centre[0]
+            y[i] = ry * d - centre[1]
+            z[i] = d - centre[2]
+            i += 1
+    return i
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(coefficient, x, y, z, evidence, total, density):
+    """Add one component to n points: its density to ``evidence``, times m to ``total``.
+
+    coefficient: mean (3), whitening (6), log peak, m, 1/2, all in the points' precision.
+    """
+    mx, my, mz = coefficient[0], coefficient[1], coefficient[2]
+    a, b, c = coefficient[3], coefficient[4], coefficient[5]
+    d, e, f = coefficient[6], coefficient[7], coefficient[8]
+    log_peak, m, half = coefficient[9], coefficient[10], coefficient[11]
+    for i in range(x.size):
+        dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
+        y0, y1, y2 = a * dx, b * dx + c * dy, d * dx + e * dy + f * dz
+        w = exp_(log_peak - half * (y0 * y0 + y1 * y1 + y2 * y2))
+        density[i] = w
+        evidence[i] += w
+        total[i] += w * m
+
+
+@njit(cache=True, nogil=True)
+def _tile(depth, K, v0, v1, u0, u1, centre, kept, n, index, local, log_peak, m, features, prior, prior_mean, out, out_f):
+    """Regress one tile; ``local`` holds mean and whitening of the occupied components."""
+    count = (v1 - v0) * (u1 - u0)
+    x, y, z = np.empty(count, out.dtype), np.empty(count, out.dtype), np.empty(count, out.dtype)
+    _points(depth, K, v0, v1, u0, u1, centre, x, y, z)
+    evidence, total = np.full(count, prior, out.dtype), np.full(count, prior * prior_mean, out.dtype)
+    density = np.empty(count, out.dtype)
+    sums = np.zeros((out_f.shape[2], count), out.dtype)
+    coefficient = np.empty(12, out.dtype)
+    coefficient[11] = 0.5
+    for j in range(n):
+        k = kept[j]
+        for i in range(3):
+            coefficient[i] = local[k, i] - centre[i]
+        for i in range(6):
+            coefficient[3 + i] = local[k, 3 + i]
+        coefficient[9], coefficient[10] = log_peak[k], m[index[k]]
+        _accumulate(coefficient, x, y, z, evidence, total, density)
+        for g in range(sums.shape[0]):
+            coefficient[10] = features[index[k], g]
+            for i in range(count):
+                sums[g, i] += density[i] * coefficient[10]
+    i = 0
+    for v in range(v0, v1):
+        for u in range(u0, u1):
+            out[v, u] = total[i] / evidence[i] if x[i] == x[i] else np.nan
+            for g in range(sums.shape[0]):
+                out_f[v, u, g] = sums[g, i] / evidence[i] if x[i] == x[i] else np.nan
+            i += 1
+
+
+@njit(cache=True, nogil=True)
+def _block(depth, K, v_low, u_low, components, index, local, log_peak, m, features, prior, epsilon, out, out_f):
+    """Regress a block of tiles with the components that matter to it."""
+    height, width = depth.shape
+    v_high, u_high = min(height, v_low + _TILE * _BLOCK), min(width, u_low + _TILE * _BLOCK)
+    centre, half = np.zeros(3), np.zeros(3)
+    near, kept = np.empty(components.size, np.int64), np.empty(components.size, np.int64)
+    mean, whitening = local[:, :3], local[:, 3:]
+    weight, prior_mean = prior
+    count = 0
+    if _box(depth, K, v_low, v_high, u_low, u_high, centre, half):
+        count = _cull(components, components.size, centre, half, mean, whitening, log_peak, weight, epsilon, near)
+    for v0 in range(v_low, v_high, _TILE):
+        for u0 in range(u_low, u_high, _TILE):
+            v1, u1 = min(v_high, v0 + _TILE), min(u_high, u0 + _TILE)
+            n = 0
+            if _box(depth, K, v0, v1, u0, u1, centre, half):
+                n = _cull(near, count, centre, half, mean, whitening, log_peak, weight, epsilon, kept)
+            _tile(
+                depth, K, v0, v1, u0, u1, centre, kept, n, index, local, log_peak, m, features,
+                weight, prior_mean, out, out_f,
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _exact(depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
+    """All streams; blocks of tiles in parallel."""
+    height, width = depth.shape[1:]
+    side = _TILE * _BLOCK
+    rows, columns = (height + side - 1) // side, (width + side - 1) // side
+    for b in range(depth.shape[0]):
+        index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
+        local = np.hstack((mean[b][index], whitening))
+        components = np.arange(index.size)
+        for block in prange(rows * columns):
+            _block(
+                depth[b], K[b], block // columns * side, block % columns * side, components, index, local,
+                log_peak, m[b], features[b], (prior_weight, prior_mean), epsilon, out[b], out_f[b],
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _pixel(x, y, z, count, gaps, kept, radius, index, local, log_peak, m, features, evidence, total, sums):
+    """Sum over the kept components whose gap is at most ``radius``; returns evidence and total."""
+    for j in range(count):
+        if gaps[j] > radius:
+            continue
+        k = kept[j]
+        dx, dy, dz = x - local[k, 0], y - local[k, 1], z - local[k, 2]
+        y0 = local[k, 3] * dx
+        y1 = local[k, 4] * dx + local[k, 5] * dy
+        y2 = local[k, 6] * dx + local[k, 7] * dy + local[k, 8] * dz
+        w = math.exp(log_peak[k] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2))
+        evidence += w
+        total += w * m[index[k]]
+        for g in range(sums.size):
+            sums[g] += w * features[index[k], g]
+    return evidence, total
+
+
+@njit(cache=True, nogil=True)
+def _near_row(depth, K, v, components, extent, index, local, log_peak, m, features, prior, radii, out, out_f):
+    """One row of pixels with the paper's neighbourhood."""
+    near, far = radii
+    gaps, kept = np.empty(components.size), np.empty(components.size, np.int64)
+    sums = np.zeros(features.shape[1])
+    for u in range(depth.shape[1]):
+        z = np.float64(depth[v, u])
+        out[v, u] = np.nan
+        out_f[v, u] = np.nan
+        if not (z > 0 and z < np.inf):
+            continue
+        x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
+        count, least = 0, np.inf
+        for k in components:
+            gap = abs(z - local[k, 2]) - extent[k, 2]
+            gap = max(gap, abs(x - local[k, 0]) - extent[k, 0], abs(y - local[k, 1]) - extent[k, 1])
+            if gap <= far:
+                gaps[count], kept[count] = gap, k
+                count += 1
+                least = min(least, gap)
+        sums[:] = 0
+        evidence, total = _pixel(
+            x, y, z, count, gaps, kept, near if least <= near else far, index, local, log_peak, m, features,
+            prior[0], prior[0] * prior[1], sums,
+        )  # fmt: skip
+        out[v, u] = total / evidence
+        out_f[v, u] = sums / evidence
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _neighbourhood(
+    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f
+):
+    """All streams; rows in parallel."""
+    for b in range(depth.shape[0]):
+        index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
+        local = np.hstack((mean[b][index], whitening))
+        extent = np.empty((index.size, 3))
+        for k in range(index.size):
+            for i in range(3):
+                extent[k, i] = sigmas * math.sqrt(covariance[b, index[k], i, i])
+        components = np.arange(index.size)
+        for v in prange(depth.shape[1]):
+            _near_row(
+                depth[b], K[b], v, components, extent, index, local, log_peak, m[b], features[b],
+                (prior_weight, prior_mean), (near, far), out[b], out_f[b],
+            )  # fmt: skip
