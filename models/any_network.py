@@ -1,0 +1,148 @@
+"""Any network as one that returns a ``DepthPrediction``: an ``nn.Module``, a function, a saved program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.models.outputs import OutputSpec
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.prediction import DepthPrediction
+
+
+class WrappedNetwork(nn.Module):
+    """A network whose outputs are declared by an :class:`OutputSpec`; made by :func:`wrap_network`."""
+
+    def __init__(self, network: Callable[..., Any], outputs: OutputSpec, preprocess: Preprocess) -> None:
+        super().__init__()
+        self.network = network
+        self.outputs = outputs
+        self.preprocess = preprocess
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
+
+        Raises:
+            ValueError: the network's output is not what was declared.
+        """
+        result = self.network(image)
+        if isinstance(result, DepthPrediction):
+            return result
+        return self.outputs.prediction(_named(result), (image.shape[-2], image.shape[-1]))
+
+
+def wrap_network(
+    network: Callable[..., Any],
+    output: str | int | None = None,
+    *,
+    scale: float = 1.0,
+    inverse: bool = False,
+    aleatoric: str | int | None = None,
+    aleatoric_kind: str = "variance",
+    epistemic: str | int | None = None,
+    epistemic_kind: str = "variance",
+    resize: bool = False,
+    preprocess: Preprocess | None = None,
+) -> WrappedNetwork:
+    """A network of one's own for UfM*.
+
+    Args:
+        network: takes an image [B, 3, H, W]; returns metric depth [B, 1, H, W] or [B, H, W], a mapping or
+            an object with named tensors, a tuple of tensors, or a ``DepthPrediction``.
+        output: which of several outputs is depth: a name, or a position in a tuple.
+        scale: [m] length of one unit of depth.
+        inverse: declares inverse or relative depth, which is refused.
+        aleatoric, aleatoric_kind, epistemic, epistemic_kind, resize: as in :class:`OutputSpec`.
+        preprocess: what its input needs; None: images in [0, 1] at their own size.
+
+    Raises:
+        ValueError: ``inverse``, or a value out of range.
+        TypeError: ``network`` cannot be called.
+    """
+    if not callable(network):
+        raise TypeError(f"network must be an nn.Module or a function, got {type(network).__name__}")
+    spec = OutputSpec(
+        kind="inverse" if inverse else "metric",
+        depth=output,
+        scale=scale,
+        aleatoric=aleatoric,
+        aleatoric_kind=aleatoric_kind,
+        epistemic=epistemic,
+        epistemic_kind=epistemic_kind,
+        resize=resize,
+    )
+    return WrappedNetwork(network, spec, preprocess or Preprocess())
+
+
+def load_torchscript(path: str | Path, outputs: OutputSpec, preprocess: Preprocess | None = None) -> WrappedNetwork:
+    """A TorchScript file (``torch.jit.save``) as a network, on the CPU. Such a file is a program: load only
+    what you trust.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a TorchScript file.
+    """
+    _check_file(path)
+    try:
+        module = torch.jit.load(str(path), map_location="cpu")
+    except RuntimeError as error:
+        raise ValueError(f"{path} is not a readable TorchScript file: {error}") from error
+    return WrappedNetwork(module.eval(), outputs, preprocess or Preprocess())
+
+
+def load_exported(path: str | Path, outputs: OutputSpec, preprocess: Preprocess | None = None) -> WrappedNetwork:
+    """A ``torch.export`` file (``torch.export.save``, .pt2) as a network. Such a file is a program: load
+    only what you trust.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not such a file.
+    """
+    _check_file(path)
+    try:
+        program = torch.export.load(str(path))
+    except (RuntimeError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{path} is not a readable torch.export file: {error}") from error
+    return WrappedNetwork(_Exported(program.module()), outputs, preprocess or Preprocess())
+
+
+class _Exported(nn.Module):
+    """An exported program, which keeps the mode it was exported in: torch refuses even ``eval()`` on it."""
+
+    def __init__(self, program: nn.Module) -> None:
+        super().__init__()
+        self.program = program
+        self.training = False
+
+    def forward(self, image: Tensor) -> Any:
+        return self.program(image)
+
+    def train(self, mode: bool = True) -> _Exported:
+        if mode:
+            raise ValueError("a torch.export program has no training mode; train the module it was exported from")
+        return self
+
+
+def _check_file(path: str | Path) -> None:
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no network file {path}")
+
+
+def _named(result: Any) -> dict[str | int, Tensor]:
+    """The tensors of whatever a network returned, by name or position."""
+    if isinstance(result, Tensor):
+        return {"depth": result}
+    if isinstance(result, Mapping):
+        items: Any = result.items()
+    elif isinstance(result, (tuple, list)):
+        items = enumerate(result)
+    elif hasattr(result, "__dict__"):
+        items = vars(result).items()
+    else:
+        raise ValueError(f"a network must return tensors or a DepthPrediction, got {type(result).__name__}")
+    return {name: value for name, value in items if isinstance(value, Tensor)}

@@ -1,0 +1,186 @@
+"""Weights to and from files: tensors only, checked key by key, written atomically.
+
+A file is read with ``weights_only=True`` (or as safetensors), so that it cannot run code; one that holds a
+pickled module, as older repositories publish them, is refused with an explanation.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+# Where training programs put the weights inside a checkpoint, and what wrappers put before every key.
+_CONTAINERS = ("state_dict", "model_state_dict", "model")
+_PREFIXES = ("module.", "_orig_mod.", "state_dict.", "model.", "network.")
+_TORCH_SUFFIXES = (".pth", ".pt", ".ckpt", ".bin", ".tar")
+_SHOWN = 8  # keys named in an error message
+
+
+class CheckpointError(ValueError):
+    """A file of weights is broken, holds something else, or does not fit the network; names the file."""
+
+
+def load_state_dict_file(path: str | Path) -> dict[str, Tensor]:
+    """The weights in a file, on the CPU, by key.
+
+    Containers ("state_dict", "model", ...) are opened and prefixes that every key shares ("module.",
+    "model.", ...) are removed.
+
+    Args:
+        path: .pth, .pt, .ckpt, .bin, .tar (all as ``torch.save`` writes them) or .safetensors.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: the file is cut off or damaged, holds pickled objects or no weights, or has
+            another suffix.
+        ModuleNotFoundError: a .safetensors file without the package safetensors.
+    """
+    return _without_prefixes(_read(Path(path)))
+
+
+def load_weights(module: nn.Module, path: str | Path) -> None:
+    """Fill a module from a file, in place; all keys and shapes have to match.
+
+    Types follow the module's (half-precision weights fill a float32 network).
+
+    Raises:
+        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also where
+            keys are missing or unexpected, or shapes differ. The module is unchanged then.
+    """
+    path = Path(path)
+    state, expected = _read(path), module.state_dict()
+    if set(state) != set(expected):  # a network may itself have a part called "model"
+        state = _without_prefixes(state, keep=set(expected))
+    missing, unexpected = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
+    shapes = [
+        f"{key} is {tuple(state[key].shape)}, expected {tuple(expected[key].shape)}"
+        for key in expected
+        if key in state and state[key].shape != expected[key].shape
+    ]
+    faults = [("missing", missing), ("unexpected", unexpected), ("of another shape", shapes)]
+    texts = [f"{len(keys)} {what}: {_some(keys)}" for what, keys in faults if keys]
+    if texts:
+        raise CheckpointError(f"{path} does not fit {type(module).__name__} ({len(expected)} keys): {'; '.join(texts)}")
+    module.load_state_dict(state, strict=True)
+
+
+def save_checkpoint(
+    path: str | Path, weights: nn.Module | Mapping[str, Tensor], metadata: Mapping[str, Any] | None = None
+) -> None:
+    """Write weights so that the file is either the old one or the whole new one, whatever happens.
+
+    Args:
+        path: .safetensors, or a suffix of ``torch.save``, which gets {"state_dict", "metadata"}.
+        weights: a module, or its state_dict.
+        metadata: plain values (JSON) stored beside them, such as widths and the command that trained them.
+
+    Raises:
+        CheckpointError: another suffix.
+        ModuleNotFoundError: .safetensors without the package safetensors.
+    """
+    path = Path(path)
+    state = weights.state_dict() if isinstance(weights, nn.Module) else dict(weights)
+    state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
+    text = json.dumps(dict(metadata or {}))
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            _write(file, path, state, text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _write(file: Any, path: Path, state: dict[str, Tensor], metadata: str) -> None:
+    if path.suffix == ".safetensors":
+        # Tensors that share memory are not allowed there; a copy each costs little.
+        separate = {key: value.clone() for key, value in state.items()}
+        file.write(_safetensors().save(separate, metadata={"metadata": metadata}))
+    elif path.suffix in _TORCH_SUFFIXES:
+        torch.save({"state_dict": state, "metadata": json.loads(metadata)}, file)
+    else:
+        raise _unknown_suffix(path)
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    """The tensors of a file with its keys as they are, containers opened."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no file of weights {path}")
+    if path.suffix == ".safetensors":
+        safetensors = _safetensors()
+        try:
+            return dict(safetensors.load_file(path))
+        except safetensors.Error as error:
+            raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
+    if path.suffix not in _TORCH_SUFFIXES:
+        raise _unknown_suffix(path)
+    return _weights_in(_read_torch(path), path)
+
+
+def _read_torch(path: Path) -> Any:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"{path} is damaged or holds pickled Python objects (a whole module?), which are never loaded because "
+            "they can run code; save the module's state_dict() with the program that made it, and load that"
+        ) from error
+    except (RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
+        raise CheckpointError(f"{path} is damaged or not a file of torch.save: {error}") from error
+
+
+def _weights_in(content: Any, path: Path) -> dict[str, Tensor]:
+    for name in _CONTAINERS:
+        if isinstance(content, Mapping) and isinstance(content.get(name), Mapping):
+            content = content[name]
+            break
+    if not isinstance(content, Mapping) or not content:
+        raise CheckpointError(f"{path} holds no weights but {type(content).__name__}")
+    others = [key for key, value in content.items() if not isinstance(value, Tensor) or not isinstance(key, str)]
+    if others:
+        raise CheckpointError(f"{path} holds more than named tensors: {_some(others)}")
+    return dict(content)
+
+
+def _without_prefixes(state: dict[str, Tensor], keep: set[str] | None = None) -> dict[str, Tensor]:
+    """Keys without the known prefixes that all of them share; stops where the keys are those in ``keep``."""
+    while state and set(state) != keep:
+        prefix = next((p for p in _PREFIXES if all(key.startswith(p) for key in state)), None)
+        if prefix is None:
+            break
+        state = {key.removeprefix(prefix): value for key, value in state.items()}
+    return state
+
+
+def _some(keys: list[Any]) -> str:
+    more = f", ... ({len(keys) - _SHOWN} more)" if len(keys) > _SHOWN else ""
+    return ", ".join(str(key) for key in keys[:_SHOWN]) + more
+
+
+def _unknown_suffix(path: Path) -> CheckpointError:
+    return CheckpointError(f"{path} must end in .safetensors or one of {', '.join(_TORCH_SUFFIXES)}")
+
+
+class _safetensors:
+    """The functions of safetensors in use, imported when first needed."""
+
+    def __init__(self) -> None:
+        try:
+            from safetensors import SafetensorError
+            from safetensors.torch import load_file, save
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                "a .safetensors file needs the package safetensors: pip install safetensors"
+            ) from error
+        self.Error, self.load_file, self.save = SafetensorError, load_file, save

@@ -1,0 +1,250 @@
+"""FastDepth (Wofk et al., ICRA 2019): MobileNet encoder, depthwise NNConv5 decoder, additive skips.
+
+The encoder is MobileNet (v1): a strided convolution and 13 pairs of a 3x3 depthwise and a 1x1 pointwise
+convolution, down to 1/32 of the resolution. Each of the decoder's five layers is a 5x5 depthwise and a
+1x1 pointwise convolution, followed by doubling the resolution (every pixel repeated); the encoder's
+features at 1/8, 1/4 and 1/2 are added on the way up. A last 1x1 convolution gives depth in metres.
+The channel widths are data, because the published network is pruned to irregular ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ufmstar_torch.models.onnx_weights import ConvLayer, read_conv_chain
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.prediction import DepthPrediction
+
+MULTIPLE = 32  # [px] five halvings
+# Strides of the encoder's stem and 13 blocks.
+_STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
+# Decoder layer -> the encoder block (at 1/8, 1/4, 1/2 of the resolution) added to its doubled output.
+_SKIPS = {1: 5, 2: 3, 3: 1}
+
+
+@dataclass(frozen=True)
+class FastDepthWidths:
+    """Channels after the encoder's stem and 13 blocks, and after the decoder's 5 layers.
+
+    Raises:
+        ValueError: not 14 and 5 positive numbers, or the widths that a skip adds differ.
+    """
+
+    encoder: tuple[int, ...]
+    decoder: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        for name, count in (("encoder", len(_STRIDES)), ("decoder", 5)):
+            value = getattr(self, name)
+            if len(value) != count or min(value) < 1:
+                raise ValueError(f"FastDepthWidths.{name} must be {count} positive numbers, got {value}")
+        for d, e in _SKIPS.items():
+            if self.decoder[d] != self.encoder[e]:
+                raise ValueError(
+                    f"FastDepthWidths: decoder[{d}] = {self.decoder[d]} must equal encoder[{e}] = "
+                    f"{self.encoder[e]}, which is added to it"
+                )
+
+    @classmethod
+    def full(cls) -> FastDepthWidths:
+        """MobileNet's own widths."""
+        return cls((32, 64, 128, 128, 256, 256, *[512] * 6, 1024, 1024), (512, 256, 128, 64, 32))
+
+    @classmethod
+    def pruned(cls) -> FastDepthWidths:
+        """The widths that NetAdapt left of the network trained on NYU Depth V2."""
+        encoder = (16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 512)
+        return cls(encoder, (200, 256, 120, 56, 16))
+
+    @classmethod
+    def of_state_dict(cls, state: Mapping[str, Tensor]) -> FastDepthWidths:
+        """The widths of a :class:`FastDepth`'s own state_dict.
+
+        Raises:
+            ValueError: a weight that tells a width is missing.
+        """
+        keys = ["encoder.0.conv.weight", *(f"encoder.{i}.pointwise.conv.weight" for i in range(1, len(_STRIDES)))]
+        decoder = [f"decoder.{i}.pointwise.conv.weight" for i in range(5)]
+        missing = [key for key in (*keys, *decoder) if key not in state]
+        if missing:
+            raise ValueError(f"not the weights of a FastDepth: no {missing[0]!r} ({len(missing)} such keys missing)")
+        return cls(tuple(len(state[key]) for key in keys), tuple(len(state[key]) for key in decoder))
+
+
+class ConvUnit(nn.Module):
+    """Convolution with "same" padding, batch norm (or a bias instead, where it is folded), activation."""
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int, *, stride: int = 1, groups: int = 1, relu6: bool, norm: bool
+    ) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=kernel // 2, groups=groups, bias=not norm)
+        self.norm = nn.BatchNorm2d(outputs) if norm else nn.Identity()
+        self.activation = nn.ReLU6() if relu6 else nn.ReLU()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.activation(self.norm(self.conv(x)))
+
+
+class SeparableUnit(nn.Module):
+    """A depthwise and a pointwise :class:`ConvUnit`."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu6: bool, norm: bool) -> None:
+        super().__init__()
+        self.depthwise = ConvUnit(inputs, inputs, kernel, stride=stride, groups=inputs, relu6=relu6, norm=norm)
+        self.pointwise = ConvUnit(inputs, outputs, 1, relu6=relu6, norm=norm)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.pointwise(self.depthwise(x))
+
+
+class FastDepth(nn.Module):
+    """Monocular metric depth at 224 x 224 for small computers.
+
+    ``preprocess`` makes its input: the centre crop of NYU's validation, RGB in [0, 1]. The weights are
+    those of a start from scratch; :meth:`from_onnx` and ``checkpoints.load_weights`` fill in trained ones.
+
+    Args:
+        widths: channels of every layer.
+        norm: batch norm after every convolution; False for weights that have it folded in, which can be
+            trained on, but as plain convolutions with a bias.
+    """
+
+    def __init__(self, widths: FastDepthWidths | None = None, *, norm: bool = True) -> None:
+        super().__init__()
+        self.widths = widths or FastDepthWidths.full()
+        self.preprocess = Preprocess.nyu()
+        e, d = self.widths.encoder, (self.widths.encoder[-1], *self.widths.decoder)
+        stem = ConvUnit(3, e[0], 3, stride=_STRIDES[0], relu6=True, norm=norm)
+        self.encoder = nn.ModuleList([stem])
+        for inputs, outputs, stride in zip(e, e[1:], _STRIDES[1:], strict=False):
+            self.encoder.append(SeparableUnit(inputs, outputs, 3, stride=stride, relu6=True, norm=norm))
+        self.decoder = nn.ModuleList(
+            SeparableUnit(inputs, outputs, 5, relu6=False, norm=norm) for inputs, outputs in pairwise(d)
+        )
+        self.head = ConvUnit(d[-1], 1, 1, relu6=False, norm=norm)
+
+    def features(self, image: Tensor) -> Tensor:
+        """The decoder's output, from which the head reads depth.
+
+        Args:
+            image: [B, 3, H, W] RGB in [0, 1], H and W multiples of 32.
+
+        Returns:
+            [B, widths.decoder[-1], H, W].
+
+        Raises:
+            ValueError: the image has another shape or type.
+        """
+        _check_image(image)
+        x, skips = image, {}
+        for i, block in enumerate(self.encoder):
+            x = block(x)
+            if i in _SKIPS.values():
+                skips[i] = x
+        for i, block in enumerate(self.decoder):
+            x = F.interpolate(block(x), scale_factor=2.0, mode="nearest")
+            if i in _SKIPS:
+                x = x + skips[_SKIPS[i]]
+        return x
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m], at least 0 (where the last ReLU cuts off, a pixel has no depth), of ``image``
+        as in :meth:`features`; no variances."""
+        return DepthPrediction(self.head(self.features(image))[:, 0])
+
+    @classmethod
+    def from_onnx(cls, path: str | Path) -> FastDepth:
+        """The network with the weights of an ONNX export, in eval mode.
+
+        The widths are read from the file; every convolution's place in the graph is compared with this
+        network's, every initialiser must be used and every parameter filled. Batch norms stay batch norms
+        (with their counters), so fine-tuning goes on as if from a checkpoint after ``.train()``; a file
+        that has them folded gives a network without norm layers (``norm=False``).
+
+        Raises:
+            ModuleNotFoundError: ``onnx`` is not installed.
+            FileNotFoundError: there is no such file.
+            ValueError: the file is broken or holds another network.
+        """
+        layers = read_conv_chain(path)
+        expected = 1 + 2 * (len(_STRIDES) - 1) + 2 * 5 + 1
+        if len(layers) != expected:
+            raise ValueError(f"{path} is not a FastDepth: expected {expected} convolutions, got {len(layers)}")
+        folded = {not layer.norm for layer in layers}
+        if len(folded) != 1:
+            raise ValueError(f"{path} has batch norm after some convolutions only; export all or none folded")
+        outputs = [layer.weight.shape[0] for layer in layers]
+        encoder, decoder = (outputs[0], *outputs[2:27:2]), tuple(outputs[28:37:2])
+        network = cls(FastDepthWidths(encoder, decoder), norm=not folded.pop())
+        network._fill(layers, str(path))
+        return network.eval()
+
+    def _units(self) -> Iterator[tuple[str, ConvUnit]]:
+        """The convolutions in the order of execution."""
+        for name, module in self.named_modules():
+            if isinstance(module, ConvUnit):
+                yield name, module
+
+    def _structures(self) -> list[dict[str, object]]:
+        """What ``ConvLayer.structure`` should be for every convolution of this network."""
+        names = [name for name, _ in self._units()]
+        structures = []
+        for name, unit in self._units():
+            decoder = name.startswith("decoder") and name.endswith("pointwise")
+            skip = _SKIPS.get(int(name.split(".")[1])) if decoder else None
+            structures.append(
+                {
+                    "weight": tuple(unit.conv.weight.shape),
+                    "stride": unit.conv.stride[0],
+                    "padding": unit.conv.padding[0],
+                    "groups": unit.conv.groups,
+                    "activation": type(unit.activation).__name__.lower(),
+                    "upsampled": decoder,
+                    "skip": None if skip is None else names.index(f"encoder.{skip}.pointwise"),
+                }
+            )
+        return structures
+
+    def _fill(self, layers: list[ConvLayer], path: str) -> None:
+        """Load the layers' weights after comparing their place in the graph with this network's."""
+        state: dict[str, Tensor] = {}
+        for (name, unit), layer, structure in zip(self._units(), layers, self._structures(), strict=True):
+            found = layer.structure()
+            wrong = [
+                f"{key} {found[key]}, expected {structure[key]}" for key in structure if found[key] != structure[key]
+            ]
+            if wrong:
+                raise ValueError(f"{path} is not a FastDepth: the convolution for {name} has {'; '.join(wrong)}")
+            state[f"{name}.conv.weight"] = layer.weight
+            bias = layer.bias
+            if isinstance(unit.norm, nn.BatchNorm2d):
+                unit.norm.eps = layer.norm_eps
+                layer.norm.setdefault("num_batches_tracked", torch.zeros((), dtype=torch.int64))
+                state.update({f"{name}.norm.{key}": value for key, value in layer.norm.items()})
+                if bias is not None:
+                    # A bias before batch norm only shifts the mean that is subtracted again.
+                    state[f"{name}.norm.running_mean"] = layer.norm["running_mean"] - bias
+            elif bias is None:
+                state[f"{name}.conv.bias"] = torch.zeros(len(layer.weight))
+            else:
+                state[f"{name}.conv.bias"] = bias
+        self.load_state_dict(state, strict=True)
+
+
+def _check_image(image: Tensor) -> None:
+    if image.dim() != 4 or image.shape[1] != 3 or not torch.is_floating_point(image):
+        raise ValueError(f"image must be floating-point [B, 3, H, W] in [0, 1], got {image.dtype} {tuple(image.shape)}")
+    height, width = image.shape[-2:]
+    if height % MULTIPLE or width % MULTIPLE or not height or not width:
+        raise ValueError(
+            f"image must have a height and width that are multiples of {MULTIPLE} px, got {height} x {width}; "
+            "FastDepth.preprocess makes 224 x 224"
+        )

@@ -1,0 +1,107 @@
+"""A network by name: what the command line and configuration files use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from ufmstar_torch.models.outputs import OutputSpec
+from ufmstar_torch.models.preprocess import Preprocess
+
+
+def load_network(name: str, weights: str | Path | None = None, **options: Any) -> nn.Module:
+    """A depth network in eval mode, on the CPU.
+
+    The network has an attribute ``preprocess`` (a :class:`Preprocess`): ``network(network.preprocess(image,
+    K)[0])`` is a ``DepthPrediction``.
+
+    Args:
+        name: one of :func:`network_names`.
+        weights: the file it is loaded from.
+        options: what the network of that name takes:
+            fastdepth: none. ``weights``: an ONNX export, or a state_dict (.pth, .pt, .safetensors).
+            onnx: ``spec`` (an ``OnnxSpec``, a dict or a JSON file), ``threads``, ``providers``.
+            torchscript, exported: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file).
+
+    Raises:
+        ValueError: no such network, no weights, or a file or declaration that does not fit.
+        TypeError: an option that this network does not have.
+        FileNotFoundError, ModuleNotFoundError: a file or an optional package is missing.
+    """
+    if name not in _BUILDERS:
+        raise ValueError(f"unknown network {name!r}, expected one of {list(network_names())}")
+    if weights is None:
+        raise ValueError(f"network {name!r} needs weights: the file to load")
+    return _BUILDERS[name](Path(weights), **options).eval()
+
+
+def network_names() -> tuple[str, ...]:
+    """The names that :func:`load_network` knows."""
+    return tuple(sorted(_BUILDERS))
+
+
+def _fastdepth(weights: Path) -> nn.Module:
+    from ufmstar_torch.models.checkpoints import load_state_dict_file, load_weights
+    from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
+
+    if weights.suffix == ".onnx":
+        return FastDepth.from_onnx(weights)
+    state = load_state_dict_file(weights)
+    try:
+        widths = FastDepthWidths.of_state_dict(state)
+    except ValueError as error:
+        raise ValueError(f"{weights}: {error}") from error
+    network = FastDepth(widths, norm="encoder.0.norm.weight" in state)
+    load_weights(network, weights)
+    return network
+
+
+def _onnx(weights: Path, spec: Any = None, **options: Any) -> nn.Module:
+    from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
+
+    if spec is None:
+        raise ValueError(
+            "an ONNX network needs a spec, which declares what the file does not say; for metric depth in metres "
+            '{"outputs": {"kind": "metric"}}'
+        )
+    if isinstance(spec, Mapping):
+        spec = OnnxSpec.from_dict(spec)
+    elif not isinstance(spec, OnnxSpec):
+        spec = OnnxSpec.from_json(spec)
+    return OnnxNetwork(weights, spec, **options)
+
+
+def _torchscript(weights: Path, spec: Any = None) -> nn.Module:
+    from ufmstar_torch.models.any_network import load_torchscript
+
+    return load_torchscript(weights, *_declared(spec))
+
+
+def _exported(weights: Path, spec: Any = None) -> nn.Module:
+    from ufmstar_torch.models.any_network import load_exported
+
+    return load_exported(weights, *_declared(spec))
+
+
+def _declared(spec: Any) -> tuple[OutputSpec, Preprocess]:
+    """Outputs and preprocessing of a program whose graph takes the image as it is."""
+    from ufmstar_torch.models.onnx_network import read_json
+
+    if spec is None:
+        raise ValueError('a saved program needs a spec; for metric depth in metres {"outputs": {"kind": "metric"}}')
+    values = dict(spec) if isinstance(spec, Mapping) else read_json(spec)
+    unknown = sorted(set(values) - {"outputs", "preprocess"})
+    if unknown or "outputs" not in values:
+        raise ValueError(f"a spec has 'outputs' and, if needed, 'preprocess', got {sorted(values)}")
+    return OutputSpec.from_dict(values["outputs"]), Preprocess.from_dict(values.get("preprocess") or {})
+
+
+_BUILDERS: dict[str, Callable[..., nn.Module]] = {
+    "exported": _exported,
+    "fastdepth": _fastdepth,
+    "onnx": _onnx,
+    "torchscript": _torchscript,
+}

@@ -1,0 +1,135 @@
+"""What a network's raw outputs mean: which one is depth, in which unit, and which are variances.
+
+UfM* compares 3D points of different views, so depth has to be metric. Networks that predict inverse
+depth, disparity or depth up to scale (and shift) are refused here, where their output is declared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ufmstar_torch.prediction import DepthPrediction
+
+METRIC = "metric"
+NOT_METRIC = ("inverse", "disparity", "relative", "affine")
+SPREADS = ("variance", "std", "log_variance")
+
+
+@dataclass(frozen=True)
+class OutputSpec:
+    """The meaning of a network's outputs.
+
+    Attributes:
+        kind: what the depth output is. Only "metric" (along the optical axis) can be used; it has no default,
+            so that it is declared and not assumed.
+        depth: name of the depth output (or its position, for a network that returns a tuple); None where the
+            network has only one output.
+        scale: [m] length of one unit of the depth output, .001 for millimetres.
+        aleatoric, epistemic: names of the outputs with the learned data and model variance, if any.
+        aleatoric_kind, epistemic_kind: "variance", "std" or "log_variance" (natural logarithm), in the units
+            of the depth output.
+        resize: whether outputs of another resolution than the input are brought to it by repeating or
+            dropping pixels; otherwise such outputs are an error.
+
+    Raises:
+        ValueError: a field is out of range, or the depth is not metric.
+    """
+
+    kind: str
+    depth: str | int | None = None
+    scale: float = 1.0
+    aleatoric: str | int | None = None
+    aleatoric_kind: str = "variance"
+    epistemic: str | int | None = None
+    epistemic_kind: str = "variance"
+    resize: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind in NOT_METRIC:
+            raise ValueError(
+                f"the depth output is declared {self.kind!r}, but UfM* needs metric depth: it compares 3D points of "
+                "several views, and without a common scale in metres their disagreement means nothing. Use a network "
+                "with metric output, or align its scale (and shift) to measured depth before it is wrapped"
+            )
+        if self.kind != METRIC:
+            raise ValueError(f"OutputSpec.kind must be {METRIC!r} (refused: {NOT_METRIC}), got {self.kind!r}")
+        if not 0 < self.scale < float("inf"):
+            raise ValueError(f"OutputSpec.scale must be positive metres per unit, got {self.scale}")
+        for name in ("aleatoric_kind", "epistemic_kind"):
+            if getattr(self, name) not in SPREADS:
+                raise ValueError(f"OutputSpec.{name} must be one of {SPREADS}, got {getattr(self, name)!r}")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> OutputSpec:
+        """From JSON.
+
+        Raises:
+            ValueError: an unknown key, no ``kind``, or a field out of range.
+        """
+        known = {f.name for f in fields(cls)}
+        if unknown := sorted(set(values) - known):
+            raise ValueError(f"outputs have no {unknown}; they have {sorted(known)}")
+        if "kind" not in values:
+            raise ValueError(f"outputs must declare their 'kind': {METRIC!r} for depth in a known unit of length")
+        return cls(**values)
+
+    def names(self) -> list[str | int]:
+        """The outputs that are declared by name."""
+        return [name for name in (self.depth, self.aleatoric, self.epistemic) if name is not None]
+
+    def prediction(self, outputs: Mapping[str | int, Tensor], size: tuple[int, int]) -> DepthPrediction:
+        """The declared outputs in metres.
+
+        Args:
+            outputs: raw outputs by name, each [B, 1, H, W], [B, H, W, 1] or [B, H, W].
+            size: (H, W) [px] of the network's input, whose intrinsics the prediction has to share.
+
+        Raises:
+            ValueError: a declared output is missing or has another shape.
+        """
+        if self.depth is None and len(outputs) != 1:
+            raise ValueError(f"the network returns {list(outputs)}; declare which one is depth")
+        depth_name = next(iter(outputs)) if self.depth is None else self.depth
+        depth = self._map(outputs, depth_name, size) * self.scale
+        aleatoric = self._variance(outputs, self.aleatoric, self.aleatoric_kind, size)
+        epistemic = self._variance(outputs, self.epistemic, self.epistemic_kind, size)
+        return DepthPrediction(depth, aleatoric, epistemic)
+
+    def _variance(
+        self, outputs: Mapping[str | int, Tensor], name: str | int | None, kind: str, size: tuple[int, int]
+    ) -> Tensor | None:
+        """[B, H, W] [m^2], or None where the network has none."""
+        if name is None:
+            return None
+        value = self._map(outputs, name, size)
+        if kind == "log_variance":
+            value = value.exp()
+        elif kind == "std":
+            value = value.square()
+        return value * self.scale**2
+
+    def _map(self, outputs: Mapping[str | int, Tensor], name: str | int, size: tuple[int, int]) -> Tensor:
+        """[B, H, W] of one output, in its own units."""
+        if name not in outputs:
+            raise ValueError(f"the network has no output {name!r}; it has {list(outputs)}")
+        value = outputs[name]
+        shape = tuple(value.shape)
+        if value.dim() == 4 and 1 in (shape[1], shape[3]):
+            value = value[:, 0] if shape[1] == 1 else value[..., 0]
+        if value.dim() != 3:
+            raise ValueError(f"output {name!r} must be [B, 1, H, W], [B, H, W, 1] or [B, H, W], got {shape}")
+        value = value if torch.is_floating_point(value) else value.to(torch.get_default_dtype())
+        if value.shape[-2:] == size:
+            return value
+        if not self.resize:
+            raise ValueError(
+                f"output {name!r} has {tuple(value.shape[-2:])} px, expected the input's {size}, whose intrinsics it "
+                "is used with; set resize to bring it there"
+            )
+        return F.interpolate(value[:, None], size, mode="nearest-exact")[:, 0]

@@ -1,0 +1,206 @@
+"""From a camera image to a network's input, with the intrinsics and the ground truth that belong to it.
+
+The geometry has up to three steps: resize with the aspect kept, crop the centre, resize to the final
+size (each axis by its own factor). Intrinsics follow by ``camera.resize_intrinsics`` and
+``crop_intrinsics``, that is by the rule that an image's borders lie half a pixel outside its outer pixel
+centres. UfM* works at the network's resolution, so predictions need no way back.
+
+Colour is resampled linearly with antialiasing, as Pillow does and therefore the field's loaders did
+(FastDepth was trained and validated on Pillow's bilinear filter); depth takes the nearest pixel, since a
+mean over a depth edge is a place where nothing is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
+
+# [1] What a float image may exceed [0, 1] by: filters that overshoot, noise; but not a range of 0..255.
+_RANGE_SLACK = 0.5
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Sizes (height, width) [px] of the three steps for one size of image; ``top`` and ``left`` are cut off."""
+
+    image: tuple[int, int]
+    resized: tuple[int, int]
+    top: int
+    left: int
+    cropped: tuple[int, int]
+    final: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Preprocess:
+    """What a network wants to see; immutable, usable as a function.
+
+    Attributes:
+        resize_height: [px] height after the first step, None = no such step. Where the crop would not fit
+            into an image of that height, it is resized larger, to the smallest size that holds the crop.
+        crop: (height, width) [px] of the centre crop, None = everything.
+        size: (height, width) [px] of the network's input, None = as it is by then.
+        value_range: what white becomes: 1 for networks trained on [0, 1], 255 for those on bytes.
+        mean, std: per channel (R, G, B), in units of ``value_range``: input = (value - mean) / std.
+        antialias: whether shrinking averages over all pixels that fall into one.
+
+    Raises:
+        ValueError: a field is out of range.
+    """
+
+    resize_height: int | None = None
+    crop: tuple[int, int] | None = None
+    size: tuple[int, int] | None = None
+    value_range: float = 1.0
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    antialias: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("crop", "size"):
+            value = getattr(self, name)
+            if value is not None and (len(value) != 2 or min(value) < 1 or any(v != int(v) for v in value)):
+                raise ValueError(f"Preprocess.{name} must be (height, width) in pixels, got {value}")
+        if self.resize_height is not None and self.resize_height < 1:
+            raise ValueError(f"Preprocess.resize_height must be positive, got {self.resize_height}")
+        if not self.value_range > 0:
+            raise ValueError(f"Preprocess.value_range must be positive, got {self.value_range}")
+        if len(self.mean) != 3 or len(self.std) != 3 or not min(self.std) > 0:
+            raise ValueError(
+                f"Preprocess.mean and .std must be 3 numbers, std positive, got {self.mean} and {self.std}"
+            )
+
+    @classmethod
+    def nyu(cls, size: tuple[int, int] = (224, 224), **changes: Any) -> Preprocess:
+        """NYU Depth V2's validation as FastDepth uses it: height 250 (480 x 640 becomes 250 x 333), centre
+        228 x 304, then ``size``. Portrait images are resized to width 304 instead."""
+        return cls(**{"resize_height": 250, "crop": (228, 304), "size": size, **changes})
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Preprocess:
+        """From JSON: lists become tuples.
+
+        Raises:
+            ValueError: an unknown key, or a field out of range.
+        """
+        known = {f.name for f in fields(cls)}
+        if unknown := sorted(set(values) - known):
+            raise ValueError(f"Preprocess has no {unknown}; it has {sorted(known)}")
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as plain values."""
+        return asdict(self)
+
+    def geometry(self, height: int, width: int) -> Geometry:
+        """The sizes of every step for an image of height x width [px].
+
+        Raises:
+            ValueError: the crop is larger than an image that is not resized.
+        """
+        if min(height, width) < 1:
+            raise ValueError(f"an image must have at least one pixel, got {height} x {width}")
+        ch, cw = self.crop or (0, 0)
+        resized = (height, width)
+        if self.resize_height is not None:
+            scale = max(self.resize_height / height, ch / height, cw / width)
+            # Fractions are cut off as Pillow-based loaders do; the 1e-6 keeps 250/480*480 at 250.
+            resized = (max(ch, 1, int(scale * height + 1e-6)), max(cw, 1, int(scale * width + 1e-6)))
+        if ch > resized[0] or cw > resized[1]:
+            raise ValueError(
+                f"Preprocess.crop {self.crop} must fit into the image, which has {resized[0]} x {resized[1]} px; "
+                "set resize_height to enlarge it"
+            )
+        cropped = self.crop or resized
+        top, left = (resized[0] - cropped[0]) // 2, (resized[1] - cropped[1]) // 2
+        return Geometry((height, width), resized, top, left, cropped, self.size or cropped)
+
+    def __call__(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+        """The network's input and its intrinsics.
+
+        Args:
+            image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1].
+            intrinsics: [B, 3, 3] (or [3, 3]) of ``image`` [px].
+
+        Returns:
+            [B, 3, h, w] floating-point, and intrinsics of the shape and type given.
+
+        Raises:
+            ValueError: wrong shapes, an integer type other than uint8, or floats outside [0, 1].
+        """
+        return self.apply_image(image), self.apply_intrinsics(intrinsics, *image.shape[-2:])
+
+    def apply_image(self, image: Tensor) -> Tensor:
+        """The image alone; shapes, types and errors as in :meth:`__call__`."""
+        x = _unit_range(image)
+        g = self.geometry(*x.shape[-2:])
+        x = self._resize(x, g.resized)
+        x = x[..., g.top : g.top + g.cropped[0], g.left : g.left + g.cropped[1]]
+        x = self._resize(x, g.final)
+        if self.value_range != 1.0:
+            x = x * self.value_range
+        if any(self.mean) or any(s != 1.0 for s in self.std):
+            x = (x - x.new_tensor(self.mean)[:, None, None]) / x.new_tensor(self.std)[:, None, None]
+        return x.contiguous()
+
+    def apply_intrinsics(self, intrinsics: Tensor, height: int, width: int) -> Tensor:
+        """Intrinsics [..., 3, 3] [px] of the network's input, from those of an image of height x width."""
+        if intrinsics.shape[-2:] != (3, 3):
+            raise ValueError(f"intrinsics must be [B, 3, 3], got {tuple(intrinsics.shape)}")
+        g = self.geometry(height, width)
+        resized = resize_intrinsics(intrinsics, g.image, g.resized)
+        return resize_intrinsics(crop_intrinsics(resized, g.top, g.left), g.cropped, g.final)
+
+    def apply_depth(self, depth: Tensor) -> Tensor:
+        """A map that is registered to the image, seen by the network: ground truth depth, a mask, labels.
+
+        Every pixel of the result takes the value of the one source pixel that its centre falls into;
+        values are copied, never mixed, and of whatever type.
+
+        Args:
+            depth: [..., H, W].
+
+        Returns:
+            [..., h, w].
+        """
+        g = self.geometry(*depth.shape[-2:])
+        rows = _source_index(g.final[0], g.cropped[0], g.top, g.resized[0], g.image[0])
+        columns = _source_index(g.final[1], g.cropped[1], g.left, g.resized[1], g.image[1])
+        return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
+
+    def _resize(self, x: Tensor, size: tuple[int, int]) -> Tensor:
+        if x.shape[-2:] == size:
+            return x
+        return F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=self.antialias)
+
+
+def _unit_range(image: Tensor) -> Tensor:
+    """[B, 3, H, W] checked, as floats in [0, 1]."""
+    if image.dim() != 4 or image.shape[1] != 3:
+        raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
+    if image.dtype == torch.uint8:
+        return image.to(torch.get_default_dtype()) / 255
+    if not torch.is_floating_point(image):
+        raise ValueError(f"image must be uint8 or floating-point, got {image.dtype}")
+    if image.numel():
+        low, high = torch.aminmax(image.detach())
+        if not (low >= -_RANGE_SLACK and high <= 1 + _RANGE_SLACK):
+            raise ValueError(
+                f"a floating-point image must lie in [0, 1], got [{float(low):.4g}, {float(high):.4g}]; "
+                "pass bytes as uint8"
+            )
+    return image
+
+
+def _source_index(final: int, cropped: int, cut: int, resized: int, image: int) -> Tensor:
+    """[final] the source pixel that each final pixel's centre falls into, along one axis."""
+    centre = torch.arange(final, dtype=torch.float64) + 0.5
+    source = (centre * (cropped / final) + cut) * (image / resized)
+    return source.floor().to(torch.int64).clamp_(0, image - 1)
