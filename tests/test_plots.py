@@ -1,0 +1,219 @@
+"""Pictures: colours that mean what the bar says, sheets and videos that can be read back."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+from PIL import Image
+from shared_data import require_shared
+
+from ufmstar_torch.eval.colours import (
+    DEPTH_MAP,
+    ERROR_MAP,
+    INVALID_GREY,
+    ColourScale,
+    colour_table,
+    robust_range,
+)
+from ufmstar_torch.eval.plots import FramePanel, contact_sheet, fit_scales
+from ufmstar_torch.eval.video import VideoWriter, preview_frame, write_video
+
+
+def panel(name: str = "a", *, error: bool = True, size: tuple[int, int] = (24, 32), seed: int = 0) -> FramePanel:
+    rng = np.random.default_rng(seed)
+    depth, sigma = rng.uniform(1, 4, size), rng.uniform(0, 0.5, size)
+    valid = np.ones(size, bool)
+    valid[:4] = False
+    image = rng.integers(0, 255, (2 * size[0], 2 * size[1], 3), dtype=np.uint8)
+    return FramePanel(name, image, depth, sigma, 2 * sigma if error else None, valid)
+
+
+def load(path: Path) -> np.ndarray[Any, Any]:
+    with Image.open(path) as picture:
+        return np.asarray(picture)
+
+
+class TestColours:
+    @pytest.mark.parametrize("name", [DEPTH_MAP, ERROR_MAP])
+    def test_lightness_rises_evenly(self, name: str) -> None:
+        """Perceptually uniform: CIELAB lightness rises all the way, in equal steps."""
+        import cv2
+
+        table = colour_table(name)
+        lab = cv2.cvtColor(table[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
+        steps = np.diff(lab[::8, 0])
+        assert steps.min() > 0
+        assert steps.max() < 2 * steps.mean()
+
+    def test_ends_and_beyond(self) -> None:
+        scale, table = ColourScale(1.0, 3.0, DEPTH_MAP), colour_table(DEPTH_MAP)
+        rgb = scale.rgb(np.array([1.0, 3.0, 0.0, 99.0, 2.0]))
+        np.testing.assert_array_equal(rgb, table[[0, 255, 0, 255, 128]])
+
+    def test_invalid_is_grey_and_no_colour_of_the_map_is(self) -> None:
+        scale = ColourScale(0.0, 1.0, ERROR_MAP)
+        rgb = scale.rgb(np.array([np.nan, np.inf, 0.5]), np.array([True, True, False]))
+        assert (rgb == INVALID_GREY).all()
+        for name in (DEPTH_MAP, ERROR_MAP):
+            distance = np.abs(colour_table(name).astype(int) - INVALID_GREY).max(1)
+            assert distance.min() > 40
+
+    def test_robust_range(self) -> None:
+        values = np.linspace(0.0, 100.0, 10_001)
+        values[-5:] = 1e9
+        assert robust_range([(values, None)], from_zero=False) == pytest.approx((1.0, 99.0))
+        assert robust_range([(values, None)], from_zero=True)[0] == 0.0
+        half = values < 50
+        assert robust_range([(values, half)], from_zero=False)[1] == pytest.approx(49.5, abs=0.01)
+        both = robust_range([(np.array([1.0]), None), (np.array([np.nan, 3.0]), None)], from_zero=False)
+        assert both == pytest.approx((1.02, 2.98))
+
+    def test_ranges_without_extent(self) -> None:
+        for maps in ([], [(np.full(4, np.nan), None)], [(np.zeros(4), None)], [(np.full(4, 2.0), None)]):
+            low, high = robust_range(maps, from_zero=False)
+            assert low < high
+        with pytest.raises(ValueError, match="low must be less"):
+            ColourScale(1.0, 1.0, DEPTH_MAP)
+
+    def test_missing_matplotlib_names_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        with pytest.raises(ImportError, match=r"ufmstar-torch\[viz\]"):
+            contact_sheet([panel()], "x.png")
+
+
+class TestContactSheet:
+    def test_columns_show_the_maps_on_common_scales(self, tmp_path: Path) -> None:
+        panels = [panel("a", seed=1), panel("b", seed=2)]
+        scales = contact_sheet(panels, tmp_path / "s.png", title="t")
+        assert scales == fit_scales(panels)
+        picture = load(tmp_path / "s.png")[..., :3]
+        # Every colour of both depth maps is in the picture, so both rows were drawn on the one scale.
+        shown = {tuple(c) for c in picture.reshape(-1, 3).tolist()}
+        for one in panels:
+            wanted = {tuple(c) for c in scales.depth.rgb(one.depth, one.valid).reshape(-1, 3).tolist()}
+            assert len(wanted & shown) > 0.95 * len(wanted)
+
+    def test_without_ground_truth_there_is_no_error_column(self, tmp_path: Path) -> None:
+        contact_sheet([panel(error=False)], tmp_path / "without.png")
+        contact_sheet([panel(error=False), panel("b")], tmp_path / "mixed.png")
+        widths = [load(tmp_path / f"{n}.png").shape[1] for n in ("without", "mixed")]
+        assert widths[1] / widths[0] == pytest.approx(4 / 3, abs=0.05)
+
+    def test_hopeless_frames_are_drawn(self, tmp_path: Path) -> None:
+        empty = np.full((5, 6), np.nan)
+        nothing = FramePanel("none", np.zeros((5, 6, 3), np.uint8), empty, empty, empty, np.zeros((5, 6), bool))
+        contact_sheet([nothing], tmp_path / "s.png")
+        assert load(tmp_path / "s.png").shape[1] > 100
+
+    def test_global_state_is_left_alone(self, tmp_path: Path) -> None:
+        import matplotlib
+
+        before = dict(matplotlib.rcParams)
+        loaded = "matplotlib.pyplot" in sys.modules
+        contact_sheet([panel()], tmp_path / "s.png")
+        assert dict(matplotlib.rcParams) == before
+        assert ("matplotlib.pyplot" in sys.modules) == loaded
+
+    def test_full_disk_keeps_the_old_sheet(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        contact_sheet([panel()], tmp_path / "s.png")
+        before = (tmp_path / "s.png").read_bytes()
+
+        def full(*_: object) -> NoReturn:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(os, "replace", full)
+        with pytest.raises(OSError, match="No space left"):
+            contact_sheet([panel("b", seed=3)], tmp_path / "s.png")
+        assert (tmp_path / "s.png").read_bytes() == before
+        assert [p.name for p in tmp_path.iterdir()] == ["s.png"]
+
+    def test_errors_name_the_argument(self) -> None:
+        with pytest.raises(ValueError, match="at least one frame"):
+            contact_sheet([], "x.png")
+        depth = np.ones((2, 3))
+        in_floats: Any = np.ones((2, 3, 3))
+        with pytest.raises(ValueError, match="image must be uint8"):
+            FramePanel("a", in_floats, depth, depth)
+        with pytest.raises(ValueError, match="sigma must have the depth's shape"):
+            FramePanel("a", np.ones((2, 3, 3), np.uint8), depth, np.ones((3, 3)))
+
+    def test_real_frame(self, tmp_path: Path) -> None:
+        folder = require_shared("data/rgbd_dataset_freiburg1_xyz")
+        image = load(sorted((folder / "rgb").iterdir())[0])
+        depth = load(sorted((folder / "depth").iterdir())[0]) / 5000.0
+        scales = contact_sheet([FramePanel("0", image, depth, 0.1 * depth, valid=depth > 0)], tmp_path / "s.png")
+        assert 0.3 < scales.depth.low < scales.depth.high < 10  # a desk
+
+
+class TestPreview:
+    @pytest.mark.parametrize("size", [(24, 32), (25, 33), (31, 17), (1, 1)])
+    def test_frame_is_even_and_holds_the_maps(self, size: tuple[int, int]) -> None:
+        one = panel(size=size)
+        scales = fit_scales([one])
+        frame = preview_frame(one, scales, cell_height=4 * size[0])
+        assert frame.dtype == np.uint8
+        assert all(n % 2 == 0 for n in frame.shape[:2])
+        left = 4 * size[1] + 4  # behind the image and a gap
+        cell = frame[22 : 22 + 4 * size[0] : 4, left : left + 4 * size[1] : 4]
+        np.testing.assert_array_equal(cell, scales.depth.rgb(one.depth, one.valid))
+
+    def test_size_does_not_depend_on_the_frame(self) -> None:
+        scales = fit_scales([panel()])
+        with_error = preview_frame(panel(), scales, with_error=True)
+        without = preview_frame(panel(error=False), scales, with_error=True)
+        assert with_error.shape == without.shape
+        assert preview_frame(panel(error=False), scales).shape[1] < without.shape[1]
+
+    def test_video_reads_back(self, tmp_path: Path) -> None:
+        import cv2
+
+        # Flat colours, which survive the codec: frame i is grey 40 i.
+        frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(6)]
+        assert write_video(tmp_path / "v.mp4", iter(frames), fps=5) == 6
+        video = cv2.VideoCapture(str(tmp_path / "v.mp4"))
+        assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(5)
+        for i in range(6):
+            ok, got = video.read()
+            assert ok
+            assert got.shape == (48, 64, 3)
+            assert abs(float(got.mean()) - 40 * i) < 4
+        assert not video.read()[0]
+        video.release()
+        assert [p.name for p in tmp_path.iterdir()] == ["v.mp4"]
+
+    def test_interrupt_keeps_the_frames_so_far(self, tmp_path: Path) -> None:
+        import cv2
+
+        def interrupted() -> Any:
+            yield from (np.zeros((32, 32, 3), np.uint8) for _ in range(3))
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            write_video(tmp_path / "v.mp4", interrupted(), fps=5)
+        video = cv2.VideoCapture(str(tmp_path / "v.mp4"))
+        assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3
+        video.release()
+
+    def test_no_frame_no_file(self, tmp_path: Path) -> None:
+        assert write_video(tmp_path / "v.mp4", [], fps=5) == 0
+        assert list(tmp_path.iterdir()) == []
+
+    def test_errors(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        with pytest.raises(ValueError, match="path must end in"):
+            VideoWriter(tmp_path / "v.avi", 5)
+        with pytest.raises(ValueError, match="fps"):
+            VideoWriter(tmp_path / "v.mp4", 0)
+        with pytest.raises(ValueError, match="even size"):
+            write_video(tmp_path / "v.mp4", [np.zeros((3, 4, 3), np.uint8)], 5)
+        frames = [np.zeros((32, 32, 3), np.uint8), np.zeros((32, 34, 3), np.uint8)]
+        with pytest.raises(ValueError, match="size of the first"):
+            write_video(tmp_path / "v.mp4", frames, 5)
+        monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+        with pytest.raises(ImportError, match=r"ufmstar-torch\[eval\]"):
+            VideoWriter(tmp_path / "v.mp4", 5)
