@@ -1,0 +1,240 @@
+"""Mixture files, parsed back by a reader of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.eval.ply import (
+    OPACITY,
+    SIGMA_FLOOR,
+    icosphere,
+    quaternion,
+    read_mixture_npz,
+    write_ellipsoids_ply,
+    write_mixture_npz,
+    write_mixture_ply,
+)
+from ufmstar_torch.mixture import GaussianMixture
+
+KINDS = {"float": "<f4", "int": "<i4", "uchar": "u1"}
+
+
+def parse(path: Path) -> tuple[dict[str, np.ndarray[Any, Any]], list[str]]:
+    """A minimal PLY reader: elements by name, and the comments."""
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    lines = head.decode("ascii").split("\n")
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    layout: dict[str, tuple[int, list[Any]]] = {}
+    for line in lines[2:]:
+        match line.split():
+            case ["element", name, count]:
+                layout[name] = (int(count), [])
+            case ["property", "list", length, kind, name]:  # of triangles
+                layout[[*layout][-1]][1].extend([("n", KINDS[length]), (name, KINDS[kind], (3,))])
+            case ["property", kind, name]:
+                layout[[*layout][-1]][1].append((name, KINDS[kind]))
+    elements, offset = {}, 0
+    for name, (count, fields) in layout.items():
+        elements[name] = np.frombuffer(body, np.dtype(fields), count, offset)
+        offset += elements[name].nbytes
+    assert offset == len(body)
+    return elements, [line for line in lines if line.startswith("comment")]
+
+
+def stack(table: np.ndarray[Any, Any], *names: str) -> np.ndarray[Any, Any]:
+    return np.stack([table[name].astype(np.float64) for name in names], -1)
+
+
+def mixture(k: int = 7, *, streams: int = 2, seed: int = 0, dtype: torch.dtype = torch.float64) -> GaussianMixture:
+    """Random components from discs to needles, with two empty slots in the middle of each stream."""
+    rng = np.random.default_rng(seed)
+    R = Rotation.random(streams * k, random_state=rng).as_matrix().reshape(streams, k, 3, 3)
+    sigma = np.exp(rng.uniform(np.log(0.005), np.log(1.0), (streams, k, 3)))
+    covariance = np.einsum("bkij,bkj,bklj->bkil", R, sigma**2, R)
+    weight = rng.integers(1, 9000, (streams, k)).astype(float)
+    weight[:, 2:4] = 0
+    used = weight > 0
+    return GaussianMixture(
+        mean=torch.tensor(rng.uniform(-3, 3, (streams, k, 3)) * used[..., None], dtype=dtype),
+        covariance=torch.tensor(covariance * used[..., None, None], dtype=dtype),
+        weight=torch.tensor(weight, dtype=dtype),
+        disagreement=torch.tensor(rng.uniform(0, 0.2, (streams, k)) * used, dtype=dtype),
+        count=torch.tensor(rng.integers(1, 50, (streams, k)) * used),
+        features=torch.zeros(streams, k, 0, dtype=dtype),
+    )
+
+
+def world() -> torch.Tensor:
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3] = torch.tensor(Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix())
+    T[:3, 3] = torch.tensor([1.0, -2.0, 3.0])
+    return T
+
+
+class TestSplats:
+    @pytest.mark.parametrize("moved", [False, True])
+    @pytest.mark.parametrize("stream", [0, 1])
+    def test_read_back(self, tmp_path: Path, stream: int, moved: bool) -> None:
+        mix = mixture()
+        assert write_mixture_ply(tmp_path / "m.ply", mix, stream=stream, T_world_first=world() if moved else None) == 5
+        table = parse(tmp_path / "m.ply")[0]["vertex"]
+        used = mix.valid[stream]
+        R = world()[:3, :3] if moved else torch.eye(3, dtype=torch.float64)
+        t = world()[:3, 3] if moved else torch.zeros(3, dtype=torch.float64)
+        mean = mix.mean[stream][used] @ R.T + t
+        np.testing.assert_allclose(stack(table, "x", "y", "z"), mean, atol=1e-6)
+        # SciPy's quaternions are x y z w.
+        axes = Rotation.from_quat(stack(table, "rot_1", "rot_2", "rot_3", "rot_0")).as_matrix()
+        sigma = np.exp(stack(table, "scale_0", "scale_1", "scale_2"))
+        covariance = np.einsum("kij,kj,klj->kil", axes, sigma**2, axes)
+        np.testing.assert_allclose(covariance, R @ mix.covariance[stream][used] @ R.T, atol=1e-6)
+        assert np.abs(np.linalg.norm(stack(table, "rot_0", "rot_1", "rot_2", "rot_3"), axis=-1) - 1).max() < 1e-6
+        for name in ("weight", "disagreement", "count"):
+            np.testing.assert_allclose(table[name], getattr(mix, name)[stream][used], rtol=1e-7)
+        np.testing.assert_allclose(1 / (1 + np.exp(-table["opacity"])), OPACITY, rtol=1e-6)
+
+    def test_normal_is_the_shortest_axis(self, tmp_path: Path) -> None:
+        mix = mixture()
+        write_mixture_ply(tmp_path / "m.ply", mix)
+        n = stack(parse(tmp_path / "m.ply")[0]["vertex"], "nx", "ny", "nz")
+        covariance = mix.covariance[0][mix.valid[0]].numpy()
+        along = np.einsum("ki,kij,kj->k", n, covariance, n)
+        np.testing.assert_allclose(along, np.linalg.eigvalsh(covariance)[:, 0], rtol=1e-3, atol=1e-7)
+
+    def test_colour_follows_disagreement(self, tmp_path: Path) -> None:
+        mix = mixture(30, streams=1)
+        write_mixture_ply(tmp_path / "m.ply", mix)
+        elements, comments = parse(tmp_path / "m.ply")
+        rgb = 0.5 + 0.28209479177387814 * stack(elements["vertex"], "f_dc_0", "f_dc_1", "f_dc_2")
+        assert rgb.min() > -1e-6
+        assert rgb.max() < 1 + 1e-6
+        brightness, m = rgb @ [0.3, 0.6, 0.1], elements["vertex"]["disagreement"]
+        assert (np.diff(brightness[np.argsort(m)]) >= -1e-6).all()
+        high = np.percentile(np.sqrt(mix.disagreement[mix.valid].numpy()), 99)
+        assert comments[0] == f"comment colour: sqrt(disagreement), magma from 0 to {high:.4g} m"
+
+    def test_attribute_order_of_splat_viewers(self, tmp_path: Path) -> None:
+        write_mixture_ply(tmp_path / "m.ply", mixture())
+        names = parse(tmp_path / "m.ply")[0]["vertex"].dtype.names
+        assert names == (
+            *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+            *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+            *("weight", "disagreement", "count"),
+        )
+
+    def test_flat_and_point_components_are_finite(self, tmp_path: Path) -> None:
+        mix = mixture(4, streams=1)
+        covariance = torch.zeros_like(mix.covariance)
+        covariance[0, 0] = torch.diag(torch.tensor([0.25, 0.04, 0.0]))
+        covariance[0, 1, 2, 2] = -1e-12  # rounding
+        weight = torch.tensor([[1.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
+        write_mixture_ply(tmp_path / "m.ply", mix.replace(covariance=covariance, weight=weight))
+        write_ellipsoids_ply(tmp_path / "e.ply", mix.replace(covariance=covariance, weight=weight))
+        table = parse(tmp_path / "m.ply")[0]["vertex"]
+        sigma = np.exp(stack(table, "scale_0", "scale_1", "scale_2"))
+        np.testing.assert_allclose(sigma[0], [SIGMA_FLOOR, 0.2, 0.5], rtol=1e-6)
+        np.testing.assert_allclose(sigma[1], [SIGMA_FLOOR] * 3, rtol=1e-6)
+        vertices = parse(tmp_path / "e.ply")[0]["vertex"]
+        assert all(np.isfinite(vertices[name]).all() for name in vertices.dtype.names or ())
+
+    def test_empty_mixture(self, tmp_path: Path) -> None:
+        empty = GaussianMixture.empty(1, 4, dtype=torch.float32, device="cpu")
+        assert write_mixture_ply(tmp_path / "m.ply", empty) == 0
+        assert write_ellipsoids_ply(tmp_path / "e.ply", empty) == 0
+        assert len(parse(tmp_path / "m.ply")[0]["vertex"]) == 0
+        assert len(parse(tmp_path / "e.ply")[0]["face"]) == 0
+
+    def test_errors(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match=r"stream must lie in \[0, 2\)"):
+            write_mixture_ply(tmp_path / "m.ply", mixture(), stream=2)
+        with pytest.raises(ValueError, match="T_world_first must have shape"):
+            write_mixture_ply(tmp_path / "m.ply", mixture(), T_world_first=torch.eye(3))
+        with pytest.raises(ValueError, match="radius"):
+            write_ellipsoids_ply(tmp_path / "m.ply", mixture(), radius=0)
+
+
+class TestQuaternion:
+    @settings(max_examples=60, deadline=None)
+    @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-9, 0.1, 1.0]))
+    def test_is_scipys(self, seed: int, jitter: float) -> None:
+        rng = np.random.default_rng(seed)
+        # Half turns about the axes and what lies close to them: where naive formulas divide by 0.
+        turns = np.pi * np.concatenate([np.eye(3), np.zeros((1, 3)), [[1, 1, 0]] / np.sqrt(2)])
+        R = Rotation.from_rotvec(turns + jitter * rng.standard_normal((5, 3)))
+        q = quaternion(R.as_matrix())
+        assert (q[:, 0] >= 0).all()
+        back = Rotation.from_quat(q[:, [1, 2, 3, 0]])
+        assert (back * R.inv()).magnitude().max() < 1e-12
+
+
+class TestEllipsoids:
+    @pytest.mark.parametrize("s", [0, 1, 2, 3])
+    def test_icosphere(self, s: int) -> None:
+        vertices, faces = icosphere(s)
+        assert (len(vertices), len(faces)) == (10 * 4**s + 2, 20 * 4**s)
+        np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-15)
+        corners = vertices[faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert (np.einsum("fi,fi->f", normal, corners.mean(1)) > 0).all()  # outwards
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # closed
+
+    def test_mesh(self, tmp_path: Path) -> None:
+        mix, radius = mixture(), 2.0
+        assert write_ellipsoids_ply(tmp_path / "e.ply", mix, T_world_first=world()[None], subdivisions=3) == 5
+        elements, comments = parse(tmp_path / "e.ply")
+        table, faces = elements["vertex"], elements["face"]
+        assert (len(table), len(faces)) == (5 * 642, 5 * 1280)
+        assert (faces["n"] == 3).all()
+        assert "comment ellipsoids of 2 standard deviations" in comments
+        v, n = stack(table, "x", "y", "z"), stack(table, "nx", "ny", "nz")
+        R, t = world()[:3, :3].numpy(), world()[:3, 3].numpy()
+        for k, (mean, covariance) in enumerate(
+            zip(mix.mean[0][mix.valid[0]].numpy(), mix.covariance[0][mix.valid[0]].numpy(), strict=True)
+        ):
+            mine = table["component"] == k
+            centre, sigma = R @ mean + t, R @ covariance @ R.T
+            offset = v[mine] - centre
+            mahalanobis = np.sqrt(np.einsum("ni,ij,nj->n", offset, np.linalg.inv(sigma), offset))
+            np.testing.assert_allclose(mahalanobis, radius, rtol=2e-3)  # float32 over 5 mm axes
+            gradient = offset @ np.linalg.inv(sigma)
+            gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
+            np.testing.assert_allclose(np.einsum("ni,ni->n", gradient, n[mine]), 1, atol=1e-4)
+            a, b, c = np.moveaxis(v[faces["vertex_indices"][k * 1280 : (k + 1) * 1280]] - centre, 1, 0)
+            volume = np.einsum("ni,ni->", a, np.cross(b, c)) / 6
+            # Positive = facing outwards; the inscribed polyhedron of 1280 faces lacks 1.1 % of the ball.
+            exact = 4 / 3 * np.pi * radius**3 * np.sqrt(np.linalg.det(sigma))
+            assert 0.985 * exact < volume < exact
+
+    def test_colours_are_those_of_the_splats(self, tmp_path: Path) -> None:
+        write_mixture_ply(tmp_path / "m.ply", mixture())
+        write_ellipsoids_ply(tmp_path / "e.ply", mixture(), subdivisions=0)
+        splats, mesh = parse(tmp_path / "m.ply")[0]["vertex"], parse(tmp_path / "e.ply")[0]["vertex"]
+        rgb = 255 * (0.5 + 0.28209479177387814 * stack(splats, "f_dc_0", "f_dc_1", "f_dc_2"))
+        np.testing.assert_allclose(stack(mesh, "red", "green", "blue")[::12], rgb, atol=1e-3)
+
+
+class TestNpz:
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_exact(self, tmp_path: Path, dtype: torch.dtype) -> None:
+        mix = mixture(dtype=dtype)
+        write_mixture_npz(tmp_path / "m.npz", mix.padded(64), T_world_first=world())
+        back, T = read_mixture_npz(tmp_path / "m.npz")
+        for name, value in mix.tensors().items():
+            assert torch.equal(getattr(back, name), value)
+            assert getattr(back, name).dtype == value.dtype
+        assert T is not None
+        assert torch.equal(T, world())
+
+    def test_empty(self, tmp_path: Path) -> None:
+        write_mixture_npz(tmp_path / "m.npz", GaussianMixture.empty(2, 4, dtype=torch.float32, device="cpu"))
+        back, T = read_mixture_npz(tmp_path / "m.npz")
+        assert (back.streams, back.capacity, T) == (2, 0, None)
