@@ -6,8 +6,10 @@ cov, weight, m, count, features; the mixture is kept in the first camera's frame
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from oracle_spgf import spgf_oracle
+import oracle_spgf
 
 PIXEL_VARIANCE = 1.0 / 12.0
 
@@ -62,12 +64,38 @@ def relative(T_world_a, T_world_b):
     return T[:3, :3], T[:3, 3]
 
 
-def segment(depth, K, config, *, valid=None, features=None):
-    """C_i with the pixel-footprint floor; config is a dict of SPGF settings (already scaled)."""
+@dataclass(frozen=True)
+class Segmentation:
+    """SPGF's thresholds for the image as it is, and the pruning rule."""
+
+    settings: oracle_spgf.Settings
+    min_pixels: int
+    min_rows: int
+    prune: str  # "both": drop if both are small, "either": drop if one is, "none"
+
+    def keeps(self, piece):
+        few_pixels, few_rows = piece.N < self.min_pixels, piece.n < self.min_rows
+        return not {"both": few_pixels and few_rows, "either": few_pixels or few_rows, "none": False}[self.prune]
+
+
+def segment(depth, K, segmentation, *, valid=None, features=None):
+    """C_i with the pixel-footprint floor; features [F, H, W] are averaged over the pixels of a component."""
+    camera = oracle_spgf.Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    pieces, _ = oracle_spgf.segment(depth, camera, segmentation.settings, valid=valid)
     components = []
-    for g in spgf_oracle(depth, K, config, valid=valid, features=features):
-        floor = (g["mean"][2] / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
-        components.append({**g, "cov": floor_eigenvalues(g["cov"], floor), "m": 0.0, "count": 1})
+    for piece in pieces:
+        if not segmentation.keeps(piece):
+            continue
+        rows, columns = np.array(piece.pixels).T
+        floor = (piece.mu[2] / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
+        components.append({
+            "mean": piece.mu,
+            "cov": floor_eigenvalues(piece.covariance, floor),
+            "weight": float(piece.N),
+            "m": 0.0,
+            "count": 1,
+            "features": np.zeros(0) if features is None else features[:, rows, columns].mean(1),
+        })  # fmt: skip
     return components
 
 
@@ -178,11 +206,11 @@ class Oracle:
         self.mixture, self.T_first, self.smoothed = [], None, None
         self.matches = []
 
-    def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None):
+    def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None, features=None):
         valid = np.isfinite(depth) & (depth > 0)
         if self.T_first is None:
             self.T_first = T_world_cam
-        current = segment(np.where(valid, depth, 0.0), K, self.spgf, valid=valid)
+        current = segment(np.where(valid, depth, 0.0), K, self.spgf, valid=valid, features=features)
         to_cam = relative(self.T_first, T_world_cam)
         to_first = relative(T_world_cam, self.T_first)
         previous_cam = [transform(g, *to_cam) for g in self.mixture]

@@ -1,3 +1,11 @@
 """UfM*: how far to trust a monocular depth network, from the disagreement between its views."""
 
+from ufmstar_torch.config import SPGFConfig as SPGFConfig
+from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
+from ufmstar_torch.mixture import GaussianMixture as GaussianMixture
+from ufmstar_torch.pipeline import UncertainDepth as UncertainDepth
+from ufmstar_torch.prediction import DepthPrediction as DepthPrediction
+from ufmstar_torch.ufmstar import UfMStar as UfMStar
+from ufmstar_torch.ufmstar import UfMStarOutput as UfMStarOutput
+
 __version__ = "0.1.0"

@@ -5,27 +5,36 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ufmstar_torch import correspond as _correspond
 from ufmstar_torch import fuse as _fuse
+from ufmstar_torch import gaussian as _gaussian
 from ufmstar_torch import regress as _regress
 from ufmstar_torch import segment as _segment
 
 
 @dataclass(frozen=True)
 class Backend:
-    """The four replaceable steps; every implementation has the torch reference's signature."""
+    """The replaceable steps; every implementation has the torch reference's signature."""
 
     name: str
     spgf: Callable[..., Any]
+    floor_covariance: Callable[..., Any]
     correspond: Callable[..., Any]
     fuse: Callable[..., Any]
     regress_image: Callable[..., Any]
 
 
-TORCH = Backend("torch", _segment.spgf, _correspond.correspond, _fuse.fuse, _regress.regress_image)
+TORCH = Backend(
+    "torch",
+    _segment.spgf,
+    _gaussian.floor_covariance,
+    _correspond.correspond,
+    _fuse.fuse,
+    _regress.regress_image,
+)
 
 
 def select(name: str, device_type: str) -> Backend:
@@ -53,17 +62,20 @@ def select(name: str, device_type: str) -> Backend:
     compiled = _numba_or_none()
     if compiled is None or device_type == "cpu":
         return compiled or TORCH
-    return Backend("torch, host segmentation", _on_host(compiled.spgf), *_steps_after_segmentation(TORCH))
-
-
-def _steps_after_segmentation(backend: Backend) -> tuple[Callable[..., Any], ...]:
-    return backend.correspond, backend.fuse, backend.regress_image
+    return replace(TORCH, name="torch, host segmentation", spgf=_on_host(compiled.spgf))
 
 
 def _numba_backend() -> Backend:
-    from ufmstar_torch.kernels import regress_cpu, segment_cpu
+    from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, gaussian_cpu, regress_cpu, segment_cpu
 
-    return Backend("numba", segment_cpu.spgf, _correspond.correspond, _fuse.fuse, regress_cpu.regress_image)
+    return Backend(
+        "numba",
+        segment_cpu.spgf,
+        gaussian_cpu.floor_covariance,
+        correspond_cpu.correspond,
+        fuse_cpu.fuse,
+        regress_cpu.regress_image,
+    )
 
 
 @functools.cache

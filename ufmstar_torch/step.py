@@ -17,7 +17,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.frame import FRAME_FAULTS, FrameInput
 from ufmstar_torch.fuse import append
-from ufmstar_torch.gaussian import floor_covariance, pixel_footprint
+from ufmstar_torch.gaussian import pixel_footprint
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression, regress, smooth
 
@@ -189,7 +189,7 @@ def segment(frame: FrameInput, config: UfMStarConfig, backend: Backend) -> tuple
     mixture = mixture.to(torch.float64)
     fx, fy, _, _ = focal_and_centre(frame.intrinsics)
     floor = pixel_footprint(mixture.mean[..., 2], torch.minimum(fx, fy)[:, None])
-    return mixture.replace(covariance=floor_covariance(mixture.covariance, floor)), labels
+    return mixture.replace(covariance=backend.floor_covariance(mixture.covariance, floor)), labels
 
 
 def _make_room(

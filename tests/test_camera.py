@@ -1,0 +1,146 @@
+"""Pinhole geometry: re-projection under resize and crop, poses, the Jacobian."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+import pytest
+import scenes
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch import camera
+
+
+def pose(seed: int) -> torch.Tensor:
+    rng = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    return torch.from_numpy(T)
+
+
+def test_unproject_inverts_projection():
+    K = torch.tensor(scenes.intrinsics(5, 7), dtype=torch.float64)[None]
+    depth = 1 + torch.rand(1, 5, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    points = camera.unproject(depth, K).view(1, 35, 3)
+    cov = torch.eye(3, dtype=torch.float64).expand(1, 35, 3, 3)
+    pixels, _ = camera.project_gaussian(points, cov, K)
+    v, u = torch.meshgrid(torch.arange(5.0), torch.arange(7.0), indexing="ij")
+    torch.testing.assert_close(pixels.view(5, 7, 2), torch.stack([u, v], -1).double(), rtol=0, atol=1e-12)
+
+
+def test_unproject_agrees_with_kornia():
+    from kornia.geometry.depth import depth_to_3d_v2
+
+    K = torch.tensor(scenes.intrinsics(6, 9), dtype=torch.float64)[None]
+    depth = 1 + torch.rand(1, 6, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(camera.unproject(depth, K), depth_to_3d_v2(depth, K), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(("old", "new"), [((480, 640), (224, 224)), ((540, 360), (97, 131)), ((30, 40), (90, 120))])
+def test_resized_intrinsics_reproject(old, new):
+    """A blob drawn at a known point's projection lands, after resizing the image, at its new projection."""
+    K = torch.tensor(scenes.intrinsics(*old), dtype=torch.float64)
+    K[0, 2] += 3.3
+    point = torch.tensor([0.1, -0.15, 1.0], dtype=torch.float64)
+
+    def pixel(K):
+        return (K @ point)[:2] / point[2]
+
+    v, u = torch.meshgrid(torch.arange(old[0]).double(), torch.arange(old[1]).double(), indexing="ij")
+    radius = 0.04 * min(old)
+    blob = torch.exp(-((u - pixel(K)[0]) ** 2 + (v - pixel(K)[1]) ** 2) / (2 * radius**2))
+    small = torch.nn.functional.interpolate(
+        blob[None, None], new, mode="bilinear", align_corners=False, antialias=True
+    )[0, 0]
+    v, u = torch.meshgrid(torch.arange(new[0]).double(), torch.arange(new[1]).double(), indexing="ij")
+    centroid = torch.stack([(u * small).sum(), (v * small).sum()]) / small.sum()
+    expected = pixel(camera.resize_intrinsics(K, old, new))
+    assert (centroid - expected).abs().max() < 0.05
+    # The rule that forgets the half pixel would be off by this much:
+    assert (camera.resize_intrinsics(K, old, new)[0, 2] - K[0, 2] * new[1] / old[1]).abs() == pytest.approx(
+        abs(new[1] / old[1] - 1) / 2
+    )
+
+
+def test_cropped_intrinsics_reproject():
+    K = torch.tensor(scenes.intrinsics(48, 64))
+    image = torch.arange(48 * 64).view(48, 64)
+    cropped, K_cropped = image[5:40, 7:60], camera.crop_intrinsics(K, top=5, left=7)
+    point = torch.tensor([0.2, 0.1, 1.0], dtype=torch.float64)
+    u, v = ((K @ point)[:2]).round().long().tolist()
+    u_c, v_c = ((K_cropped @ point)[:2]).round().long().tolist()
+    assert image[v, u] == cropped[v_c, u_c]
+
+
+def test_resize_refuses_empty_sizes():
+    with pytest.raises(ValueError, match="positive sizes"):
+        camera.resize_intrinsics(torch.eye(3), (0, 4), (2, 2))
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=20, deadline=None)
+def test_relative_pose(seed):
+    T_a, T_b = pose(seed), pose(seed + 1)
+    R, t = camera.relative_pose(T_a, T_b)
+    expected = torch.linalg.inv(T_b) @ T_a
+    torch.testing.assert_close(R, expected[:3, :3], rtol=0, atol=1e-13)
+    torch.testing.assert_close(t, expected[:3, 3], rtol=0, atol=1e-13)
+    torch.testing.assert_close(camera.invert_rigid(T_a) @ T_a, torch.eye(4).double(), rtol=0, atol=1e-14)
+
+
+def test_relative_pose_keeps_digits_far_from_the_world_origin():
+    """Two cameras 10 cm apart in coordinates of a city: the difference survives in full."""
+    T_a, T_b = pose(0), pose(0)
+    T_a[:3, 3] = torch.tensor([5e6, -3e6, 100.0], dtype=torch.float64)
+    T_b[:3, 3] = T_a[:3, 3] + torch.tensor([0.125, 0.0, 0.0], dtype=torch.float64)
+    _, t = camera.relative_pose(T_a, T_b)
+    assert t.norm().item() == pytest.approx(0.125, abs=1e-15)
+
+
+@given(st.integers(0, 10**6), st.floats(0, 0.01))
+@settings(max_examples=20, deadline=None)
+def test_nearest_rotation_is_the_polar_factor(seed, amount):
+    R = pose(seed)[:3, :3]
+    noise = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    skewed = R + amount * noise / noise.abs().max()
+    U, _, Vh = torch.linalg.svd(skewed)
+    torch.testing.assert_close(camera.nearest_rotation(skewed), U @ Vh, rtol=0, atol=1e-14)
+
+
+def test_nearest_rotation_converges_at_the_greatest_tolerance():
+    R = pose(5)[:3, :3] * (1.1**0.5)
+    assert camera.rotation_deviation(R).item() == pytest.approx(0.1)
+    torch.testing.assert_close(camera.nearest_rotation(R), pose(5)[:3, :3], rtol=0, atol=1e-14)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=20, deadline=None)
+def test_projected_covariance(seed):
+    from random_gaussians import covariances, means
+
+    K = torch.tensor(scenes.intrinsics(48, 64))
+    mean, cov = means(3, seed), covariances(3, seed)
+    mean[:, 2] = mean[:, 2].abs() + 0.5
+    image_mean, image_cov = camera.project_gaussian(mean[None], cov[None], K[None])
+    for i in range(3):
+        m, S = oracle.project(mean[i].numpy(), cov[i].numpy(), K.numpy())
+        np.testing.assert_allclose(image_mean[0, i].numpy(), m, rtol=1e-12)
+        np.testing.assert_allclose(
+            image_cov[0, i].numpy() + oracle.PIXEL_VARIANCE * np.eye(2), S, rtol=1e-11, atol=1e-11
+        )
+
+
+def test_jacobian_is_the_derivative_of_the_projection():
+    K = torch.tensor(scenes.intrinsics(48, 64))[None]
+    mean = torch.tensor([[[0.3, -0.2, 1.7]]], dtype=torch.float64)
+
+    def project(m):
+        return camera.project_gaussian(m, torch.zeros(1, 1, 3, 3, dtype=torch.float64), K)[0]
+
+    A = torch.autograd.functional.jacobian(project, mean)[0, 0, :, 0, 0]
+    cov = torch.diag(torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64))
+    _, image_cov = camera.project_gaussian(mean, cov[None, None], K)
+    torch.testing.assert_close(image_cov[0, 0], A @ cov @ A.T, rtol=1e-12, atol=0)

@@ -1,0 +1,148 @@
+"""Gaussian mixture regression: oracle, kernels, the bound of the culling, sampling, the moving average."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+import pytest
+import scenes
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_gaussians import mixture
+from test_correspond import as_lists
+
+from ufmstar_torch.camera import unproject
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.kernels import regress_cpu
+from ufmstar_torch.regress import regress, regress_image, sample_pixels, smooth
+
+K = torch.tensor(scenes.intrinsics(40, 56))[None]
+EXACT = UfMStarConfig(prior_mean=0.3, prior_weight=2.0)
+NEAR = EXACT.replace(regression="neighbourhood")
+
+
+def rendered(seed: int = 0) -> torch.Tensor:
+    depth = torch.tensor(scenes.render(scenes.tour(8)[seed % 8], K[0].numpy(), 40, 56))[None]
+    depth[0, 3, 4] = torch.nan
+    return depth
+
+
+@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=10, deadline=None)
+def test_agrees_with_the_oracle(config, seed):
+    m = mixture(2, 9, seed, features=2)
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(2, 20, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 3.0])
+    points[:, :7] = m.mean[:, :7] + 0.02
+    result = regress(m, points, config)
+    neighbourhood = (2.0, 0.1, 0.5) if config is NEAR else None
+    for b in range(2):
+        for p in range(20):
+            value, features = oracle.regress_point(
+                points[b, p].numpy(), as_lists(m, b), prior_weight=2.0, prior_mean=0.3, neighbourhood=neighbourhood
+            )
+            assert result.disagreement[b, p].item() == pytest.approx(value, rel=1e-9)
+            np.testing.assert_allclose(result.features[b, p].numpy(), features, rtol=1e-9, atol=1e-300)
+
+
+@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 5e-5)])
+def test_the_kernel_agrees_with_the_reference(config, dtype, tolerance):
+    m = mixture(2, 40, 3, features=2)
+    depth = torch.cat([rendered(0), rendered(3)])
+    reference = regress_image(m, depth, K.expand(2, 3, 3), config)
+    fast = regress_cpu.regress_image(m, depth.to(dtype), K.expand(2, 3, 3), config)
+    assert fast.disagreement.dtype == dtype
+    assert torch.equal(fast.disagreement.isnan(), reference.disagreement.isnan())
+    assert fast.disagreement.isnan().sum() == 2
+    # float32: what the exponent's argument, up to some 100, loses to rounding.
+    torch.testing.assert_close(fast.disagreement.double(), reference.disagreement, rtol=0, atol=tolerance, equal_nan=True)
+    torch.testing.assert_close(fast.features.double(), reference.features, rtol=0, atol=tolerance, equal_nan=True)
+
+
+@pytest.mark.parametrize("epsilon", [0.5, 1e-2, 1e-6])
+def test_culling_keeps_its_bound(monkeypatch, epsilon):
+    m = mixture(1, 60, 5)
+    config = UfMStarConfig(prior_mean=0.7)
+    depth = rendered(2)
+    exact = regress_image(m, depth, K, config).disagreement
+    monkeypatch.setitem(regress_cpu.EPSILON, torch.float64, epsilon)
+    error = (regress_cpu.regress_image(m, depth, K, config).disagreement - exact).abs().nan_to_num().max().item()
+    assert error <= 2 * epsilon * max(m.disagreement.max().item(), 0.7)
+    if epsilon == 0.5:
+        assert error > 1e-9  # something was left out, or the test tests nothing
+
+
+def test_far_away_the_prior_rules():
+    m = mixture(1, 8, 1)
+    far = torch.full((1, 3, 3), 50.0, dtype=torch.float64)
+    for config in (EXACT, NEAR):
+        assert regress(m, far, config).disagreement.tolist() == [[0.3, 0.3, 0.3]]
+    image = regress_cpu.regress_image(m, torch.full((1, 40, 56), 50.0, dtype=torch.float64), K, EXACT)
+    torch.testing.assert_close(image.disagreement, torch.full_like(image.disagreement, 0.3), rtol=1e-12, atol=0)
+
+
+def test_an_empty_mixture_is_the_prior_everywhere():
+    m = mixture(1, 3, 1, empty=3)
+    for function in (regress_image, regress_cpu.regress_image):
+        for config in (EXACT, NEAR):
+            out = function(m, rendered(), K, config).disagreement
+            assert torch.equal(out[~out.isnan()].unique(), torch.tensor([0.3], dtype=torch.float64))
+
+
+def test_chunks_change_nothing(monkeypatch):
+    from ufmstar_torch import regress as module
+
+    m = mixture(1, 9, 4)
+    points = unproject(rendered(1).nan_to_num(1.0), K).flatten(1, 2)
+    whole = regress(m, points, EXACT).disagreement
+    monkeypatch.setattr(module, "_CHUNK", 9 * 100)
+    assert torch.equal(regress(m, points, EXACT).disagreement, whole)
+    assert regress(m, points[:, :0], EXACT).disagreement.shape == (1, 0)
+
+
+def test_weights_average_between_components():
+    """Half way between two equal Gaussians of m = 1 and m = 3, with a vanishing prior, lies 2."""
+    m = mixture(1, 2, 1, empty=0)
+    eye = 0.01 * torch.eye(3, dtype=torch.float64)
+    m = m.replace(
+        mean=torch.tensor([[[0.0, 0, 2], [0.2, 0, 2]]]).double(),
+        covariance=eye.expand(1, 2, 3, 3),
+        weight=torch.full((1, 2), 1e6).double(),
+        disagreement=torch.tensor([[1.0, 3.0]]).double(),
+    )
+    middle = torch.tensor([[[0.1, 0, 2]]]).double()
+    assert regress(m, middle, UfMStarConfig()).disagreement.item() == pytest.approx(2, abs=1e-5)
+
+
+def test_smooth():
+    nan = float("nan")
+    before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]])
+    torch.testing.assert_close(
+        smooth(before, now, 0.25), torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True
+    )
+    assert smooth(None, now, 0.5) is now
+    assert smooth(before, now, 1.0) is now
+
+
+def test_sample_is_seeded_uniform_and_valid():
+    valid = torch.zeros(2, 10, 10, dtype=torch.bool)
+    valid[0, :5] = True
+    valid[1, 0, :3] = True
+    index, used = sample_pixels(valid, 20, seed=4)
+    again, _ = sample_pixels(valid, 20, seed=4)
+    other, _ = sample_pixels(valid, 20, seed=5)
+    assert torch.equal(index, again)
+    assert not torch.equal(index, other)
+    assert used.sum(1).tolist() == [20, 3]
+    assert valid.flatten(1).gather(1, index)[used].all()
+    assert all(len(set(row.tolist())) == 20 for row in index)
+    counts = torch.zeros(100)
+    for seed in range(400):
+        index, _ = sample_pixels(valid[:1], 10, seed)
+        counts[index[0]] += 1
+    # Binomial(400, 0.2) per valid pixel: mean 80, sigma 8.
+    assert (counts[:50] - 80).abs().max() < 5 * 8
+    assert counts[50:].sum() == 0
