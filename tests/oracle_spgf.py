@@ -165,7 +165,8 @@ class _Frame:
                 queue.appendleft(start)
                 if len(queue) > self.settings.max_open:
                     out.append(queue.pop())
-        return [o for o in [*out, *queue] if o.N > self.settings.sparse]
+        sparse = self.settings.sparse
+        return [o for o in [*out, *queue] if o.N > sparse]
 
     def _fits(self, o: Piece, u: int, p: Array, k: int) -> bool:
         w = o.pR - o.pL
@@ -175,7 +176,8 @@ class _Frame:
         t = self.slope * z * z
         low = self.settings.noise_floor
         tau_z = min(max(6 * t, low), self.settings.noise_thresh)
-        if o.N <= self.settings.n_check:
+        n_check = self.settings.n_check
+        if o.N <= n_check:
             tau_x = min(max(t, low), self.settings.line_t)
             return bool(abs(z - o.pR[2]) < tau_z and abs(x - o.pR[0]) < tau_x)
         lx, _, lz = (float(value) for value in o.l)

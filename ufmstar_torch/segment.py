@@ -1,0 +1,143 @@
+"""Step 2, 3D Gaussian segmentation: Single Pass Gaussian Fitting, depth map -> mixture C_i.
+
+Section "3D Gaussian segmentation" (Li, Karaman, Sze, ICRA 2022): every row is cut into segments that are
+lines in x and z (scanline segmentation), and the segments of successive rows are joined into planes
+(segment fusion). This is the vectorised torch reference; ``docs/segmentation.md`` explains the method.
+
+Moments are kept about a point of the surface itself (first pixel of a segment, then the running mean, Chan et al.),
+never about the camera, so that they lose nothing to the distance from it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.segment_fusion import GAUSSIAN_WIDTH, Gaussian, append, fuse_segments, parts
+from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.segment_scanline import Frame, Segments, scanlines
+
+
+@torch.no_grad()
+def spgf(
+    depth: Tensor,
+    intrinsics: Tensor,
+    config: SPGFConfig | UfMStarConfig | None = None,
+    *,
+    variance: Tensor | None = None,
+    valid: Tensor | None = None,
+    features: Tensor | None = None,
+    before_pruning: bool = False,
+    compute_dtype: torch.dtype | None = None,
+) -> tuple[GaussianMixture, Tensor]:
+    """Fit Gaussians to the surfaces of B depth maps.
+
+    A pixel takes part if its depth is finite, positive and at most ``max_depth``, its variance, where given,
+    finite and not negative, and ``valid`` allows it. Nothing is differentiated. Nothing waits for an
+    accelerator: there, loops and tables have their static bounds.
+
+    Args:
+        depth: [B, H, W] [m].
+        intrinsics: [B, 3, 3] [px], centre of the first pixel at (0, 0).
+        config: thresholds (``.segment`` of a ``UfMStarConfig``); None = defaults.
+        variance: [B, H, W] [m^2] of the depth; adds s^2 r r^T, r the pixel's ray, to the scatter. The
+            partition does not depend on it.
+        valid: [B, H, W] bool, True = use.
+        features: [B, F, H, W] averaged over the pixels of each Gaussian; not read where no Gaussian is.
+        before_pruning: return every Gaussian that was emitted.
+        compute_dtype: torch.float64 (default), or torch.float32, the default where the device has no float64.
+
+    Returns:
+        The mixture [B, K] in the camera frame in order of emission: sample covariance (divisor N - 1;
+        zeros for N = 1; eigenvalues not floored), weight = N [px], disagreement 0, count 1. Its dtype is
+        depth's, float32 for half and bfloat16. K is the largest number of Gaussians of any stream, at least 1; on an
+        accelerator the bound that the pruning rule implies.
+        Labels [B, H, W] int64: each pixel's slot, -1 = none.
+
+    Raises:
+        TypeError: an argument is no tensor or has the wrong kind of dtype, or config is no config.
+        ValueError: an argument has the wrong shape or lies on another device than depth; on the CPU also
+            intrinsics that are not finite with fx, fy > 0 (elsewhere such a stream's result means nothing).
+    """
+    given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
+    if compute_dtype is None:
+        compute_dtype = torch.float32 if depth.device.type == "mps" else torch.float64
+    elif compute_dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"compute_dtype must be torch.float32 or torch.float64, got {compute_dtype}")
+    frame = Frame.of(given, compute_dtype)
+    segments = scanlines(frame)
+    return _output(frame, segments, *fuse_segments(frame, segments), before_pruning)
+
+
+def _output(
+    frame: Frame, segments: Segments, emitted: Tensor, count: Tensor, member: Tensor, before_pruning: bool
+) -> tuple[GaussianMixture, Tensor]:
+    """Prune, and write the mixture and the labels."""
+    given = frame.given
+    total = emitted.shape[1]
+    g = parts(emitted)
+    exists = torch.arange(total, device=count.device) < count[:, None]
+    kept = exists
+    if not before_pruning:
+        kept = exists & _keeps(g.n[..., 0], g.merged[..., 0], given.config)
+    if count.device.type == "cpu":
+        capacity = max(1, int(kept.sum(1).max()))
+    else:
+        capacity = total if before_pruning else min(total, _most_kept(given))
+    table = emitted.new_zeros(emitted.shape[0], capacity + 1, GAUSSIAN_WIDTH)
+    append(table, torch.zeros_like(count), emitted, kept)
+
+    # A pixel's segment of its row -> Gaussian in order of creation -> slot.
+    created = torch.where(exists, g.index[..., 0].to(torch.int64), total)
+    slot = torch.where(kept, kept.cumsum(1) - 1, -1)
+    slot_of = slot.new_zeros(slot.shape[0], total + 1).scatter(1, created, slot)
+    segment = segments.pixel.view(given.depth.shape)
+    gaussian = member.gather(2, segment.clamp_min(0)).flatten(1).clamp_min(0)
+    labels = torch.where(segment < 0, -1, slot_of.gather(1, gaussian).view_as(segment))
+    return _mixture(parts(table[:, :capacity]), labels, given), labels
+
+
+def _keeps(pixels: Tensor, merged: Tensor, limits: SPGFConfig) -> Tensor:
+    """The pruning rule: "both" drops what is small in pixels and in rows, "either" what is small in one."""
+    large, tall = pixels >= limits.min_pixels, merged >= limits.min_rows
+    if limits.prune == "none":
+        return torch.ones_like(large)
+    return large | tall if limits.prune == "both" else large & tall
+
+
+def _most_kept(given: SegmentInput) -> int:
+    """Bound on the Gaussians of an image that survive pruning: each has at least so many pixels."""
+    _, height, width = given.depth.shape
+    limits = given.config
+    by_rows = limits.min_rows * (limits.sparse + 1)  # of min_rows segments, each with more than ``sparse``
+    least = {"none": 1, "both": min(limits.min_pixels, by_rows), "either": max(limits.min_pixels, by_rows)}
+    return max(1, height * width // least[limits.prune])
+
+
+def _mixture(g: Gaussian, labels: Tensor, given: SegmentInput) -> GaussianMixture:
+    n = g.n[..., 0]
+    covariance = torch.where(g.n > 1, g.scatter / (g.n - 1).clamp_min(1.0), 0)
+    xx, xy, xz, yy, yz, zz = covariance.unbind(-1)
+    full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).unflatten(-1, (3, 3))
+    features = n.new_zeros(*n.shape, 0)
+    if given.features is not None:
+        features = _feature_means(given.features.to(n.dtype), labels, n)
+    return GaussianMixture(
+        mean=g.mean.to(given.dtype),
+        covariance=full.to(given.dtype),
+        weight=n.to(given.dtype),
+        disagreement=torch.zeros_like(n, dtype=given.dtype),
+        count=(n > 0).to(torch.int64),
+        features=features.to(given.dtype),
+    )
+
+
+def _feature_means(features: Tensor, labels: Tensor, n: Tensor) -> Tensor:
+    """[B, K, F] means of the features [B, F, H, W] over the pixels of each Gaussian."""
+    b, channels = features.shape[:2]
+    k = n.shape[1]
+    at = torch.where(labels < 0, k, labels).flatten(1)[:, None].expand(-1, channels, -1)
+    sums = features.new_zeros(b, channels, k + 1).scatter_add_(2, at, features.flatten(2))
+    return sums[..., :k].mT / n.clamp_min(1.0)[..., None]

@@ -1,0 +1,141 @@
+"""What both implementations of SPGF are given, checked once: shapes, dtypes, and thresholds for this image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+
+# Bins are walked one by one; more than this would be a mistake in the units, not a wish.
+MAX_DEPTH_BINS = 10_000
+
+
+@dataclass(frozen=True)
+class SegmentInput:
+    """Checked arguments of ``spgf``, detached from any graph.
+
+    Attributes:
+        depth: [B, H, W] [m], float32 or float64 (float64 where half or bfloat16 was given).
+        intrinsics: [B, 3, 3] [px], in the dtype that was given.
+        config: thresholds scaled to H x W.
+        variance: [B, H, W] [m^2] or None.
+        valid: [B, H, W] bool or None.
+        features: [B, F, H, W] or None.
+        dtype: of the mixture to return: depth's, float32 for half and bfloat16.
+    """
+
+    depth: Tensor
+    intrinsics: Tensor
+    config: SPGFConfig
+    variance: Tensor | None
+    valid: Tensor | None
+    features: Tensor | None
+    dtype: torch.dtype
+
+    @classmethod
+    def checked(
+        cls,
+        depth: Tensor,
+        intrinsics: Tensor,
+        config: SPGFConfig | UfMStarConfig | None,
+        variance: Tensor | None,
+        valid: Tensor | None,
+        features: Tensor | None,
+    ) -> SegmentInput:
+        """Check the arguments of ``spgf``; see there.
+
+        Raises:
+            TypeError: an argument is no tensor or has the wrong kind of dtype, or config is no config.
+            ValueError: a wrong shape, another device than depth's, or (CPU tensors only, elsewhere the check
+                would wait for the device) intrinsics that are not finite with fx, fy > 0.
+        """
+        _require_float("depth", depth)
+        if depth.dim() != 3 or 0 in depth.shape:
+            raise ValueError(f"depth must be [B, H, W] with no empty dimension, got {tuple(depth.shape)}")
+        b, height, width = depth.shape
+        _require_like("intrinsics", intrinsics, (b, 3, 3), depth)
+        if variance is not None:
+            _require_like("variance", variance, (b, height, width), depth)
+        if features is not None:
+            channels = features.shape[1] if isinstance(features, Tensor) and features.dim() == 4 else "F"
+            _require_like("features", features, (b, channels, height, width), depth)
+        if valid is not None:
+            _require_mask(valid, depth)
+        if depth.device.type == "cpu":
+            _require_camera(intrinsics)
+        stored = depth.dtype in (torch.float32, torch.float64)
+        return cls(
+            depth=depth.detach() if stored else depth.detach().to(torch.float64),
+            intrinsics=intrinsics.detach(),
+            config=_spgf_config(config).scaled_to(height, width),
+            variance=None if variance is None else variance.detach(),
+            valid=valid,
+            features=None if features is None else features.detach(),
+            dtype=depth.dtype if stored else torch.float32,
+        )
+
+    @property
+    def segments_per_row(self) -> int:
+        """Most segments that one row can hold: each has more than ``sparse`` pixels. At least 1."""
+        return max(1, self.depth.shape[2] // (self.config.sparse + 1))
+
+    @property
+    def depth_bins(self) -> int:
+        """Enough depth bins to reach max_depth whatever the camera: none is shorter than L0."""
+        return math.ceil(self.config.max_depth / self.config.min_gaussian_length) + 2
+
+
+def _spgf_config(config: SPGFConfig | UfMStarConfig | None) -> SPGFConfig:
+    if config is None:
+        config = SPGFConfig()
+    elif isinstance(config, UfMStarConfig):
+        config = config.segment
+    elif not isinstance(config, SPGFConfig):
+        raise TypeError(f"config must be an SPGFConfig, a UfMStarConfig or None, got {type(config).__name__}")
+    if config.max_depth > MAX_DEPTH_BINS * config.min_gaussian_length:
+        raise ValueError(
+            f"config.min_gaussian_length = {config.min_gaussian_length} m would cut config.max_depth = "
+            f"{config.max_depth} m into more than {MAX_DEPTH_BINS} bins; are both in metres?"
+        )
+    return config
+
+
+def _require_float(name: str, value: object) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+    if not value.is_floating_point():
+        raise TypeError(f"{name} must have a floating-point dtype, got {value.dtype}")
+
+
+def _require_like(name: str, value: object, shape: tuple[object, ...], depth: Tensor) -> None:
+    _require_float(name, value)
+    assert isinstance(value, Tensor)
+    if tuple(value.shape) != shape:
+        expected = "[" + ", ".join(str(n) for n in shape) + "]"
+        raise ValueError(f"{name} must be {expected} for this depth, got {list(value.shape)}")
+    _require_device(name, value, depth)
+
+
+def _require_device(name: str, value: Tensor, depth: Tensor) -> None:
+    if value.device != depth.device:
+        raise ValueError(f"{name} must lie on depth's device {depth.device}, got {value.device}")
+
+
+def _require_mask(valid: object, depth: Tensor) -> None:
+    if not isinstance(valid, Tensor) or valid.dtype != torch.bool:
+        kind = valid.dtype if isinstance(valid, Tensor) else type(valid).__name__
+        raise TypeError(f"valid must be a torch.bool tensor (True = use), got {kind}")
+    if valid.shape != depth.shape:
+        raise ValueError(f"valid must be {list(depth.shape)} as depth is, got {list(valid.shape)}")
+    _require_device("valid", valid, depth)
+
+
+def _require_camera(intrinsics: Tensor) -> None:
+    for b, (row_x, row_y, _) in enumerate(intrinsics.tolist()):
+        values = (row_x[0], row_y[1], row_x[2], row_y[2])
+        if not all(map(math.isfinite, values)) or min(values[:2]) <= 0:
+            raise ValueError(f"intrinsics must be finite with fx, fy > 0, got fx, fy, cx, cy = {values} in stream {b}")
