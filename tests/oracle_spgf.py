@@ -166,7 +166,7 @@ class _Frame:
                 if len(queue) > self.settings.max_open:
                     out.append(queue.pop())
         sparse = self.settings.sparse
-        return [o for o in [*out, *queue] if o.N > sparse]
+        return [o for o in [*out, *queue] if sparse < o.N]
 
     def _fits(self, o: Piece, u: int, p: Array, k: int) -> bool:
         w = o.pR - o.pL
@@ -177,7 +177,7 @@ class _Frame:
         low = self.settings.noise_floor
         tau_z = min(max(6 * t, low), self.settings.noise_thresh)
         n_check = self.settings.n_check
-        if o.N <= n_check:
+        if n_check >= o.N:
             tau_x = min(max(t, low), self.settings.line_t)
             return bool(abs(z - o.pR[2]) < tau_z and abs(x - o.pR[0]) < tau_x)
         lx, _, lz = (float(value) for value in o.l)

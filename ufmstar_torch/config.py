@@ -96,6 +96,30 @@ class SPGFConfig(_Checked):
                 f".noise_floor = {self.noise_floor}, got {self.noise_thresh} and {self.line_thresh}"
             )
 
+    @classmethod
+    def preset(cls, name: str) -> SPGFConfig:
+        """Upstream's own values: "tum", "tartanair_indoor" or "tartanair_outdoor", all for images of 640x480.
+
+        Raises:
+            ValueError: another name.
+        """
+        tartanair = {"adaptive_thresh_scale": 0.70, "min_rows": 8, "reference_focal": 320.0}
+        outdoor = {"noise_floor": 0.25, "noise_thresh": 0.5, "min_gaussian_length": 0.6}
+        presets: dict[str, dict[str, Any]] = {
+            "tum": {},
+            "tartanair_indoor": {**tartanair, "noise_floor": 0.05, "sparse": 2},
+            "tartanair_outdoor": {**tartanair, **outdoor},
+        }
+        if name not in presets:
+            raise ValueError(f"SPGFConfig.preset must be one of {', '.join(presets)}, got {name!r}")
+        upstream = {
+            "adaptive_thresh_scale": 2.4, "noise_floor": 0.08, "noise_thresh": 0.2, "line_thresh": 0.3,
+            "occlusion_gap": 10, "n_check": 16, "max_open": 2, "angle_cosine": 0.5, "sparse": 5,
+            "min_gaussian_length": 0.5, "frame_max_scale": 4.0, "max_depth": 20.0, "min_pixels": 200,
+            "min_rows": 16, "prune": "both", "reference_focal": 525.0, "reference_height": 480, "reference_width": 640,
+        }  # fmt: skip
+        return cls(**{**upstream, **presets[name]})
+
     def scaled_to(self, height: int, width: int) -> SPGFConfig:
         """The same thresholds for an image of height x width: counts of pixels along a row follow the
         width, rows the height, areas the area. Off (``scale_with_image=False``): returned as it is.
