@@ -22,14 +22,19 @@ from ufmstar_torch.eval.metrics import (
     ECEDelta,
     ECEQuantile,
     EntropyHistogram,
+    NLLByError,
     SequenceMetrics,
+    Sparsification,
+    SpearmanCorrelation,
     mean_and_ci,
 )
 from ufmstar_torch.eval.metrics.base import SumMetric
 from ufmstar_torch.eval.metrics.calibration import interval_confidence
+from ufmstar_torch.eval.metrics.ranking import confident, log_bin
 from ufmstar_torch.eval.metrics.sequence import over_sequences
 
-ALL = [Delta1, AbsRel, RMSE, NLL, ECEDelta, ECEQuantile, EntropyHistogram]
+RANKING = [Sparsification, SpearmanCorrelation, NLLByError]
+ALL = [Delta1, AbsRel, RMSE, NLL, ECEDelta, ECEQuantile, EntropyHistogram, *RANKING]
 UNCERTAIN = ALL[3:]
 
 
@@ -88,9 +93,7 @@ class TestAgainstIndependentImplementations:
         confidence = interval_confidence(d, v, 0.25)
         accurate = ((g - d).abs() <= 0.25 * d).long()
         oracle = BinaryCalibrationError(n_bins=bins, norm="l1")(confidence.flatten(), accurate.flatten())
-        assert float(figures(ECEDelta(bins=bins), d, v, g)["ece_delta"]) == pytest.approx(
-            float(oracle), abs=3e-6
-        )
+        assert float(figures(ECEDelta(bins=bins), d, v, g)["ece_delta"]) == pytest.approx(float(oracle), abs=3e-6)
 
     def test_ece_delta_is_a_numpy_loop(self) -> None:
         d, v, g = maps(20, 30, scale=2.0)
@@ -157,6 +160,114 @@ class TestMeaning:
         g = torch.full((100,), 2.0)
         got = figures(ECEQuantile([0.01, 0.3]), g + 10, torch.ones(100), g)
         assert got["ece_q_observed"].tolist() == [1.0, 1.0]
+
+
+def sparsification(key: np.ndarray, error: np.ndarray, root: bool) -> np.ndarray:
+    """The curve by sorting all pixels; ties in the order in which they stand."""
+    ordered = error[np.argsort(key, kind="stable")]
+    kept = [ordered[: round((1 - j / 50) * len(ordered))].mean() for j in range(50)]
+    return np.sqrt(kept) if root else np.array(kept)
+
+
+def area(curve: np.ndarray) -> float:
+    return float(np.trapezoid(curve, dx=1 / 50) + curve[-1] / 50)
+
+
+class TestRanking:
+    @pytest.mark.parametrize("name", ["rmse", "abs_rel"])
+    def test_ause_and_aurg_are_those_of_sorted_pixels(self, name: str) -> None:
+        d, v, g = maps(300, 400)
+        root = name == "rmse"
+        e = (((d - g) ** 2) if root else (d - g).abs() / g).numpy().ravel()
+        by_variance, oracle = sparsification(v.numpy().ravel(), e, root), sparsification(e, e, root)
+        got = figures(Sparsification(), d, v, g)
+        # Bins of .7 %; seen: 1e-4.
+        np.testing.assert_allclose(got[f"sparsification_{name}"].numpy(), by_variance, rtol=3e-3)
+        assert float(got[f"ause_{name}"]) == pytest.approx(area(by_variance) - area(oracle), rel=1e-3)
+        assert float(got[f"aurg_{name}"]) == pytest.approx(by_variance[0] - area(by_variance), rel=1e-3)
+        assert float(got[f"aurg_{name}"]) > 0
+
+    def test_ties_are_broken_at_random(self) -> None:
+        """The same variance everywhere gains nothing and costs nothing, however the pixels are ordered."""
+        d, _, g = maps(100, 100)
+        order = (d - g).abs().flatten().argsort()
+        for index in (order, order.flip(0)):
+            got = figures(Sparsification(), d.flatten()[index], torch.ones(10_000), g.flatten()[index].double())
+            assert abs(float(got["aurg_rmse"])) < 1e-12
+            assert abs(float(got["aurg_abs_rel"])) < 1e-12
+        shuffled = [
+            sparsification(np.random.default_rng(i).random(10_000), ((d - g) ** 2).numpy().ravel(), True)
+            for i in range(40)
+        ]
+        assert abs(np.mean([c[0] - area(c) for c in shuffled])) < 5e-3  # of .4 m; the mean of 40 draws
+
+    def test_variance_that_is_the_squared_error_is_perfect(self) -> None:
+        d, _, g = maps(100, 100)
+        got = figures(Sparsification(), d, (d - g).square(), g)
+        assert abs(float(got["ause_rmse"])) < 1e-12
+        worst = figures(Sparsification(), d, 1 / (d - g).square().clamp(min=1e-6), g)
+        assert float(worst["aurg_rmse"]) < 0
+
+    @pytest.mark.parametrize("kind", ["many", "rounded", "narrow", "zeros"])
+    def test_spearman_is_scipys_within_its_bound(self, kind: str) -> None:
+        d, v, g = maps(300, 400)
+        if kind == "rounded":
+            v = (v.sqrt() * 10).round().div(10).square().clamp(min=1e-3)
+        if kind == "narrow":
+            v = 0.1 + 0.5 * v
+        if kind == "zeros":
+            v = torch.where(torch.arange(400) < 200, 0.0, v)
+        got = figures(SpearmanCorrelation(), d, v, g)
+        exact = stats.spearmanr(v.numpy().ravel(), ((d - g) ** 2).numpy().ravel()).statistic
+        rho, bound = float(got["spearman"]), float(got["spearman_bound"])
+        assert abs(rho - exact) <= bound
+        assert abs(rho - exact) < 2e-3
+        if kind == "many":
+            assert bound < 0.05
+
+    def test_spearman_bound_admits_a_variance_too_narrow_for_the_bins(self) -> None:
+        d, v, g = maps(100, 100)
+        narrow = 0.04 * (1 + 0.02 * v)
+        got = figures(SpearmanCorrelation(), d, narrow, g)
+        exact = stats.spearmanr(narrow.numpy().ravel(), ((d - g) ** 2).numpy().ravel()).statistic
+        assert not abs(float(got["spearman"]) - exact) > float(got["spearman_bound"])  # NaN or within
+
+    def test_spearman_of_monotone_relation(self) -> None:
+        g, e = torch.full((5000,), 500.0), torch.logspace(-2, 1.5, 5000, dtype=torch.float64)
+        up = figures(SpearmanCorrelation(), g.double() + e, e.square() / 2, g.double())
+        down = figures(SpearmanCorrelation(), g.double() + e, 1e-2 / e, g.double())
+        assert float(up["spearman"]) == pytest.approx(1, abs=1e-3)
+        assert float(down["spearman"]) == pytest.approx(-1, abs=1e-3)
+
+    def test_nll_by_error_is_that_of_sorted_pixels(self) -> None:
+        d, v, g = maps(300, 400)
+        got = figures(NLLByError(percentiles=10), d, v, g)
+        error = (d - g).abs().numpy().ravel()
+        nll = -stats.norm.logpdf(g.numpy(), d.numpy(), v.sqrt().numpy()).ravel()
+        groups = np.array_split(np.argsort(error), 10)
+        oracle = np.array([nll[i].mean() for i in groups])
+        # The smallest errors lie close together in metres: within .02 nats of the mean.
+        np.testing.assert_allclose(got["nll_by_error"].numpy(), oracle, atol=0.02)
+        oracle_error = np.array([error[i].mean() for i in groups])
+        np.testing.assert_allclose(got["error_by_error"].numpy(), oracle_error, rtol=2e-3)
+        total = figures(NLL(), d, v, g)["nll"]
+        assert float(got["nll_by_error"].mean()) == pytest.approx(float(total), rel=1e-12)
+
+    def test_nll_by_error_over_confident_pixels(self) -> None:
+        d, v, g = maps(100, 100)
+        sure = confident(v, 0.2)
+        assert torch.equal(sure, v.sqrt() <= 0.2)
+        assert not confident(torch.tensor([math.nan]), 1.0).any()
+        got = figures(NLLByError(4), d, v, g, sure)["nll_by_error"]
+        np.testing.assert_array_equal(got, figures(NLLByError(4), d[sure], v[sure], g[sure])["nll_by_error"])
+
+    @given(st.floats(0, 1e9))
+    def test_log_bins_rise(self, value: float) -> None:
+        x = torch.tensor([value, value * 1.01 + 1e-7], dtype=torch.float64)
+        low, high = log_bin(x, 4096).tolist()
+        assert 0 <= low <= high <= 4097
+        assert (low == 0) == (value < 1e-8)
+        assert (low == 4097) == (value >= 1e4 * (1 - 1e-12))
 
 
 class TestZeroVariance:
@@ -227,8 +338,9 @@ class TestMasks:
             empty = [kind().compute(), figures(kind(), d, v, torch.zeros_like(g))]
             empty.append(figures(kind(), d, v, g, torch.zeros_like(g, dtype=torch.bool)))
         headline = {"delta1", "abs_rel", "rmse", "nll", "ece_delta", "ece_q", "entropy"}
+        headline |= {"ause_rmse", "aurg_abs_rel", "spearman", "nll_by_error"}
         for got in empty:
-            assert all(math.isnan(value) for name, value in got.items() if name in headline)
+            assert all(bool(value.isnan().all()) for name, value in got.items() if name in headline)
             assert headline & got.keys()
 
     def test_arguments_are_not_changed(self) -> None:
@@ -250,9 +362,9 @@ class TestStreaming:
         first.update(d[:cut], v[:cut], g[:cut])
         second.update(d[cut:], v[cut:], g[cut:])
         first.merge_state(second)
-        assert first.compute() == pytest.approx(whole.compute(), rel=1e-12, abs=1e-15, nan_ok=True)
+        assert first.compute() == pytest.approx(whole.compute(), rel=1e-12, abs=1e-14, nan_ok=True)
         for name, curve in whole.curves().items():
-            np.testing.assert_allclose(first.curves()[name], curve, rtol=1e-12)
+            np.testing.assert_allclose(first.curves()[name], curve, rtol=1e-12, atol=1e-15)
 
     def test_order_of_frames_does_not_matter(self) -> None:
         d, v, g = maps(9, 20, 20)
@@ -260,7 +372,7 @@ class TestStreaming:
         for i in range(9):
             forwards.update(d[i], v[i], g[i])
             backwards.update(d[8 - i], v[8 - i], g[8 - i])
-        assert forwards.compute() == pytest.approx(backwards.compute(), rel=1e-12)
+        assert forwards.compute() == pytest.approx(backwards.compute(), rel=1e-12, abs=1e-14)
 
     @pytest.mark.parametrize("shape", [(24,), (4, 6), (2, 3, 4), (2, 1, 3, 4)])
     def test_any_leading_shape(self, shape: tuple[int, ...]) -> None:
@@ -271,16 +383,14 @@ class TestStreaming:
         assert flat.compute() == shaped.compute()
 
     def test_memory_does_not_grow(self) -> None:
-        metrics = SequenceMetrics()
         d, v, g = maps(30, 30)
-
-        def size() -> int:
-            return sum(value.nelement() * value.element_size() for value in metrics.state_dict().values())
-
-        before = size()
-        for _ in range(5):
-            metrics.update(d, v, g)
-        assert size() == before < 4096
+        for ranking, limit in ((False, 2048), (True, 2.4e6)):
+            metrics = SequenceMetrics(ranking=ranking)
+            sizes = []
+            for _ in range(3):
+                metrics.update(d, v, g)
+                sizes.append(sum(x.nelement() * x.element_size() for x in metrics.state_dict().values()))
+            assert sizes[0] == sizes[1] == sizes[2] < limit
 
     def test_sums_keep_counting_beyond_float32(self) -> None:
         metric, one = RMSE(), torch.ones(1)
@@ -415,6 +525,9 @@ class TestErrors:
             ECEQuantile([0.5, 0.5])
         with pytest.raises(ValueError, match="low < high"):
             EntropyHistogram(low=1.0, high=1.0)
+        for kind in RANKING:
+            with pytest.raises(ValueError, match=r"bins must be >= 1"):
+                kind(bins=0)
 
     def test_package_is_light_and_complete(self) -> None:
         from ufmstar_torch.eval import metrics

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.metrics.calibration import ECEQuantile as ECEQuantile
     from ufmstar_torch.eval.metrics.likelihood import NLL as NLL
     from ufmstar_torch.eval.metrics.likelihood import EntropyHistogram as EntropyHistogram
+    from ufmstar_torch.eval.metrics.ranking import NLLByError as NLLByError
+    from ufmstar_torch.eval.metrics.ranking import Sparsification as Sparsification
+    from ufmstar_torch.eval.metrics.ranking import SpearmanCorrelation as SpearmanCorrelation
     from ufmstar_torch.eval.metrics.sequence import SequenceMetrics as SequenceMetrics
     from ufmstar_torch.eval.metrics.sequence import mean_and_ci as mean_and_ci
 
@@ -26,8 +29,11 @@ _HOME = {
     "ECEQuantile": "calibration",
     "EntropyHistogram": "likelihood",
     "NLL": "likelihood",
+    "NLLByError": "ranking",
     "RMSE": "accuracy",
     "SequenceMetrics": "sequence",
+    "Sparsification": "ranking",
+    "SpearmanCorrelation": "ranking",
     "mean_and_ci": "sequence",
 }
 

@@ -48,9 +48,7 @@ class Delta1(SumMetric):
         for name in ("hits", "hits_ratio", "pixels", "with_truth"):
             self.add_count(name)
 
-    def update(
-        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
         p = select_pixels(depth, None, target, valid)
         n = torch.tensor(p.depth.numel())
@@ -78,9 +76,7 @@ class AbsRel(SumMetric):
         self.add_sum("total")
         self.add_count("pixels")
 
-    def update(
-        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
         p = select_pixels(depth, None, target, valid)
         error = (p.depth - p.target).abs() / p.target
@@ -102,9 +98,7 @@ class RMSE(SumMetric):
         self.add_sum("total")
         self.add_count("pixels")
 
-    def update(
-        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
         p = select_pixels(depth, None, target, valid)
         error = (p.depth - p.target).square()

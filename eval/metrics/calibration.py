@@ -69,9 +69,7 @@ class ECEDelta(SumMetric):
         self.add_count("accurate", bins)
         self.add_count("pixels", bins)
 
-    def update(
-        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "ECE_delta"), target, valid)
         confidence, accurate, pixels = _ece_delta_update(p, self.delta, self.bins)
@@ -131,9 +129,7 @@ class ECEQuantile(SumMetric):
         self.add_count("at_or_below", q.numel())
         self.add_count("pixels")
 
-    def update(
-        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "ECE_q"), target, valid)
         counts = _ece_quantile_update(p, self.thresholds.to(p.depth.device))

@@ -47,9 +47,7 @@ class NLL(SumMetric):
         self.add_count("pixels")
         self.add_count("with_truth")
 
-    def update(
-        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "NLL"), target, valid)
         total, pixels = _nll_update(p)
@@ -93,9 +91,7 @@ class EntropyHistogram(SumMetric):
         self.add_sum("total")
         self.add_count("pixels")
 
-    def update(
-        self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-    ) -> None:
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         v = select_pixels(depth, require_variance(variance, "the entropy"), target, valid).variance
         positive = v[v > 0]

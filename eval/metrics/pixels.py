@@ -36,9 +36,7 @@ def truth_mask(target: Tensor, valid: Tensor | None) -> Tensor:
     return mask if valid is None else mask & valid
 
 
-def select_pixels(
-    depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None
-) -> Pixels:
+def select_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> Pixels:
     """The pixels with valid ground truth and a usable prediction.
 
     Args:
@@ -66,9 +64,7 @@ def check_maps(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Te
         if value is None:
             continue
         if value.shape != depth.shape:
-            raise ValueError(
-                f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}"
-            )
+            raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
         if name == "valid" and value.dtype != torch.bool:
             raise ValueError(f"valid must be a bool mask (True = use), got {value.dtype}")
         if name != "valid" and not torch.is_floating_point(value):
@@ -78,7 +74,5 @@ def check_maps(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Te
 def require_variance(variance: Tensor | None, metric: str) -> Tensor:
     """The variance, or a ValueError that says who needs it."""
     if variance is None:
-        raise ValueError(
-            f"variance must be given: {metric} judges the predicted distribution N(depth, variance)"
-        )
+        raise ValueError(f"variance must be given: {metric} judges the predicted distribution N(depth, variance)")
     return variance

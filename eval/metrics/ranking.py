@@ -1,0 +1,228 @@
+"""Does a larger variance mean a larger error? AUSE, AURG, Spearman, and the NLL by size of the error.
+
+Ranks need all pixels at once; a stream has none of the earlier ones. So the pixels go into bins of equal
+width in the logarithm of the variance and of the error, finer than anyone reads a variance, and pixels
+of one bin count as ties. What that can change is bounded: see each class.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.metrics.base import SumMetric
+from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
+from ufmstar_torch.eval.metrics.pixels import require_variance, select_pixels
+
+# Variances and squared errors [m^2] between (0.1 mm)^2 and (100 m)^2 are told apart; 0 and what is
+# smaller share the bin below, what is larger the bin above. Relative errors use the same bins.
+LOW, HIGH = 1e-8, 1e4
+
+
+def log_bin(value: Tensor, bins: int) -> Tensor:
+    """[...] int64 bin in [0, bins + 1] of values >= 0: 0 below ``LOW``, bins + 1 from ``HIGH`` on."""
+    position = (value.clamp(min=LOW) / LOW).log() * (bins / math.log(HIGH / LOW))
+    index = position.floor().clamp(max=bins).long() + 1
+    return torch.where(value < LOW, torch.zeros_like(index), index)
+
+
+def _sorted_sums(index: Tensor, weights: Tensor | None, bins: int) -> Tensor:
+    """[bins + 2] count, or sum of the weights, in each bin."""
+    return torch.bincount(index, weights=weights, minlength=bins + 2)
+
+
+def kept_mean(count: Tensor, total: Tensor, kept: Tensor) -> Tensor:
+    """[F] mean over the ``kept`` shares (0, 1] of the pixels in the first bins.
+
+    Within a bin the order is random: the expectation over all orders is linear in the pixels taken.
+    """
+    pixels, sums = count.double().cumsum(0), total.cumsum(0)
+    wanted = kept * pixels[-1]
+    bin_ = torch.searchsorted(pixels, wanted).clamp(max=count.numel() - 1)
+    before, sum_before = pixels[bin_] - count[bin_], sums[bin_] - total[bin_]
+    part = (wanted - before) / count[bin_].clamp(min=1)
+    return (sum_before + part * total[bin_]) / wanted
+
+
+class Sparsification(SumMetric):
+    """AUSE and AURG for RMSE and AbsRel, from sparsification curves with ties broken at random.
+
+    The curve at f is the error of the pixels left after the share f with the largest variance is gone,
+    f = 0, .02, ..., .98; its area is the trapezoid rule, the last value held up to 1. The oracle removes
+    by the error itself; random removal leaves the error as it is. Nothing is normalised, so the RMSE
+    figures are in metres.
+    ``compute()``: ``ause_rmse`` = area - oracle's area (0 is best), ``aurg_rmse`` = overall error -
+    area (positive: better than random), ``ause_abs_rel``, ``aurg_abs_rel``, curves [50]
+    ``sparsification_rmse``, ``sparsification_oracle_rmse`` and the same for abs_rel.
+
+    Ties: pixels whose variance agrees within a bin (4096 bins: .7 %, .35 % of sigma) count as equal, so
+    the curve is exactly that of variances rounded so far.
+
+    Args:
+        bins: of the logarithm of the variance.
+    """
+
+    count: Tensor
+    squared: Tensor
+    relative: Tensor
+    count_squared: Tensor
+    sum_squared: Tensor
+    count_relative: Tensor
+    sum_relative: Tensor
+
+    def __init__(self, bins: int = 4096, **kwargs: Any) -> None:
+        if bins < 1:
+            raise ValueError(f"bins must be >= 1, got {bins}")
+        super().__init__({"bins": bins}, **kwargs)
+        self.bins = bins
+        for name in ("count", "count_squared", "count_relative"):
+            self.add_count(name, bins + 2)
+        for name in ("squared", "relative", "sum_squared", "sum_relative"):
+            self.add_sum(name, bins + 2)
+
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
+        p = select_pixels(depth, require_variance(variance, "AUSE"), target, valid)
+        squared = (p.depth - p.target).square()
+        relative = (p.depth - p.target).abs() / p.target
+        by_v, by_s, by_r = (log_bin(x, self.bins) for x in (p.variance, squared, relative))
+        self.add(
+            count=_sorted_sums(by_v, None, self.bins),
+            squared=_sorted_sums(by_v, squared, self.bins),
+            relative=_sorted_sums(by_v, relative, self.bins),
+            count_squared=_sorted_sums(by_s, None, self.bins),
+            sum_squared=_sorted_sums(by_s, squared, self.bins),
+            count_relative=_sorted_sums(by_r, None, self.bins),
+            sum_relative=_sorted_sums(by_r, relative, self.bins),
+        )
+
+    def compute(self) -> dict[str, Tensor]:
+        """The figures and curves of all updates so far."""
+        kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
+        curves = {
+            "rmse": kept_mean(self.count, self.squared, kept).sqrt(),
+            "oracle_rmse": kept_mean(self.count_squared, self.sum_squared, kept).sqrt(),
+            "abs_rel": kept_mean(self.count, self.relative, kept),
+            "oracle_abs_rel": kept_mean(self.count_relative, self.sum_relative, kept),
+        }
+        results = {f"sparsification_{name}": curve for name, curve in curves.items()}
+        for error in ("rmse", "abs_rel"):
+            area = _area(curves[error])
+            results[f"ause_{error}"] = area - _area(curves[f"oracle_{error}"])
+            results[f"aurg_{error}"] = curves[error][0] - area
+        return results
+
+
+def _area(curve: Tensor) -> Tensor:
+    """[] trapezoid rule over f = 0, .02, ..., .98, the last value held up to 1."""
+    return torch.trapezoid(curve, dx=1 / 50) + curve[-1] / 50
+
+
+class SpearmanCorrelation(SumMetric):
+    """Spearman's rank correlation of variance and squared error, ties at their mean rank.
+
+    ``compute()``: ``spearman``, NaN where all variances or all errors are alike; ``spearman_bound``, by
+    how much the figure can differ from that of the single pixels, given how they fell into the bins.
+
+    The bound: a bin's mean rank X' is the conditional mean of the ranks X in it, so that var X = var X' +
+    w var X with w <= sum_b n_b (n_b^2 - 1) / (N (N^2 - 1)); by Cauchy-Schwarz the covariance changes by
+    at most sd X sd Y (sqrt(w_x) + sqrt(w_y) + sqrt(w_x w_y)).
+
+    Args:
+        bins: per axis; 512 make bins of 5.5 % in variance (2.7 % of sigma) and 2 MB of counts.
+    """
+
+    joint: Tensor
+
+    def __init__(self, bins: int = 512, **kwargs: Any) -> None:
+        if bins < 1:
+            raise ValueError(f"bins must be >= 1, got {bins}")
+        super().__init__({"bins": bins}, **kwargs)
+        self.bins = bins
+        self.add_count("joint", bins + 2, bins + 2)
+
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
+        p = select_pixels(depth, require_variance(variance, "Spearman's correlation"), target, valid)
+        side = self.bins + 2
+        index = log_bin(p.variance, self.bins) * side
+        index = index + log_bin((p.depth - p.target).square(), self.bins)
+        self.add(joint=torch.bincount(index, minlength=side * side).reshape(side, side))
+
+    def compute(self) -> dict[str, Tensor]:
+        """The correlation of all updates so far."""
+        joint = self.joint.double()
+        n = joint.sum()
+        (x, w_x), (y, w_y) = _centred_ranks(joint.sum(1)), _centred_ranks(joint.sum(0))
+        var_x, var_y = (joint.sum(1) * x.square()).sum(), (joint.sum(0) * y.square()).sum()
+        rho = (x @ joint @ y) / (var_x * var_y).sqrt()
+        kept = ((1 - w_x) * (1 - w_y)).clamp(min=0).sqrt()
+        bound = w_x.sqrt() + w_y.sqrt() + (w_x * w_y).sqrt() + rho.abs() * (1 - kept)
+        return {"spearman": rho, "spearman_bound": torch.where(n > 1, bound, rho)}
+
+
+def _centred_ranks(count: Tensor) -> tuple[Tensor, Tensor]:
+    """[bins] mean rank of each bin less the overall mean, and [] the share w of the variance that ties hide."""
+    n = count.sum()
+    rank = count.cumsum(0) - count / 2  # the mean of n_b successive ranks, less 1/2
+    hidden = (count * (count.square() - 1)).sum() / (n * (n.square() - 1))
+    return rank - n / 2, hidden
+
+
+class NLLByError(SumMetric):
+    """Mean NLL by percentile of the error (the paper's figure of binned error against NLL).
+
+    The paper looks at pixels where another method is confident: pass these as ``valid``, and the same
+    ones for every method that is compared.
+    ``compute()``: curves [percentiles] ``nll_by_error``, mean NLL over v > 0, and
+    ``error_by_error``, mean |d - g| [m], of the pixels between one percentile and the next, NaN without a
+    pixel. Errors that agree within a bin (4096 bins of squared error: .35 % of the error) count as equal.
+
+    Args:
+        percentiles: number of groups of equal size; 10 = deciles.
+        bins: of the logarithm of the squared error.
+    """
+
+    count: Tensor
+    nll: Tensor
+    error: Tensor
+
+    def __init__(self, percentiles: int = 10, bins: int = 4096, **kwargs: Any) -> None:
+        if percentiles < 1 or bins < 1:
+            raise ValueError(f"percentiles and bins must be >= 1, got {percentiles} and {bins}")
+        super().__init__({"percentiles": percentiles, "bins": bins}, **kwargs)
+        self.percentiles, self.bins = percentiles, bins
+        self.add_count("count", bins + 2)
+        self.add_sum("nll", bins + 2)
+        self.add_sum("error", bins + 2)
+
+    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
+        p = select_pixels(depth, require_variance(variance, "NLL by error"), target, valid)
+        positive = p.variance > 0
+        d, v, g = p.depth[positive], p.variance[positive], p.target[positive]
+        index = log_bin((d - g).square(), self.bins)
+        self.add(
+            count=_sorted_sums(index, None, self.bins),
+            nll=_sorted_sums(index, gaussian_nll(d, v, g), self.bins),
+            error=_sorted_sums(index, (d - g).abs(), self.bins),
+        )
+
+    def compute(self) -> dict[str, Tensor]:
+        """The curves of all updates so far."""
+        steps = torch.arange(1, self.percentiles + 1, dtype=torch.float64, device=self.count.device)
+        kept = steps / self.percentiles
+        return {"nll_by_error": self._groups(self.nll, kept), "error_by_error": self._groups(self.error, kept)}
+
+    def _groups(self, total: Tensor, kept: Tensor) -> Tensor:
+        """[percentiles] mean of each group, from the sums up to its end."""
+        upto = kept_mean(self.count, total, kept) * kept
+        return torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles
+
+
+def confident(variance: Tensor, threshold: float) -> Tensor:
+    """[...] bool, where a method says sigma <= threshold [m] (NaN: False); for ``NLLByError``'s ``valid``."""
+    return variance <= threshold**2
