@@ -78,8 +78,8 @@ class Segmentation:
         return not {"both": few_pixels and few_rows, "either": few_pixels or few_rows, "none": False}[self.prune]
 
 
-def segment(depth, K, segmentation, *, valid=None, features=None):
-    """C_i with the pixel-footprint floor; features [F, H, W] are averaged over the pixels of a component."""
+def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
+    """C_i with the footprint of a pixel (at the near plane, if nearer) as floor; features [F, H, W] are averaged over the pixels of a component."""
     camera = oracle_spgf.Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     pieces, _ = oracle_spgf.segment(depth, camera, segmentation.settings, valid=valid)
     components = []
@@ -87,7 +87,7 @@ def segment(depth, K, segmentation, *, valid=None, features=None):
         if not segmentation.keeps(piece):
             continue
         rows, columns = np.array(piece.pixels).T
-        floor = (piece.mu[2] / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
+        floor = (max(piece.mu[2], near) / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
         components.append({
             "mean": piece.mu,
             "cov": floor_eigenvalues(piece.covariance, floor),
@@ -153,9 +153,17 @@ def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False):
     return fused
 
 
-def density(x, mean, cov):
-    d = x - mean
-    return np.exp(-d @ np.linalg.solve(cov, d) / 2) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(cov))
+def prepared(mixture):
+    """The mixture with the inverse covariance and the density's factor kept beside each component."""
+    return [
+        {**g, "inverse": np.linalg.inv(g["cov"]), "factor": 1 / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(g["cov"]))}
+        for g in mixture
+    ]
+
+
+def density(x, g):
+    d = x - g["mean"]
+    return g["factor"] * np.exp(-d @ g["inverse"] @ d / 2)
 
 
 def neighbours(x, mixture, sigmas, radius):
@@ -168,7 +176,7 @@ def neighbours(x, mixture, sigmas, radius):
 
 
 def regress_point(x, mixture, *, prior_weight, prior_mean, neighbourhood=None):
-    """m_hat(x) and the features; neighbourhood = (sigmas, near, far) or None for the exact sum."""
+    """m_hat(x) and the features of a prepared mixture; neighbourhood = (sigmas, near, far), None = exact sum."""
     used = mixture
     if neighbourhood is not None:
         sigmas, near, far = neighbourhood
@@ -176,7 +184,7 @@ def regress_point(x, mixture, *, prior_weight, prior_mean, neighbourhood=None):
     evidence, m = prior_weight, prior_weight * prior_mean
     features = np.zeros_like(mixture[0]["features"]) if mixture else np.zeros(0)
     for g in used:
-        w = g["weight"] * density(x, g["mean"], g["cov"])
+        w = g["weight"] * density(x, g)
         evidence += w
         m += w * g["m"]
         features = features + w * g["features"]
@@ -186,6 +194,7 @@ def regress_point(x, mixture, *, prior_weight, prior_mean, neighbourhood=None):
 def dense(mixture_cam, depth, valid, K, **prior):
     """m_hat at every valid pixel of a depth map, NaN elsewhere."""
     out = np.full(depth.shape, np.nan)
+    mixture_cam = prepared(mixture_cam)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if valid[v, u]:

@@ -41,7 +41,7 @@ def test_agrees_with_the_oracle(config, seed):
     for b in range(2):
         for p in range(20):
             value, features = oracle.regress_point(
-                points[b, p].numpy(), as_lists(m, b), prior_weight=2.0, prior_mean=0.3, neighbourhood=neighbourhood
+                points[b, p].numpy(), oracle.prepared(as_lists(m, b)), prior_weight=2.0, prior_mean=0.3, neighbourhood=neighbourhood
             )
             assert result.disagreement[b, p].item() == pytest.approx(value, rel=1e-9)
             np.testing.assert_allclose(result.features[b, p].numpy(), features, rtol=1e-9, atol=1e-300)
@@ -146,3 +146,12 @@ def test_sample_is_seeded_uniform_and_valid():
     # Binomial(400, 0.2) per valid pixel: mean 80, sigma 8.
     assert (counts[:50] - 80).abs().max() < 5 * 8
     assert counts[50:].sum() == 0
+
+
+def test_a_far_outlier_in_a_tile_spoils_no_neighbour():
+    m = mixture(1, 30, 3)
+    depth = rendered(1).nan_to_num(2.0)
+    depth[0, 10, 10] = 1e30
+    reference = regress_image(m, depth, K, EXACT).disagreement
+    fast = regress_cpu.regress_image(m, depth.float(), K, EXACT).disagreement
+    torch.testing.assert_close(fast.double(), reference, rtol=0, atol=5e-5)

@@ -188,7 +188,8 @@ def segment(frame: FrameInput, config: UfMStarConfig, backend: Backend) -> tuple
     )
     mixture = mixture.to(torch.float64)
     fx, fy, _, _ = focal_and_centre(frame.intrinsics)
-    floor = pixel_footprint(mixture.mean[..., 2], torch.minimum(fx, fy)[:, None])
+    # Nearer than the near plane nothing is ever matched; the footprint there keeps the floor above zero.
+    floor = pixel_footprint(mixture.mean[..., 2].clamp_min(config.near_plane), torch.minimum(fx, fy)[:, None])
     return mixture.replace(covariance=backend.floor_covariance(mixture.covariance, floor)), labels
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -244,7 +245,7 @@ class UfMStar(nn.Module):
             raise ValueError("query needs a mixture: call the module on a frame first")
         if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
             raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
-        with torch.no_grad(), torch.autocast(points.device.type, enabled=False):
+        with torch.no_grad(), _full_precision(points.device):
             local = points.detach()
             if frame == "world":
                 T = invert_rigid(self.T_world_first)
@@ -302,7 +303,7 @@ class UfMStar(nn.Module):
         with (
             torch.inference_mode(False),
             torch.no_grad(),
-            torch.autocast(frame.depth.device.type, enabled=False),
+            _full_precision(frame.depth.device),
         ):
             backend = select(self.config.backend, frame.depth.device.type)
             state, out = step(
@@ -384,6 +385,13 @@ class UfMStar(nn.Module):
     def extra_repr(self) -> str:
         """Streams and components."""
         return f"streams={self.mean.shape[0]}, capacity={self.mean.shape[1]}, backend={self.config.backend!r}"
+
+
+def _full_precision(device: torch.device) -> AbstractContextManager[object]:
+    """Autocast off, where the device has it: it would turn the fusion's products into half precision."""
+    if device.type == "meta" or not torch.amp.is_autocast_available(device.type):
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)
 
 
 def _to_buffers(state: UfMStarState) -> dict[str, Tensor]:

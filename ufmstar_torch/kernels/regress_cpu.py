@@ -9,7 +9,8 @@ What is left out then adds up to at most eps times the denominator, which bounds
     |m_hat - m_hat_culled| <= 2 eps max(m_k, mu_0)
 
 (tests/test_regress.py checks it; the 2 is for the two levels, blocks of tiles first, then tiles).
-Within a tile, points are taken relative to the tile's centre, so that float32 loses nothing to the distance from the camera.
+Within a tile, points are taken relative to its nearest point, so that float32 loses nothing to the distance
+from the camera, and nothing to a far outlier among its pixels either.
 """
 
 from __future__ import annotations
@@ -114,8 +115,8 @@ def _cull(candidates, count, centre, half, mean, whitening, log_peak, prior, eps
 
 
 @njit(cache=True, nogil=True)
-def _box(depth, K, v0, v1, u0, u1, centre, half):
-    """Bounding box of the points of a patch of pixels; False where it has no positive depth."""
+def _box(depth, K, v0, v1, u0, u1, centre, half, origin):
+    """Bounding box of the points of a patch of pixels, and its nearest point; False without a positive depth."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
@@ -128,12 +129,14 @@ def _box(depth, K, v0, v1, u0, u1, centre, half):
             x, y = (u - cx) / fx * z, ry * z
             low[0], high[0] = min(low[0], x), max(high[0], x)
             low[1], high[1] = min(low[1], y), max(high[1], y)
+            if z < low[2]:
+                origin[0], origin[1], origin[2] = x, y, z
             low[2], high[2] = min(low[2], z), max(high[2], z)
     if low[2] > high[2]:
         return False
     for i in range(3):
         centre[i] = 0.5 * (low[i] + high[i])
-        # Rounding of the bounds, and of points computed in float32 relative to the centre.
+        # Rounding of the bounds, and of points computed in float32.
         half[i] = 0.5 * (high[i] - low[i]) * (1 + 1e-6) + 1e-12
     return True
 
@@ -169,8 +172,8 @@ def _exp_overload(t):
 
 
 @njit(cache=True, nogil=True)
-def _points(depth, K, v0, v1, u0, u1, centre, x, y, z):
-    """Points of a patch relative to ``centre``, in the arrays' precision; pixels without depth give NaN."""
+def _points(depth, K, v0, v1, u0, u1, origin, x, y, z):
+    """Points of a patch relative to ``origin``, in the arrays' precision; pixels without depth give NaN."""
     i = 0
     for v in range(v0, v1):
         ry = (v - K[1, 2]) / K[1, 1]
@@ -178,9 +181,9 @@ def _points(depth, K, v0, v1, u0, u1, centre, x, y, z):
             d = np.float64(depth[v, u])
             if not (d > 0 and d < np.inf):
                 d = np.nan
-            x[i] = (u - K[0, 2]) / K[0, 0] * d - centre[0]
-            y[i] = ry * d - centre[1]
-            z[i] = d - centre[2]
+            x[i] = (u - K[0, 2]) / K[0, 0] * d - origin[0]
+            y[i] = ry * d - origin[1]
+            z[i] = d - origin[2]
             i += 1
     return i
 
@@ -205,11 +208,11 @@ def _accumulate(coefficient, x, y, z, evidence, total, density):
 
 
 @njit(cache=True, nogil=True)
-def _tile(depth, K, v0, v1, u0, u1, centre, kept, n, index, local, log_peak, m, features, prior, prior_mean, out, out_f):
+def _tile(depth, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features, prior, prior_mean, out, out_f):
     """Regress one tile; ``local`` holds mean and whitening of the occupied components."""
     count = (v1 - v0) * (u1 - u0)
     x, y, z = np.empty(count, out.dtype), np.empty(count, out.dtype), np.empty(count, out.dtype)
-    _points(depth, K, v0, v1, u0, u1, centre, x, y, z)
+    _points(depth, K, v0, v1, u0, u1, origin, x, y, z)
     evidence, total = np.full(count, prior, out.dtype), np.full(count, prior * prior_mean, out.dtype)
     density = np.empty(count, out.dtype)
     sums = np.zeros((out_f.shape[2], count), out.dtype)
@@ -218,7 +221,7 @@ def _tile(depth, K, v0, v1, u0, u1, centre, kept, n, index, local, log_peak, m, 
     for j in range(n):
         k = kept[j]
         for i in range(3):
-            coefficient[i] = local[k, i] - centre[i]
+            coefficient[i] = local[k, i] - origin[i]
         for i in range(6):
             coefficient[3 + i] = local[k, 3 + i]
         coefficient[9], coefficient[10] = log_peak[k], m[index[k]]
@@ -241,21 +244,21 @@ def _block(depth, K, v_low, u_low, components, index, local, log_peak, m, featur
     """Regress a block of tiles with the components that matter to it."""
     height, width = depth.shape
     v_high, u_high = min(height, v_low + _TILE * _BLOCK), min(width, u_low + _TILE * _BLOCK)
-    centre, half = np.zeros(3), np.zeros(3)
+    centre, half, origin = np.zeros(3), np.zeros(3), np.zeros(3)
     near, kept = np.empty(components.size, np.int64), np.empty(components.size, np.int64)
     mean, whitening = local[:, :3], local[:, 3:]
     weight, prior_mean = prior
     count = 0
-    if _box(depth, K, v_low, v_high, u_low, u_high, centre, half):
+    if _box(depth, K, v_low, v_high, u_low, u_high, centre, half, origin):
         count = _cull(components, components.size, centre, half, mean, whitening, log_peak, weight, epsilon, near)
     for v0 in range(v_low, v_high, _TILE):
         for u0 in range(u_low, u_high, _TILE):
             v1, u1 = min(v_high, v0 + _TILE), min(u_high, u0 + _TILE)
             n = 0
-            if _box(depth, K, v0, v1, u0, u1, centre, half):
+            if _box(depth, K, v0, v1, u0, u1, centre, half, origin):
                 n = _cull(near, count, centre, half, mean, whitening, log_peak, weight, epsilon, kept)
             _tile(
-                depth, K, v0, v1, u0, u1, centre, kept, n, index, local, log_peak, m, features,
+                depth, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features,
                 weight, prior_mean, out, out_f,
             )  # fmt: skip
 

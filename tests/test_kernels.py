@@ -1,0 +1,132 @@
+"""Three tiers, one answer: the compiled CPU kernels against the torch reference."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import warnings
+
+import pytest
+import scenes
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_gaussians import covariances, mixture
+from test_fuse import random_pairs
+
+from ufmstar_torch import UfMStar, UfMStarConfig, backend, gaussian
+from ufmstar_torch.correspond import correspond
+from ufmstar_torch.fuse import fuse
+from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, gaussian_cpu
+
+SIZE = (48, 64)
+K = torch.tensor(scenes.intrinsics(*SIZE))
+
+
+@given(st.integers(0, 10**6), st.floats(0.05, 0.6), st.floats(0.05, 0.9))
+@settings(max_examples=30, deadline=None)
+def test_correspond(seed, eta, eta_occl):
+    previous, current = mixture(2, 14, seed), mixture(2, 8, seed + 50)
+    config = UfMStarConfig(eta=eta, eta_occlusion=eta_occl)
+    reference = correspond(previous, current, K.expand(2, 3, 3), SIZE, config)
+    fast = correspond_cpu.correspond(previous, current, K.expand(2, 3, 3), SIZE, config)
+    torch.testing.assert_close(fast.overlap, reference.overlap, rtol=1e-11, atol=1e-300)
+    assert torch.equal(fast.match, reference.match)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=15, deadline=None)
+def test_fuse(weighted, seed):
+    previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, features=2)
+    pairs = random_pairs(2, previous, current, seed)
+    config = UfMStarConfig(overlap_weighted=weighted)
+    before = previous.mean.clone()
+    reference, fast = fuse(previous, current, pairs, config), fuse_cpu.fuse(previous, current, pairs, config)
+    for name, value in reference.tensors().items():
+        torch.testing.assert_close(getattr(fast, name), value, rtol=1e-10, atol=1e-12)
+    assert torch.equal(previous.mean, before)
+    single = fuse_cpu.fuse(previous.to(torch.float32), current, pairs, config)
+    for name, value in fuse(previous.to(torch.float32), current, pairs, config).tensors().items():
+        torch.testing.assert_close(getattr(single, name), value, rtol=1e-5, atol=1e-7)
+
+
+def test_floor_covariance():
+    cov = covariances(60, 4, decades=6).view(3, 20, 3, 3)
+    floor = torch.linspace(1e-8, 1e-2, 20, dtype=torch.float64).expand(3, 20)
+    torch.testing.assert_close(
+        gaussian_cpu.floor_covariance(cov, floor), gaussian.floor_covariance(cov, floor), rtol=0, atol=1e-15
+    )
+    zero = torch.zeros(1, 3, 3, dtype=torch.float64)
+    lifted = gaussian_cpu.floor_covariance(zero, torch.tensor([1e-6], dtype=torch.float64))
+    torch.testing.assert_close(lifted[0], 1e-6 * torch.eye(3, dtype=torch.float64), rtol=1e-12, atol=0)
+
+
+def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
+    for name in [n for n in sys.modules if n.startswith("ufmstar_torch.kernels.") or n == "numba"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr("ufmstar_torch.kernels.regress_cpu")
+    for name in ("correspond_cpu", "fuse_cpu", "gaussian_cpu", "segment_cpu"):
+        monkeypatch.delattr(f"ufmstar_torch.kernels.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    backend._numba_or_none.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match="numba cannot be imported .* torch reference serves") as caught:
+            assert backend.select("auto", "cpu") is backend.TORCH
+            assert backend.select("auto", "cpu") is backend.TORCH
+        assert len(caught) == 1
+        with pytest.raises(ImportError):
+            backend.select("numba", "cpu")
+    finally:
+        backend._numba_or_none.cache_clear()
+
+
+def test_seam():
+    assert backend.select("auto", "cpu").name == "numba"
+    assert backend.select("torch", "cpu") is backend.TORCH
+    assert backend.select("auto", "cuda").name == "torch, host segmentation"
+    assert backend.select("torch", "cuda") is backend.TORCH
+    with pytest.raises(ValueError, match="needs CPU tensors"):
+        backend.select("numba", "cuda")
+
+
+def test_whole_sequence_fast_and_slow():
+    depths, poses, K = scenes.sequence(6, 48, 64, 0.05)
+    config = UfMStarConfig(regression="exact")
+    fast = UfMStar(config.replace(backend="numba"), dtype=torch.float64)
+    slow = UfMStar(config.replace(backend="torch"), dtype=torch.float64)
+    for depth, T in zip(depths, poses, strict=True):
+        arguments = torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K)
+        a, b = fast(*arguments), slow(*arguments)
+        assert torch.equal(a.labels, b.labels)
+        torch.testing.assert_close(a.variance, b.variance, rtol=1e-9, atol=1e-12, equal_nan=True)
+        assert torch.equal(a.statistics.components, b.statistics.components)
+        assert torch.equal(a.statistics.pairs, b.statistics.pairs)
+
+
+def test_several_threads_at_once():
+    """Two streams in two Python threads give what they give alone."""
+    depths, poses, K = scenes.sequence(4, 48, 64, 0.05)
+    frames = [(torch.tensor(d)[None].float(), torch.tensor(T), torch.tensor(K)) for d, T in zip(depths, poses, strict=True)]
+
+    def run(out: list) -> None:
+        ufm = UfMStar()
+        out.extend(ufm(*frame).variance for frame in frames)
+
+    alone: list = []
+    run(alone)
+    results: list[list] = [[] for _ in range(3)]
+    threads = [threading.Thread(target=run, args=(out,)) for out in results]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    for out in results:
+        for mine, theirs in zip(out, alone, strict=True):
+            assert torch.equal(mine.nan_to_num(-1), theirs.nan_to_num(-1))
+
+
+def test_importing_the_package_leaves_the_warnings_alone():
+    before = list(warnings.filters)
+    __import__("ufmstar_torch.kernels.regress_cpu")
+    assert list(warnings.filters) == before

@@ -1,0 +1,531 @@
+"""UfMStar as a user of nn.Module expects it: state, devices, dtypes, bad input, subsets, queries."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+
+import numpy as np
+import pytest
+import scenes
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_ufmstar import SPGF, run
+
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.frame import FRAME_FAULTS
+
+H, W = 30, 40
+CONFIG = UfMStarConfig(segment=SPGF)
+DEPTHS, POSES, K_ = scenes.sequence(8, H, W, 0.05)
+K = torch.tensor(K_)
+
+
+def frame(i: int, dtype=torch.float32):
+    return torch.tensor(DEPTHS[i], dtype=dtype)[None], torch.tensor(POSES[i])[None], K[None]
+
+
+def same(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return torch.equal(a.nan_to_num(-1.0), b.nan_to_num(-1.0)) and torch.equal(a.isnan(), b.isnan())
+
+
+def snapshot(ufm: UfMStar) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in ufm.state_dict().items()}
+
+
+def unchanged(ufm: UfMStar, before: dict[str, torch.Tensor]) -> bool:
+    return all(same(value.double(), before[name].double()) for name, value in ufm.state_dict().items())
+
+
+@pytest.mark.parametrize("cut", [1, 4])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_saved_state_continues_bit_for_bit(cut, dtype):
+    whole = UfMStar(CONFIG.replace(initial_capacity=4), dtype=dtype)
+    expected = [whole(*frame(i, dtype)).variance for i in range(8)]
+    first = UfMStar(CONFIG.replace(initial_capacity=4), dtype=dtype)
+    for i in range(cut):
+        first(*frame(i, dtype))
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second = UfMStar(CONFIG.replace(initial_capacity=4), dtype=dtype)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    for i in range(cut, 8):
+        assert same(second(*frame(i, dtype)).variance, expected[i])
+    assert unchanged(second, whole.state_dict())
+
+
+def test_state_survives_safetensors(tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    ufm = UfMStar(CONFIG)
+    ufm(*frame(0))
+    save_file(ufm.state_dict(), tmp_path / "state.safetensors")
+    other = UfMStar(CONFIG)
+    other.load_state_dict(load_file(tmp_path / "state.safetensors"))
+    assert same(other(*frame(1)).variance, ufm(*frame(1)).variance)
+
+
+def test_loading_into_another_config_warns():
+    ufm = UfMStar(CONFIG)
+    with pytest.warns(UserWarning, match="another config: eta differ"):
+        UfMStar(CONFIG.replace(eta=0.4)).load_state_dict(ufm.state_dict())
+
+
+def test_deepcopy_is_independent():
+    ufm = UfMStar(CONFIG)
+    ufm(*frame(0))
+    twin = copy.deepcopy(ufm)
+    before = snapshot(ufm)
+    expected = twin(*frame(1)).variance
+    assert unchanged(ufm, before)
+    assert same(ufm(*frame(1)).variance, expected)
+
+
+def test_a_frame_does_not_mutate_what_it_is_given():
+    depth, pose, intrinsics = frame(0)
+    copies = [x.clone() for x in (depth, pose, intrinsics)]
+    ufm = UfMStar(CONFIG)
+    ufm(depth, pose, intrinsics)
+    for given_, kept in zip((depth, pose, intrinsics), copies, strict=True):
+        assert same(given_.double(), kept.double())
+
+
+@pytest.mark.parametrize("cast", [torch.float64, torch.float32, torch.float16, torch.bfloat16])
+def test_casts_keep_the_state_usable(cast):
+    ufm = UfMStar(CONFIG)
+    ufm(*frame(0))
+    pose = ufm.T_world_first.clone()
+    ufm.to(cast)
+    assert ufm.mean.dtype == (torch.float64 if cast == torch.float64 else torch.float32)
+    assert ufm.T_world_first.dtype == torch.float64
+    assert torch.equal(ufm.T_world_first, pose)
+    assert ufm(*frame(1)).variance.isfinite().any()
+
+
+def test_half_converts_a_network_around_it_without_harm():
+    wrapper = torch.nn.ModuleDict({"net": torch.nn.Linear(2, 2), "ufm": UfMStar(CONFIG)}).half()
+    assert wrapper["net"].weight.dtype == torch.float16
+    assert wrapper["ufm"].mean.dtype == torch.float32
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_depth_is_computed_safely(dtype):
+    half, full = UfMStar(CONFIG), UfMStar(CONFIG)
+    for i in range(3):
+        depth, pose, intrinsics = frame(i)
+        a = half(depth.to(dtype), pose, intrinsics)
+        b = full(depth.to(dtype).float(), pose, intrinsics)
+        assert a.variance.dtype == torch.float32
+        assert same(a.variance, b.variance)
+
+
+def test_autocast_changes_nothing():
+    plain, cast = UfMStar(CONFIG.replace(backend="torch")), UfMStar(CONFIG.replace(backend="torch"))
+    for i in range(2):
+        expected = plain(*frame(i)).variance
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            assert same(cast(*frame(i)).variance, expected)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_inference_mode_then_normal_mode(backend):
+    config = CONFIG.replace(backend=backend, initial_capacity=2)  # grows inside inference mode
+    ufm, plain = UfMStar(config), UfMStar(config)
+    with torch.inference_mode():
+        inside = ufm(*frame(0)).variance.clone()
+    assert same(inside, plain(*frame(0)).variance)
+    assert not ufm.mean.is_inference()
+    assert same(ufm(*frame(1)).variance, plain(*frame(1)).variance)
+    ufm.mean += 0.0  # an inference tensor would refuse
+
+
+def test_gradients_reach_the_networks_own_variance_only():
+    ufm = UfMStar(CONFIG)
+    depth, pose, intrinsics = frame(0, torch.float64)
+    depth = depth.nan_to_num(1.0).requires_grad_()
+    a = torch.full_like(depth, 0.1).detach().requires_grad_()
+    out = ufm(depth, pose, intrinsics, aleatoric=a)
+    out.variance.sum().backward()
+    assert depth.grad is None
+    torch.testing.assert_close(a.grad, torch.ones_like(a))
+
+
+def test_layouts():
+    flat, channel = UfMStar(CONFIG), UfMStar(CONFIG)
+    for i in range(2):
+        depth, pose, intrinsics = frame(i)
+        a = torch.full_like(depth, 0.01)
+        valid = torch.ones_like(depth, dtype=torch.bool)
+        x = flat(depth, pose, intrinsics, a, a, valid)
+        y = channel(depth[:, None], pose, intrinsics, a[:, None], a[:, None], valid[:, None])
+        assert y.variance.shape == y.std.shape == y.valid.shape == (1, 1, H, W)
+        assert same(x.variance, y.variance[:, 0])
+    shared = UfMStar(CONFIG)
+    for i in range(2):
+        depth, pose, intrinsics = frame(i)
+        z = shared(depth, pose[0], intrinsics[0], a, a)
+    assert same(z.variance, x.variance)
+
+
+def test_reset():
+    ufm, fresh = UfMStar(CONFIG), UfMStar(CONFIG)
+    for i in range(3):
+        ufm(*frame(i))
+    ufm.reset()
+    assert ufm.mean.shape[0] == 0
+    assert same(ufm(*frame(0)).variance, fresh(*frame(0)).variance)
+
+
+@pytest.mark.parametrize("streams", [[1], torch.tensor([False, True, False])])
+def test_reset_of_one_stream(streams):
+    def three(i):
+        depth, pose, intrinsics = frame(i)
+        return depth.expand(3, H, W), pose.expand(3, 4, 4), intrinsics.expand(3, 3, 3)
+
+    ufm, fresh = UfMStar(CONFIG), UfMStar(CONFIG)
+    for i in range(2):
+        ufm(*three(i))
+    ufm.reset(streams)
+    out, alone = ufm(*three(2)), fresh(*frame(2))
+    assert same(out.variance[1], alone.variance[0])
+    assert ufm.frames.tolist() == [3, 1, 3]
+    assert (out.disagreement[0][out.valid[0]] > 0).any()
+    with pytest.raises(IndexError):
+        ufm.reset([7])
+    with pytest.raises(ValueError, match="mask"):
+        ufm.reset(torch.tensor([True, False]))
+
+
+def test_growth_by_doubling_keeps_everything():
+    small, large = UfMStar(CONFIG.replace(initial_capacity=1)), UfMStar(CONFIG.replace(initial_capacity=512))
+    for i in range(8):
+        assert same(small(*frame(i)).variance, large(*frame(i)).variance)
+    assert large.mean.shape[1] == 512
+    k = int(small.mixture.components.max())
+    assert small.mean.shape[1] == 2 ** int(np.ceil(np.log2(k)))
+
+
+def test_max_components_drops_and_counts():
+    ufm = UfMStar(CONFIG.replace(initial_capacity=2, max_components=5))
+    outputs = [ufm(*frame(i)) for i in range(8)]
+    assert ufm.mean.shape[1] == 5
+    assert outputs[-1].statistics.components.item() == 5
+    assert sum(o.statistics.dropped.item() for o in outputs) > 0
+    for o in outputs:
+        s = o.statistics
+        assert (s.matched + s.new + s.dropped).item() == s.segments.item()
+
+
+def test_mean_uncertainty():
+    dense, sampled, all_of_it = UfMStar(CONFIG), UfMStar(CONFIG), UfMStar(CONFIG)
+    inside = 0
+    for i in range(8):
+        depth, pose, intrinsics = frame(i, torch.float64)
+        a = torch.full_like(depth, 0.01)
+        no_average = dense.config.replace(ema_alpha=1.0)
+        dense.config = no_average
+        out = dense(depth, pose, intrinsics, a)
+        truth = out.variance[out.valid].mean().item()
+        exact = all_of_it.mean_uncertainty(depth, pose, intrinsics, a, fraction=1.0)
+        assert exact.mean.item() == pytest.approx(truth, rel=1e-6)
+        assert exact.pixels.item() == out.valid.sum().item()
+        estimate = sampled.mean_uncertainty(depth, pose, intrinsics, a, pixels=200, seed=i)
+        assert estimate.pixels.item() == 200
+        inside += abs(estimate.mean.item() - truth) <= 3 * estimate.standard_error.item() + 1e-12
+    assert inside == 8
+    assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on where it is read
+
+
+def test_mean_uncertainty_is_seeded_and_checked():
+    def mean(**options):
+        ufm = UfMStar(CONFIG)
+        ufm(*frame(0))
+        return ufm.mean_uncertainty(*frame(1), **options).mean
+
+    assert torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=3))
+    assert not torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=4))
+    for bad in ({"pixels": 0}, {"pixels": H * W + 1}, {"fraction": 0.0}, {"fraction": 1.5}, {"pixels": 5, "fraction": 0.5}):
+        with pytest.raises(ValueError, match="pixels|fraction"):
+            mean(**bad)
+
+
+def test_mean_uncertainty_with_the_moving_average_on_request():
+    dense, sampled = UfMStar(CONFIG), UfMStar(CONFIG)
+    for i in range(4):
+        out = dense(*frame(i, torch.float64))
+        mean = sampled.mean_uncertainty(*frame(i, torch.float64), fraction=1.0, average=True)
+        assert mean.mean.item() == pytest.approx(out.variance[out.valid].mean().item(), rel=1e-5)
+
+
+def test_query_is_the_dense_map_at_its_own_points():
+    from ufmstar_torch.camera import unproject
+
+    ufm = UfMStar(CONFIG.replace(ema_alpha=1.0), dtype=torch.float64)
+    for i in range(4):
+        out = ufm(*frame(i, torch.float64))
+    depth, pose, intrinsics = frame(3, torch.float64)
+    points = unproject(depth, intrinsics).flatten(1, 2) @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
+    before = snapshot(ufm)
+    result = ufm.query(points)
+    torch.testing.assert_close(result.disagreement.view(1, H, W), out.disagreement, rtol=1e-6, atol=1e-9, equal_nan=True)
+    assert unchanged(ufm, before)
+    for bad in (torch.zeros(2, 5, 3), torch.zeros(5, 3), torch.zeros(1, 5, 2)):
+        with pytest.raises(ValueError, match="points"):
+            ufm.query(bad)
+    with pytest.raises(ValueError, match="frame"):
+        ufm.query(points, frame="camera")
+    with pytest.raises(ValueError, match="first"):
+        UfMStar().query(points)
+
+
+def test_no_host_synchronisation():
+    """On the meta device every read of a value raises: with a fixed capacity nothing is read at all."""
+    config = UfMStarConfig(
+        segment=SPGF, backend="torch", initial_capacity=16, max_components=16, on_bad_frame="skip"
+    )
+    ufm = UfMStar(config, device="meta")
+    for _ in range(2):
+        out = ufm(
+            torch.empty(2, 12, 16, device="meta"),
+            torch.empty(2, 4, 4, device="meta"),
+            torch.empty(2, 3, 3, device="meta"),
+            aleatoric=torch.empty(2, 12, 16, device="meta"),
+        )
+    assert out.variance.shape == (2, 12, 16)
+    assert out.variance.device.type == "meta"
+
+
+# ---- bad input ----
+
+
+def break_pose(pose, how):
+    pose = pose.clone()
+    if how == "nan":
+        pose[0, 0, 3] = torch.nan
+    elif how == "inf":
+        pose[0, 1, 1] = -torch.inf
+    elif how == "scaled":
+        pose[0, :3, :3] *= 1.05
+    elif how == "sheared":
+        pose[0, 0, 1] += 0.2
+    elif how == "mirrored":
+        pose[0, :3, 0] *= -1
+    elif how == "row":
+        pose[0, 3] = torch.tensor([0.0, 0, 0, 2])
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("nan", "stream 0: pose holds NaN"),
+        ("inf", "stream 0: pose holds NaN"),
+        ("scaled", "not orthonormal"),
+        ("sheared", "not orthonormal"),
+        ("mirrored", "reflection"),
+        ("row", "last row"),
+    ],
+)
+def test_bad_poses_raise_and_leave_the_state(how, message):
+    ufm, twin = UfMStar(CONFIG), UfMStar(CONFIG)
+    ufm(*frame(0)), twin(*frame(0))
+    before = snapshot(ufm)
+    depth, pose, intrinsics = frame(1)
+    with pytest.raises(ValueError, match=message):
+        ufm(depth, break_pose(pose, how), intrinsics)
+    assert unchanged(ufm, before)
+    assert same(ufm(*frame(2)).variance, twin(*frame(2)).variance)
+
+
+@pytest.mark.parametrize("how", ["nan", "inf", "scaled", "mirrored", "row"])
+def test_bad_poses_can_be_skipped_and_are_counted(how):
+    config = CONFIG.replace(on_bad_frame="skip")
+    ufm, single = UfMStar(config), UfMStar(config)
+    poses = [torch.cat([frame(i)[1]] * 2) for i in range(3)]
+    poses[1] = torch.cat([break_pose(frame(1)[1], how), frame(1)[1]])
+    outputs = [ufm(frame(i)[0].expand(2, H, W), poses[i], K) for i in range(3)]
+    assert outputs[1].statistics.fault.tolist()[0] > 0
+    assert outputs[1].statistics.fault.tolist()[1] == 0
+    assert outputs[1].variance[0].isnan().all()
+    assert outputs[1].variance[1].isfinite().any()
+    assert ufm.skipped.tolist() == [1, 0]
+    assert ufm.frames.tolist() == [2, 3]
+    single(*frame(0))
+    assert same(outputs[2].variance[0], single(*frame(2)).variance[0])
+
+
+def test_a_first_frame_at_fault_does_not_anchor_the_stream():
+    config = CONFIG.replace(on_bad_frame="skip")
+    ufm, clean = UfMStar(config), UfMStar(config)
+    ufm(frame(0)[0], break_pose(frame(0)[1], "nan"), K)
+    assert not ufm.started.item()
+    assert same(ufm(*frame(1)).variance, clean(*frame(1)).variance)
+
+
+def test_slightly_skewed_rotations_are_projected_and_reported():
+    """7-Scenes' rotations have determinants near 0.9995."""
+    exact, skewed = UfMStar(CONFIG), UfMStar(CONFIG)
+    for i in range(4):
+        depth, pose, intrinsics = frame(i)
+        worse = pose.clone()
+        worse[:, :3, :3] *= 0.9995 ** (1 / 3)
+        a, b = exact(depth, pose, intrinsics), skewed(depth, worse, intrinsics)
+        torch.testing.assert_close(a.std, b.std, rtol=0, atol=1e-4, equal_nan=True)
+        assert b.statistics.rotation_deviation.item() == pytest.approx(1 - 0.9995 ** (2 / 3), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        [[100.0, 0, 20], [0, -100, 15], [0, 0, 1]],
+        [[torch.nan, 0, 20], [0, 100, 15], [0, 0, 1]],
+        [[100.0, 0, 20], [0, 0, 15], [0, 0, 1]],
+        [[100.0, 0, 20], [0, 100, 15], [0, 0, 2]],
+        [[100.0, 3, 20], [0, 100, 15], [0, 0, 1]],
+    ],
+)
+def test_bad_intrinsics(bad):
+    depth, pose, _ = frame(0)
+    with pytest.raises(ValueError, match="intrinsics"):
+        UfMStar(CONFIG)(depth, pose, torch.tensor(bad))
+
+
+def test_wrong_shapes_and_dtypes_name_the_argument():
+    depth, pose, intrinsics = frame(0)
+    ufm = UfMStar(CONFIG)
+    cases = [
+        ((depth[0], pose, intrinsics), {}, ValueError, "depth must be"),
+        ((depth[:, None, None], pose, intrinsics), {}, ValueError, "depth must be"),
+        ((depth[:, :0], pose, intrinsics), {}, ValueError, "depth must be"),
+        ((depth.long(), pose, intrinsics), {}, TypeError, "depth must have a floating"),
+        ((depth.numpy(), pose, intrinsics), {}, TypeError, "depth must be a torch.Tensor"),
+        ((depth, pose[:, :3], intrinsics), {}, ValueError, "pose must be"),
+        ((depth, pose.expand(3, 4, 4), intrinsics), {}, ValueError, "pose must have depth's 1 streams"),
+        ((depth, pose, intrinsics[:, :2]), {}, ValueError, "intrinsics must be"),
+        ((depth, pose, intrinsics), {"aleatoric": depth[:, 1:]}, ValueError, "aleatoric must have"),
+        ((depth, pose, intrinsics), {"epistemic": depth.int()}, TypeError, "epistemic must have"),
+        ((depth, pose, intrinsics), {"valid": depth}, TypeError, "valid must be"),
+        ((depth, pose, intrinsics), {"valid": depth[:, 1:] > 0}, ValueError, "valid must have"),
+        ((depth, pose, intrinsics), {"features": depth[:, None]}, ValueError, "features must have shape"),
+        ((depth, pose, intrinsics), {"aleatoric": depth.to("meta")}, ValueError, "aleatoric must lie on"),
+    ]
+    for arguments, options, error, message in cases:
+        with pytest.raises(error, match=message):
+            ufm(*arguments, **options)
+    assert ufm.mean.shape[0] == 0
+    ufm(depth, pose, intrinsics)
+    with pytest.raises(ValueError, match="call reset"):
+        ufm(depth.expand(2, H, W), pose, intrinsics)
+    with pytest.raises(ValueError, match="features must be given"):
+        UfMStar(CONFIG.replace(features=1))(depth, pose, intrinsics)
+
+
+def test_bad_pixels_are_left_out_and_counted():
+    depth, pose, intrinsics = frame(0)
+    depth = depth.nan_to_num(2.0)
+    a = torch.full_like(depth, 0.1)
+    depth[0, 0, :4] = torch.tensor([torch.nan, torch.inf, 0.0, -1.0])
+    a[0, 1, :3] = torch.tensor([torch.nan, -0.1, torch.inf])
+    valid = torch.ones_like(depth, dtype=torch.bool)
+    valid[0, 2, :2] = False
+    out = UfMStar(CONFIG)(depth, pose, intrinsics, aleatoric=a, valid=valid)
+    assert out.statistics.valid_pixels.item() == H * W - 9
+    assert torch.equal(out.variance.isnan(), ~out.valid)
+
+
+def test_all_invalid_depth_is_a_frame_without_segments():
+    ufm, twin = UfMStar(CONFIG), UfMStar(CONFIG)
+    ufm(*frame(0)), twin(*frame(0))
+    depth, pose, intrinsics = frame(1)
+    out = ufm(torch.full_like(depth, torch.nan), pose, intrinsics)
+    assert out.variance.isnan().all()
+    assert out.statistics.segments.item() == 0
+    assert same(ufm(*frame(2)).variance, twin(*frame(2)).variance)
+
+
+def test_one_pixel_image():
+    ufm = UfMStar(UfMStarConfig(segment=SPGFConfig(prune="none", sparse=0, scale_with_image=False)))
+    for _ in range(2):
+        out = ufm(torch.full((1, 1, 1), 2.0), torch.eye(4), torch.eye(3))
+        assert out.variance.shape == (1, 1, 1)
+        assert out.variance.isfinite().all()
+        plain = UfMStar()(torch.full((1, 1, 1), 2.0), torch.eye(4), torch.eye(3))
+        assert plain.variance.isfinite().all()
+
+
+def test_intrinsics_and_size_may_change_in_the_middle():
+    ufm = UfMStar(CONFIG)
+    for i in range(3):
+        ufm(*frame(i))
+    K_small = scenes.intrinsics(H - 6, W - 8, 60)
+    depth = torch.tensor(scenes.render(POSES[3], K_small, H - 6, W - 8)).float()[None]
+    out = ufm(depth, torch.tensor(POSES[3]), torch.tensor(K_small))
+    assert out.variance.shape == depth.shape
+    assert out.statistics.matched.item() > 0
+    assert ufm.smoothed.shape == depth.shape
+
+
+@given(st.data())
+@settings(max_examples=25, deadline=None)
+def test_any_depth_map_gives_a_variance_or_nan(data):
+    """Whatever lies in a depth map: finite non-negative variance where valid, NaN elsewhere, no crash."""
+    values = st.one_of(
+        st.floats(0.0625, 30, width=32),
+        st.sampled_from([0.0, -1.0, float("nan"), float("inf"), -float("inf"), 1e-30, 1e30, 20.0]),
+    )
+    height, width = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
+    ufm = UfMStar(UfMStarConfig(segment=SPGFConfig(prune="none", sparse=0, scale_with_image=False)))
+    for i in range(3):
+        cells = data.draw(st.lists(values, min_size=height * width, max_size=height * width))
+        depth = torch.tensor(cells, dtype=torch.float32).view(1, height, width)
+        pose = torch.tensor(scenes.look((0.05 * i, 0, 0), 0.02 * i))
+        out = ufm(depth, pose, torch.tensor(scenes.intrinsics(height, width)))
+        expected = depth.isfinite() & (depth > 0)
+        assert torch.equal(out.valid, expected)
+        assert torch.equal(out.variance.isnan(), ~expected)
+        assert (out.variance[expected] >= 0).all()
+        assert out.variance[expected].isfinite().all()
+
+
+# ---- config ----
+
+
+def test_config_rejects_unknown_keys_and_impossible_values():
+    for changes in (
+        {"eta": 0.0}, {"eta": 1.5}, {"eta_occlusion": -1.0}, {"prior_weight": 0.0}, {"ema_alpha": 0.0},
+        {"regression": "rtree"}, {"backend": "cuda"}, {"max_components": 0}, {"variance_floor": float("nan")},
+        {"near_radius": 0.6}, {"add_aleatoric": 1}, {"features": 1.5}, {"initial_capacity": True}, {"segment": 3},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=next(iter(changes))):
+            UfMStarConfig(**changes)
+    with pytest.raises(TypeError, match="eta_oclusion"):
+        UfMStarConfig.from_dict({"eta_oclusion": 0.7})
+    with pytest.raises(TypeError, match="min_pixel"):
+        UfMStarConfig.from_dict({"segment": {"min_pixel": 7}})
+    with pytest.raises(ValueError, match="noise_floor"):
+        SPGFConfig(noise_floor=0.5)
+    with pytest.raises(Exception, match="frozen|assign"):
+        UfMStarConfig().eta = 0.3
+    with pytest.raises(TypeError, match="UfMStarConfig"):
+        UfMStar({"eta": 0.5})
+    with pytest.raises(ValueError, match="dtype"):
+        UfMStar(dtype=torch.float16)
+
+
+def test_config_round_trips_through_json():
+    config = UfMStarConfig(eta=0.4, max_components=99, segment=SPGFConfig(min_rows=3))
+    assert UfMStarConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_every_fault_has_its_own_sentence():
+    assert len(set(FRAME_FAULTS)) == len(FRAME_FAULTS)
+
+
+def test_float32_follows_float64():
+    _, single = run(CONFIG, DEPTHS, POSES, K_, dtype=torch.float32)
+    _, double = run(CONFIG, DEPTHS, POSES, K_, dtype=torch.float64)
+    for a, b in zip(single, double, strict=True):
+        torch.testing.assert_close(a.std, b.std, rtol=0, atol=1e-4, equal_nan=True)

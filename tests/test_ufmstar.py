@@ -1,0 +1,252 @@
+"""The whole algorithm against the oracle, and its properties over sequences."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+import oracle_spgf
+import pytest
+import scenes
+import torch
+
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+
+HEIGHT, WIDTH = 30, 40
+SPGF = SPGFConfig(
+    adaptive_thresh_scale=0.13, occlusion_gap=2, n_check=4, sparse=1, min_pixels=14, min_rows=5, scale_with_image=False
+)  # fmt: skip
+BACKENDS = ("torch", "numba")
+
+
+def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
+    settings = oracle_spgf.Settings(
+        a=config.adaptive_thresh_scale,
+        noise_floor=config.noise_floor,
+        noise_thresh=config.noise_thresh,
+        line_t=config.line_thresh,
+        occ_x=config.occlusion_gap,
+        n_check=config.n_check,
+        max_open=config.max_open,
+        angle=config.angle_cosine,
+        sparse=config.sparse,
+        min_gaussian_length=config.min_gaussian_length,
+        frame_max_scale=config.frame_max_scale,
+        max_depth=config.max_depth,
+    )
+    return oracle.Segmentation(settings, config.min_pixels, config.min_rows, config.prune)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """The oracle's run over 30 rendered frames: inputs, maps, mixtures, matches."""
+    depths, poses, K = scenes.sequence(30, HEIGHT, WIDTH, 0.04)
+    rng = np.random.default_rng(1)
+    aleatoric = [0.01 + 0.02 * rng.random(d.shape) for d in depths]
+    judge = oracle.Oracle(oracle_settings(SPGF))
+    maps, matches, sizes = [], [], []
+    for depth, T, a in zip(depths, poses, aleatoric, strict=True):
+        features = np.stack([a, np.nan_to_num(depth)])
+        maps.append(judge.step(depth, T, K, aleatoric=a, features=features))
+        matches.append(judge.matches)
+        sizes.append(len(judge.mixture))
+    return depths, poses, K, aleatoric, maps, matches, judge.mixture, sizes
+
+
+def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
+    depths, poses, K, _, _, matches, mixture, sizes = truth
+    per_c = [len(ks) for frame in matches for ks in frame]
+    per_k = [sum(k in ks for ks in frame) for frame in matches for k in range(100)]
+    assert max(per_c) > 1, "one current component must match many"
+    assert max(per_k) > 1, "many must match one"
+    assert min(per_c) == 0
+    assert sizes[-1] > sizes[0] + 5, "new places must be seen"
+    assert max(g["count"] for g in mixture) > 10, "places must be revisited"
+    # The occlusion filter must have had work to do: without it, other matches follow.
+    judge = oracle.Oracle(oracle_settings(SPGF), eta_occl=1.0)
+    hidden = 0
+    for i in range(12):
+        valid = np.isfinite(depths[i])
+        current = oracle.segment(np.where(valid, depths[i], 0), K, judge.spgf, valid=valid)
+        if judge.T_first is None:
+            judge.T_first = poses[i]
+        to_cam = oracle.relative(judge.T_first, poses[i])
+        previous = [oracle.transform(g, *to_cam) for g in judge.mixture]
+        loose, overlaps = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 1.0, 0.05)
+        strict, _ = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 0.7, 0.05)
+        hidden += sum(len(a) - len(b) for a, b in zip(loose, strict, strict=True))
+        to_first = oracle.relative(poses[i], judge.T_first)
+        judge.mixture = oracle.fuse(
+            judge.mixture, [oracle.transform(g, *to_first) for g in current], strict, overlaps
+        )
+    assert hidden > 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("streams", [1, 4])
+def test_thirty_frames_agree_with_the_oracle(truth, backend, streams):
+    depths, poses, K, aleatoric, maps, matches, mixture, sizes = truth
+    config = UfMStarConfig(segment=SPGF, backend=backend, features=2, initial_capacity=8)
+    ufm = UfMStar(config, dtype=torch.float64)
+
+    def batch(x):
+        return torch.tensor(np.asarray(x)).expand(streams, *np.shape(x)).contiguous()
+
+    for i, (depth, T, a) in enumerate(zip(depths, poses, aleatoric, strict=True)):
+        features = np.stack([a, np.nan_to_num(depth)])
+        out = ufm(batch(depth), batch(T), batch(K), aleatoric=batch(a), features=batch(features))
+        V, M = maps[i]
+        assert out.statistics.components.tolist() == [sizes[i]] * streams
+        assert out.statistics.pairs.tolist() == [sum(map(len, matches[i]))] * streams
+        for b in range(streams):
+            np.testing.assert_allclose(out.disagreement[b].numpy(), M, rtol=0, atol=1e-10)
+            np.testing.assert_allclose(out.variance[b].numpy(), V, rtol=0, atol=1e-10)
+    for b in range(streams):
+        for k, g in enumerate(mixture):
+            np.testing.assert_allclose(ufm.mixture.mean[b, k].numpy(), g["mean"], atol=1e-10)
+            np.testing.assert_allclose(ufm.mixture.covariance[b, k].numpy(), g["cov"], atol=1e-10)
+            np.testing.assert_allclose(ufm.mixture.features[b, k].numpy(), g["features"], atol=1e-10)
+            assert ufm.mixture.disagreement[b, k].item() == pytest.approx(g["m"], abs=1e-10)
+            assert ufm.mixture.weight[b, k].item() == g["weight"]
+            assert ufm.mixture.count[b, k].item() == g["count"]
+
+
+def run(config, depths, poses, K, dtype=torch.float64):
+    ufm = UfMStar(config, dtype=dtype)
+    outputs = [
+        ufm(torch.as_tensor(d).view(-1, *d.shape[-2:]), torch.as_tensor(T), torch.as_tensor(K))
+        for d, T in zip(depths, poses, strict=True)
+    ]
+    return ufm, outputs
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_streams_are_independent(backend):
+    """Four different streams together equal four single runs: to the last bit by the compiled kernels;
+    the torch reference sums over padded slots, which moves the last digits."""
+    config = UfMStarConfig(segment=SPGF, backend=backend, initial_capacity=16)
+    data = [scenes.sequence(8, HEIGHT, WIDTH, 0.03 * (s + 1), seed=s) for s in range(4)]
+    K = np.stack([scenes.intrinsics(HEIGHT, WIDTH, 60 + 5 * s) for s in range(4)])
+    singles = [run(config, d, p, K[s])[1] for s, (d, p, _) in enumerate(data)]
+    together = run(
+        config,
+        [np.stack([data[s][0][i] for s in range(4)]) for i in range(8)],
+        [np.stack([data[s][1][i] for s in range(4)]) for i in range(8)],
+        K,
+    )[1]
+    for i in range(8):
+        for s in range(4):
+            mine, alone = together[i].variance[s], singles[s][i].variance[0]
+            tolerance = 0.0 if backend == "numba" else 1e-12
+            torch.testing.assert_close(mine, alone, rtol=0, atol=tolerance, equal_nan=True)
+            assert together[i].statistics.components[s] == singles[s][i].statistics.components[0]
+
+
+def test_rigid_motion_of_the_world_changes_nothing():
+    depths, poses, K = scenes.sequence(10, HEIGHT, WIDTH, 0.04)
+    world = scenes.look((512.0, -64.0, 2048.0), 0.7, -0.4)
+    config = UfMStarConfig(segment=SPGF)
+    _, here = run(config, depths, poses, K)
+    ufm, there = run(config, depths, [world @ T for T in poses], K)
+    for a, b in zip(here, there, strict=True):
+        torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-10, equal_nan=True)
+    points = torch.tensor([[[0.1, 0.2, 2.0]]], dtype=torch.float64)
+    moved = torch.einsum("ij,bnj->bni", torch.tensor(world[:3, :3] @ poses[0][:3, :3]), points) + torch.tensor(
+        (world @ poses[0])[:3, 3]
+    )
+    torch.testing.assert_close(
+        ufm.query(moved).disagreement, ufm.query(points, frame="first").disagreement, rtol=1e-9, atol=1e-12
+    )
+
+
+def test_kilometres_from_the_origin_float32_loses_nothing():
+    depths, poses, K = scenes.sequence(10, HEIGHT, WIDTH, 0.04)
+    far = np.eye(4)
+    far[:3, 3] = 4.5e6, -3.2e6, 120.0  # easting and northing of a map projection
+    config = UfMStarConfig(segment=SPGF)
+    _, here = run(config, depths, poses, K, dtype=torch.float32)
+    _, there = run(config, depths, [far @ T for T in poses], K, dtype=torch.float32)
+    for a, b in zip(here, there, strict=True):
+        torch.testing.assert_close(a.std, b.std, rtol=0, atol=1e-4, equal_nan=True)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_identical_views_do_not_disagree(backend):
+    depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.0)
+    ufm, outputs = run(UfMStarConfig(segment=SPGF, backend=backend), depths * 5, poses * 5, K, torch.float32)
+    assert outputs[-1].statistics.new.item() == 0
+    assert outputs[-1].statistics.matched.item() == outputs[-1].statistics.segments.item()
+    same = ufm.mixture.count == 5  # matched with themselves only; others met a neighbour that overlaps them
+    assert same.sum() >= 3
+    assert ufm.mixture.disagreement[same].max() < 1e-12
+    valid = outputs[-1].valid
+    assert outputs[-1].disagreement[valid].min() == 0 or outputs[-1].disagreement[valid].min() < 1e-12
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_more_depth_noise_more_disagreement(seed):
+    """Seen from one place, where segments do not slide: M and the mixture's m both rise with the noise."""
+    K, T = scenes.intrinsics(HEIGHT, WIDTH), scenes.tour(30)[0]
+    exact = scenes.render(T, K, HEIGHT, WIDTH)
+    dense, stored = [], []
+    for amount in (0.0, 0.01, 0.02, 0.04, 0.08):
+        depths = [scenes.flicker(exact, amount, 100 * seed + i) for i in range(12)]
+        ufm, outputs = run(UfMStarConfig(segment=SPGF), depths, [T] * 12, K)
+        dense.append(torch.stack([o.disagreement.mean() for o in outputs[6:]]).mean().item())
+        stored.append(((ufm.mixture.disagreement * ufm.mixture.weight).sum() / ufm.mixture.weight.sum()).item())
+    assert dense == sorted(dense)
+    assert stored == sorted(stored)
+    assert dense[0] < 1e-12 < 1e-3 < dense[-1]
+
+
+def test_the_first_frame_knows_nothing():
+    depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.04)
+    _, (out,) = run(UfMStarConfig(segment=SPGF, prior_mean=0.0), depths, poses, K)
+    assert (out.disagreement[out.valid] == 0).all()
+    assert out.statistics.new.item() == out.statistics.segments.item() > 0
+
+
+def test_a_place_never_seen_starts_afresh():
+    depths, poses, K = scenes.sequence(4, HEIGHT, WIDTH, 0.04)
+    elsewhere = [poses[0], poses[1], scenes.look((500.0, 0, 300.0), 2.0), poses[3]]
+    _, outputs = run(UfMStarConfig(segment=SPGF, ema_alpha=1.0), depths, elsewhere, K)
+    jump = outputs[2]
+    assert jump.statistics.matched.item() == 0
+    assert (jump.disagreement[jump.valid] == 0).all()
+    assert outputs[3].statistics.matched.item() > 0
+
+
+def test_moving_average():
+    depths, poses, K = scenes.sequence(5, HEIGHT, WIDTH, 0.06)
+    _, raw = run(UfMStarConfig(segment=SPGF, ema_alpha=1.0), depths, poses, K)
+    _, smoothed = run(UfMStarConfig(segment=SPGF, ema_alpha=0.3), depths, poses, K)
+    expected = raw[0].disagreement
+    for a, b in zip(raw[1:], smoothed[1:], strict=True):
+        both = 0.7 * expected + 0.3 * a.disagreement
+        expected = torch.where(expected.isnan(), a.disagreement, torch.where(a.disagreement.isnan(), expected, both))
+        shown = torch.where(b.valid, expected, torch.nan)
+        torch.testing.assert_close(b.disagreement, shown, rtol=1e-12, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("which", ["none", "a", "e", "both", "off"])
+def test_total_variance(which):
+    depths, poses, K = scenes.sequence(2, HEIGHT, WIDTH, 0.06)
+    a, e = torch.full((1, HEIGHT, WIDTH), 0.25).double(), torch.full((1, HEIGHT, WIDTH), 0.5).double()
+    config = UfMStarConfig(segment=SPGF, add_aleatoric=which != "off", add_epistemic=which != "off")
+    ufm = UfMStar(config, dtype=torch.float64)
+    given = {"aleatoric": a if which in ("a", "both", "off") else None, "epistemic": e if which in ("e", "both", "off") else None}
+    for depth, T in zip(depths, poses, strict=True):
+        out = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K), **given)
+    added = {"none": 0.0, "a": 0.25, "e": 0.5, "both": 0.75, "off": 0.0}[which]
+    torch.testing.assert_close(out.variance, out.disagreement + added, equal_nan=True)
+    torch.testing.assert_close(out.std, out.variance.sqrt(), equal_nan=True)
+    assert (out.disagreement[out.valid] > 0).any()
+
+
+def test_variance_floor_is_off_by_default_and_leaves_nan():
+    depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.04)
+    _, (plain,) = run(UfMStarConfig(segment=SPGF), depths, poses, K)
+    _, (floored,) = run(UfMStarConfig(segment=SPGF, variance_floor=0.01), depths, poses, K)
+    assert plain.variance[plain.valid].min() == 0
+    assert (floored.variance[floored.valid] == 0.01).all()
+    assert torch.equal(floored.variance.isnan(), ~floored.valid)
+    assert (floored.disagreement[floored.valid] == 0).all()
