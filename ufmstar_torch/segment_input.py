@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -71,7 +72,7 @@ class SegmentInput:
         return cls(
             depth=depth.detach() if stored else depth.detach().to(torch.float64),
             intrinsics=intrinsics.detach(),
-            config=_spgf_config(config).scaled_to(height, width),
+            config=_scaled(_spgf_config(config), height, width),
             variance=None if variance is None else variance.detach(),
             valid=valid,
             features=None if features is None else features.detach(),
@@ -87,6 +88,11 @@ class SegmentInput:
     def depth_bins(self) -> int:
         """Enough depth bins to reach max_depth whatever the camera: none is shorter than L0."""
         return math.ceil(self.config.max_depth / self.config.min_gaussian_length) + 2
+
+
+@functools.lru_cache(maxsize=16)  # a frame's worth of checks, for a value that never changes
+def _scaled(config: SPGFConfig, height: int, width: int) -> SPGFConfig:
+    return config.scaled_to(height, width)
 
 
 def _spgf_config(config: SPGFConfig | UfMStarConfig | None) -> SPGFConfig:

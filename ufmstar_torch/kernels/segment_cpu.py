@@ -18,24 +18,40 @@ from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
 
 # Columns of a finished segment. Within a row y = z (v - cy)/fy, so x and z say everything.
-_N, _MX, _MZ, _CXX, _CXZ, _CZZ, _LX, _LZ, _NEAREST, _UL, _UR = range(11)
-_SEGMENT = 11
-
-# Columns of an open segment: sums of d = p - pL and of d d^T, first and last point, w2 = |pR - pL|^2 ...
-_DX, _DZ, _DXX, _DXZ, _DZZ, _XL, _ZL, _XR, _ZR, _W2 = range(10)
-_OPEN = 10
-# ... and its whole numbers: N, uL, uR, smallest bin, how many were started in the row before it.
-_ON, _OUL, _OUR, _OBIN, _BORN = range(5)
-_OPEN_INT = 5
+_MX, _MZ, _CXX, _CXZ, _CZZ, _LX, _LZ = range(7)
+_SEGMENT = 7
+# Its whole numbers: N, smallest bin, interval.
+_N, _NEAREST, _UL, _UR = range(4)
+_SEGMENT_INT = 4
 
 # Columns of a Gaussian: mean, scatter (upper triangle), line vector, first mean, plane vector, its pi2 ...
 _M, _C, _L, _M0, _PI, _PI2 = 0, 3, 9, 12, 15, 18
 _GAUSSIAN = 19
-# ... and its whole numbers: N, n, smallest bin, stored interval, the row that extended it last.
-_GN, _MERGED, _GBIN, _GUL, _GUR, _ROW = range(6)
-_GAUSSIAN_INT = 6
+# ... and its whole numbers: those of a segment, n, the row that extended it last, its place in the output.
+_MERGED, _ROW, _ORDER = range(4, 7)
+_GAUSSIAN_INT = 7
 
 _PRUNE = {"none": 0, "both": 1, "either": 2}
+
+
+class _Open(NamedTuple):
+    """An open segment, which compiled code keeps in registers. d = p - pL."""
+
+    n: int
+    u_left: int
+    u_right: int
+    nearest: int  # smallest depth bin
+    born: int  # how many segments the row had started before
+    x_left: float
+    z_left: float
+    x_right: float
+    z_right: float
+    w2: float  # |pR - pL|^2
+    dx: float  # sums of d_x, d_z, d_x^2, d_x d_z, d_z^2
+    dz: float
+    dxx: float
+    dxz: float
+    dzz: float
 
 
 class _Limits(NamedTuple):
@@ -152,37 +168,43 @@ def _image(z, use, spread, camera, limits, labels):
     height, width = z.shape
     fx, fy, cx, cy, slope = camera[0], camera[1], camera[2], camera[3], camera[4]
     lengths2, edges = _depth_bins(0.5 * min(width / fx, height / fy), limits)
-    rx = np.empty(width)
-    for u in range(width):
-        rx[u] = (u - cx) / fx
+    depth, s2, rx = np.empty(width), np.zeros(width), (np.arange(width) - cx) / fx
 
-    segments = np.empty((height, width // (limits.sparse + 1), _SEGMENT))
-    finished = np.empty(height, np.int64)
-    owner = np.empty((height, width), np.int32)  # which of the row's starts a pixel belongs to, -1 = none
-    place = np.empty((height, width), np.int32)  # start -> finished segment, -1 = too sparse
-    values, whole = np.empty((limits.max_open, _OPEN)), np.empty((limits.max_open, _OPEN_INT), np.int64)
-    total = 0
+    most = width // (limits.sparse + 1)  # segments of one row
+    segments, segments_int = np.empty((most, _SEGMENT)), np.empty((most, _SEGMENT_INT), np.int64)
+    place = np.empty(width, np.int64)  # what the row started -> finished segment, then Gaussian; -1 = too sparse
+    member = np.empty(most, np.int64)  # finished segment -> Gaussian
+    active = np.empty(2 * most, np.int64)
+    gaussians, whole = np.empty((4 * most + 64, _GAUSSIAN)), np.empty((4 * most + 64, _GAUSSIAN_INT), np.int64)
+    older, older_int = np.empty((limits.max_open, 10)), np.empty((limits.max_open, 5), np.int64)
+    before, created, emitted = 0, 0, 0
     for v in range(height):
-        finished[v] = _scanline(
-            z[v], use[v % use.shape[0]], spread[v % spread.shape[0]], rx, (v - cy) / fy, slope, lengths2, edges,
-            limits, values, whole, segments[v], owner[v], place[v],
+        ry = (v - cy) / fy
+        _usable(z[v], use[v % use.shape[0]], spread[v % spread.shape[0]], limits.max_depth, depth, s2)
+        done, started = _scanline(
+            depth, s2, rx, ry, slope, lengths2, edges, limits, older, older_int, segments, segments_int, place,
+            labels[v],
         )  # fmt: skip
-        total += finished[v]
+        if created + done > gaussians.shape[0]:
+            gaussians, whole = _doubled(gaussians), _doubled(whole)
+        n, created = _join_row(
+            segments, segments_int, done, v, ry, slope, lengths2, limits, gaussians, whole, active, before, created,
+            member,
+        )  # fmt: skip
+        for i in range(started):
+            place[i] = member[place[i]] if place[i] >= 0 else -1
+        for u in range(width):
+            labels[v, u] = place[labels[v, u]] if labels[v, u] >= 0 else -1
+        before, emitted = _retire(active, n, v, v == height - 1, whole, emitted)
+    return _prune(whole, created, limits, labels), gaussians, whole
 
-    gaussians, whole = np.empty((total, _GAUSSIAN)), np.empty((total, _GAUSSIAN_INT), np.int64)
-    member = np.empty((height, segments.shape[1]), np.int32)  # segment -> Gaussian, in order of creation
-    emitted = _fuse(segments, finished, cy, fy, slope, lengths2, limits, gaussians, whole, member)
-    slot = np.full(total, -1, np.int32)
-    kept = np.empty(emitted.size, np.int32)
-    n = 0
-    for g in emitted:
-        if _keeps(whole[g, _GN], whole[g, _MERGED], limits):
-            kept[n] = g
-            slot[g] = n
-            n += 1
-    for v in range(height):
-        _label_row(owner[v], place[v], member[v], slot, labels[v])
-    return kept[:n], gaussians, whole
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _doubled(table):
+    """The same rows with as many free ones behind them."""
+    out = np.empty((2 * table.shape[0], table.shape[1]), table.dtype)
+    out[: table.shape[0]] = table
+    return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -199,175 +221,214 @@ def _depth_bins(s, limits):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scanline(z, use, spread, rx, ry, slope, lengths2, edges, limits, values, whole, segments, owner, place):
-    """Scanline segmentation of one row. Writes segments, owner and place; returns the number of segments.
-
-    The queue of open segments is a ring in ``values`` and ``whole``: ``front`` is the newest.
-    """
-    y_factor = 1.0 + ry * ry
-    front, opened, started, done = 0, 0, 0, 0
-    k = 0
+def _usable(z, use, spread, max_depth, depth, s2):
+    """Depth and variance of a row's pixels, depth 0 for those that take no part. NaN fails every comparison."""
     for u in range(z.size):
-        depth = np.float64(z[u])
-        s2 = np.float64(spread[u]) if spread.size else 0.0
-        # Comparisons are written so that NaN fails them.
-        if not (depth > 0 and depth <= limits.max_depth and s2 >= 0 and s2 < np.inf and (use.size == 0 or use[u])):
-            owner[u] = -1
-            continue
-        x = rx[u] * depth
-        while k < edges.size - 1 and edges[k] < depth:
-            k += 1
-        while k > 0 and edges[k - 1] >= depth:
-            k -= 1
-        q = _match(x, depth, u, slope, lengths2[k], limits, values, whole, front, opened)
-        if q < 0:
-            q = (front + 1) % limits.max_open
-            if opened == limits.max_open:  # the ring is full: the slot after the front holds the oldest
-                done = _finish(values[q], whole[q], limits.sparse, segments, done, place)
-            else:
-                opened += 1
-            front = q
-            _start(values[q], whole[q], x, depth, u, k, started)
-            started += 1
-        _extend(values[q], whole[q], x, depth, u, k, y_factor)
-        if s2 > 0:
-            values[q, _DXX] += s2 * (rx[u] * rx[u])
-            values[q, _DXZ] += s2 * rx[u]
-            values[q, _DZZ] += s2
-        owner[u] = whole[q, _BORN]
-    for i in range(opened):
-        q = (front - i) % limits.max_open
-        done = _finish(values[q], whole[q], limits.sparse, segments, done, place)
-    return done
+        d = np.float64(z[u])
+        depth[u] = d if (d > 0) & (d <= max_depth) else 0.0
+    for u in range(use.size):
+        depth[u] = depth[u] if use[u] else 0.0
+    for u in range(spread.size):
+        s2[u] = spread[u]
+        depth[u] = depth[u] if (s2[u] >= 0) & (s2[u] < np.inf) else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _match(x, z, u, slope, length2, limits, values, whole, front, opened):
-    """The newest open segment that the point continues, or -1."""
+def _scanline(
+    depth, s2, rx, ry, slope, lengths2, edges, limits, older, older_int, segments, segments_int, place, owner
+):
+    """Scanline segmentation of one row.
+
+    Writes the finished segments, ``place`` and ``owner`` (which of the row's starts a pixel belongs to, -1 =
+    none); returns how many segments were finished and how many started. The newest open segment lives in
+    registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
+    """
+    y_factor = 1.0 + ry * ry
+    room = limits.max_open - 1
+    front, waiting, started, done, k = 0, 0, 0, 0, 0
+    newest = _Open(0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    for u in range(depth.size):
+        z = depth[u]
+        if z == 0.0:
+            owner[u] = -1
+            continue
+        x = rx[u] * z
+        while k < edges.size - 1 and edges[k] < z:
+            k += 1
+        while k > 0 and edges[k - 1] >= z:
+            k -= 1
+        if newest.n > 0 and _fits(newest, x, z, u, slope, lengths2[k], limits):
+            newest = _extended(newest, x, z, u, k, y_factor, rx[u], s2[u])
+            owner[u] = newest.born
+            continue
+        q = _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, lengths2[k], limits)
+        if q >= 0:
+            match = _extended(_load(older[q], older_int[q]), x, z, u, k, y_factor, rx[u], s2[u])
+            _store(older[q], older_int[q], match)
+            owner[u] = match.born
+            continue
+        if newest.n > 0:
+            front, waiting, done = _push(
+                newest, older, older_int, front, waiting, room, limits.sparse, segments, segments_int, done, place
+            )
+        empty = _Open(0, u, u, k, started, x, z, x, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        newest = _extended(empty, x, z, u, k, y_factor, rx[u], s2[u])
+        owner[u] = started
+        started += 1
+    if newest.n > 0:
+        done = _finish(newest, limits.sparse, segments, segments_int, done, place)
+    for i in range(waiting):
+        q = front - i if front >= i else front - i + room
+        done = _finish(_load(older[q], older_int[q]), limits.sparse, segments, segments_int, done, place)
+    return done, started
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _push(newest, older, older_int, front, waiting, room, sparse, segments, segments_int, done, place):
+    """Let the newest open segment wait, and finish the oldest if there is no room."""
+    if room == 0:
+        return front, waiting, _finish(newest, sparse, segments, segments_int, done, place)
+    front = front + 1 if front + 1 < room else 0
+    if waiting == room:  # the ring is full: the place after the front holds the oldest
+        oldest = _load(older[front], older_int[front])
+        done = _finish(oldest, sparse, segments, segments_int, done, place)
+    else:
+        waiting += 1
+    _store(older[front], older_int[front], newest)
+    return front, waiting, done
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fits(o, x, z, u, slope, length2, limits):
+    """Does the point continue the open segment?"""
+    if u - o.u_right > limits.occlusion_gap or not o.w2 < length2:
+        return False
     t = slope * z * z
     tau_z = min(max(6.0 * t, limits.noise_floor), limits.noise_thresh)
-    for i in range(opened):
-        q = front - i
-        if q < 0:
-            q += limits.max_open
-        if u - whole[q, _OUR] > limits.occlusion_gap or not values[q, _W2] < length2:
-            continue
-        if whole[q, _ON] <= limits.n_check:
-            tau_x = min(max(t, limits.noise_floor), limits.line_thresh)
-            if abs(z - values[q, _ZR]) < tau_z and abs(x - values[q, _XR]) < tau_x:
-                return q
-        else:
-            dx, dz = values[q, _DX], values[q, _DZ]
-            if dx != 0 and abs(values[q, _ZL] + dz * (x - values[q, _XL]) / dx - z) < tau_z:
-                return q
+    if o.n <= limits.n_check:
+        tau_x = min(max(t, limits.noise_floor), limits.line_thresh)
+        return abs(z - o.z_right) < tau_z and abs(x - o.x_right) < tau_x
+    return o.dx != 0 and abs(o.z_left + o.dz * (x - o.x_left) / o.dx - z) < tau_z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, length2, limits):
+    """The newest of the waiting segments that the point continues, or -1."""
+    for i in range(waiting):
+        q = front - i if front >= i else front - i + room
+        if _fits(_load(older[q], older_int[q]), x, z, u, slope, length2, limits):
+            return q
     return -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _start(values, whole, x, z, u, k, born):
-    """An open segment without pixels that is anchored at its first one."""
-    values[:] = 0.0
-    values[_XL], values[_ZL] = x, z
-    whole[_ON], whole[_OUL], whole[_OBIN], whole[_BORN] = 0, u, k, born
+def _extended(o, x, z, u, k, y_factor, rx, s2):
+    """The open segment with a pixel added."""
+    dx, dz = x - o.x_left, z - o.z_left
+    dxx, dxz, dzz = o.dxx + dx * dx, o.dxz + dx * dz, o.dzz + dz * dz
+    if s2 > 0:
+        dxx, dxz, dzz = dxx + s2 * (rx * rx), dxz + s2 * rx, dzz + s2
+    return _Open(
+        o.n + 1, o.u_left, u, min(o.nearest, k), o.born, o.x_left, o.z_left, x, z,
+        dx * dx + y_factor * (dz * dz), o.dx + dx, o.dz + dz, dxx, dxz, dzz,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _extend(values, whole, x, z, u, k, y_factor):
-    """Add a pixel to an open segment."""
-    dx, dz = x - values[_XL], z - values[_ZL]
-    values[_DX] += dx
-    values[_DZ] += dz
-    values[_DXX] += dx * dx
-    values[_DXZ] += dx * dz
-    values[_DZZ] += dz * dz
-    values[_XR], values[_ZR] = x, z
-    values[_W2] = dx * dx + y_factor * (dz * dz)
-    whole[_ON] += 1
-    whole[_OUR] = u
-    whole[_OBIN] = min(whole[_OBIN], k)
+def _store(values, whole, o):
+    whole[0], whole[1], whole[2], whole[3], whole[4] = o.n, o.u_left, o.u_right, o.nearest, o.born
+    values[0], values[1], values[2], values[3], values[4] = o.x_left, o.z_left, o.x_right, o.z_right, o.w2
+    values[5], values[6], values[7], values[8], values[9] = o.dx, o.dz, o.dxx, o.dxz, o.dzz
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _finish(values, whole, sparse, segments, done, place):
+def _load(f, i):
+    return _Open(i[0], i[1], i[2], i[3], i[4], f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _finish(o, sparse, segments, segments_int, done, place):
     """Output an open segment unless it is too sparse; returns the new number of finished ones."""
-    n = whole[_ON]
-    if n <= sparse:
-        place[whole[_BORN]] = -1
+    if o.n <= sparse:
+        place[o.born] = -1
         return done
-    place[whole[_BORN]] = done
-    out = segments[done]
-    dx, dz = values[_DX], values[_DZ]
-    out[_N] = n
-    out[_MX], out[_MZ] = values[_XL] + dx / n, values[_ZL] + dz / n
-    out[_CXX] = values[_DXX] - dx * dx / n
-    out[_CXZ] = values[_DXZ] - dx * dz / n
-    out[_CZZ] = values[_DZZ] - dz * dz / n
-    out[_LX], out[_LZ] = dx, dz
-    out[_NEAREST], out[_UL], out[_UR] = whole[_OBIN], whole[_OUL], whole[_OUR]
+    place[o.born] = done
+    out, whole = segments[done], segments_int[done]
+    out[_MX], out[_MZ] = o.x_left + o.dx / o.n, o.z_left + o.dz / o.n
+    out[_CXX] = o.dxx - o.dx * o.dx / o.n
+    out[_CXZ] = o.dxz - o.dx * o.dz / o.n
+    out[_CZZ] = o.dzz - o.dz * o.dz / o.n
+    out[_LX], out[_LZ] = o.dx, o.dz
+    whole[_N], whole[_NEAREST], whole[_UL], whole[_UR] = o.n, o.nearest, o.u_left, o.u_right
     return done + 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fuse(segments, finished, cy, fy, slope, lengths2, limits, gaussians, whole, member):
-    """Segment fusion over the rows. Fills the Gaussians and member; returns the order of emission."""
-    height, most = member.shape
-    active, fresh = np.empty(2 * most, np.int32), np.empty(2 * most, np.int32)
-    emitted = np.empty(whole.shape[0], np.int32)
-    before, created, done = 0, 0, 0
+def _join_row(
+    segments, segments_int, done, v, ry, slope, lengths2, limits, gaussians, whole, active, before, created, member
+):
+    """Fusion of one row's segments with the Gaussians active before it.
+
+    Fills ``member``, appends new Gaussians; returns the length of the active list and the number created.
+    """
+    n = before
     h = np.empty(_GAUSSIAN)
-    h_int = np.empty(_GAUSSIAN_INT, np.int64)
-    for v in range(height):
-        n = before
-        ry = (v - cy) / fy
-        for j in range(finished[v]):
-            _lift(segments[v, j], ry, v, h, h_int)
-            o = _best_overlap(h_int, active, before, whole)
-            if o >= 0 and _same_plane(gaussians[o], whole[o], h, slope, lengths2, limits):
-                _merge(gaussians[o], whole[o], h, h_int)
-                member[v, j] = o
-            else:
-                gaussians[created] = h
-                whole[created] = h_int
-                active[n] = member[v, j] = created
-                n += 1
-                created += 1
-        going = 0
-        for i in range(n):
-            # After the last row all are complete together, in the order of the active list.
-            if whole[active[i], _ROW] == v and v < height - 1:
-                fresh[going] = active[i]
-                going += 1
-            else:
-                emitted[done] = active[i]
-                done += 1
-        active, fresh = fresh, active
-        before = going
-    return emitted[:done]
+    for j in range(done):
+        _lift(segments[j], ry, h)
+        o = _best_overlap(segments_int[j], active, before, whole)
+        if o >= 0 and _same_plane(gaussians[o], whole[o], h, slope, lengths2, limits):
+            _merge(gaussians[o], whole[o], h, segments_int[j])
+            whole[o, _ROW] = v
+            member[j] = o
+        else:
+            gaussians[created] = h
+            whole[created, :_SEGMENT_INT] = segments_int[j]
+            whole[created, _MERGED], whole[created, _ROW] = 1, v
+            active[n] = member[j] = created
+            n += 1
+            created += 1
+    return n, created
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lift(segment, ry, v, h, h_int):
-    """A segment of row v as a Gaussian of its own: y and the moments with y follow from y = ry z."""
+def _retire(active, n, v, last, whole, emitted):
+    """Emit the Gaussians that row v did not extend, after the last row all of them in the order of the list.
+
+    Returns how many stay active, at the head of the list, and how many were ever emitted.
+    """
+    going = 0
+    for i in range(n):
+        g = active[i]
+        if whole[g, _ROW] == v and not last:
+            active[going] = g
+            going += 1
+        else:
+            whole[g, _ORDER] = emitted
+            emitted += 1
+    return going, emitted
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lift(segment, ry, h):
+    """A segment as a Gaussian of its own: y and the moments with y follow from y = ry z."""
     h[:] = 0.0
     h[_M], h[_M + 1], h[_M + 2] = segment[_MX], ry * segment[_MZ], segment[_MZ]
     xx, xz, zz = segment[_CXX], segment[_CXZ], segment[_CZZ]
     h[_C], h[_C + 1], h[_C + 2] = xx, ry * xz, xz
     h[_C + 3], h[_C + 4], h[_C + 5] = ry * ry * zz, ry * zz, zz
     h[_L], h[_L + 1], h[_L + 2] = segment[_LX], ry * segment[_LZ], segment[_LZ]
-    h_int[_GN], h_int[_MERGED], h_int[_ROW] = int(segment[_N]), 1, v
-    h_int[_GBIN], h_int[_GUL], h_int[_GUR] = int(segment[_NEAREST]), int(segment[_UL]), int(segment[_UR])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_overlap(h_int, active, before, whole):
     """The Gaussian active before this row whose stored interval overlaps the segment's most, or -1."""
     best, found = 0.0, -1
-    low, high = h_int[_GUL], h_int[_GUR]
+    low, high = h_int[_UL], h_int[_UR]
     for i in range(before):
         o = active[i]
-        shared = min(whole[o, _GUR], high) - max(whole[o, _GUL], low)
+        shared = min(whole[o, _UR], high) - max(whole[o, _UL], low)
         if shared > 0:
-            rho = shared / (max(whole[o, _GUR], high) - min(whole[o, _GUL], low))
+            rho = shared / (max(whole[o, _UR], high) - min(whole[o, _UL], low))
             if rho > best:
                 best, found = rho, o
     return found
@@ -376,7 +437,7 @@ def _best_overlap(h_int, active, before, whole):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _same_plane(o, o_int, h, slope, lengths2, limits):
     """Does segment h continue the surface of Gaussian o?"""
-    if not o[_PI2] < lengths2[o_int[_GBIN]]:
+    if not o[_PI2] < lengths2[o_int[_NEAREST]]:
         return False
     hx, hz, ox, oz = h[_L], h[_L + 2], o[_L], o[_L + 2]
     dot = hx * ox + hz * oz
@@ -394,7 +455,7 @@ def _same_plane(o, o_int, h, slope, lengths2, limits):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _merge(o, o_int, h, h_int):
     """Add segment h to Gaussian o: moments about the means (Chan et al.), then interval and plane state."""
-    n_o, n_h = o_int[_GN], h_int[_GN]
+    n_o, n_h = o_int[_N], h_int[_N]
     n = n_o + n_h
     share, factor = n_h / n, n_o * n_h / n
     dx, dy, dz = h[_M] - o[_M], h[_M + 1] - o[_M + 1], h[_M + 2] - o[_M + 2]
@@ -417,12 +478,11 @@ def _merge(o, o_int, h, h_int):
         o[_PI + i] += step
         pi2 += step * step
     o[_PI2] = pi2
-    o_int[_GN] = n
-    o_int[_GUL] = (o_int[_GUL] + h_int[_GUL]) // 2
-    o_int[_GUR] = (o_int[_GUR] + h_int[_GUR]) // 2
-    o_int[_GBIN] = min(o_int[_GBIN], h_int[_GBIN])
+    o_int[_N] = n
+    o_int[_UL] = (o_int[_UL] + h_int[_UL]) // 2
+    o_int[_UR] = (o_int[_UR] + h_int[_UR]) // 2
+    o_int[_NEAREST] = min(o_int[_NEAREST], h_int[_NEAREST])
     o_int[_MERGED] += 1
-    o_int[_ROW] = h_int[_ROW]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -435,12 +495,23 @@ def _keeps(pixels, merged, limits):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _label_row(owner, place, member, slot, labels):
-    """From a pixel's start to its finished segment, its Gaussian, and that one's slot."""
-    for u in range(owner.size):
-        labels[u] = -1
-        if owner[u] >= 0 and place[owner[u]] >= 0:
-            labels[u] = slot[member[place[owner[u]]]]
+def _prune(whole, created, limits, labels):
+    """Kept Gaussians in order of emission; turns the labels from orders of creation into slots."""
+    emitted = np.empty(created, np.int64)
+    for g in range(created):
+        emitted[whole[g, _ORDER]] = g
+    slot, n = np.full(created, -1), 0
+    kept = np.empty(created, np.int64)
+    for g in emitted:
+        if _keeps(whole[g, _N], whole[g, _MERGED], limits):
+            kept[n] = g
+            slot[g] = n
+            n += 1
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            if labels[v, u] >= 0:
+                labels[v, u] = slot[labels[v, u]]
+    return kept[:n]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -448,7 +519,7 @@ def _write(kept, gaussians, whole, mean, covariance, weight, count):
     """The kept Gaussians as the mixture's slots; a single pixel has no sample covariance (zeros)."""
     for i in range(kept.size):
         g = gaussians[kept[i]]
-        n = whole[kept[i], _GN]
+        n = whole[kept[i], _N]
         weight[i], count[i] = n, 1
         scatter = 0
         for r in range(3):
