@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.fastdepth import FastDepth as FastDepth
     from ufmstar_torch.models.fastdepth import FastDepthWidths as FastDepthWidths
     from ufmstar_torch.models.load import load_network as load_network
+    from ufmstar_torch.models.network import DepthNetwork as DepthNetwork
     from ufmstar_torch.models.onnx_network import OnnxNetwork as OnnxNetwork
     from ufmstar_torch.models.onnx_network import OnnxSpec as OnnxSpec
     from ufmstar_torch.models.outputs import OutputSpec as OutputSpec
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "CheckpointError": "checkpoints",
+    "DepthNetwork": "network",
     "FastDepth": "fastdepth",
     "FastDepthWidths": "fastdepth",
     "OnnxNetwork": "onnx_network",

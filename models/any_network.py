@@ -10,12 +10,13 @@ from zipfile import BadZipFile
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import OutputSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 
-class WrappedNetwork(nn.Module):
+class WrappedNetwork(DepthNetwork):
     """A network whose outputs are declared by an :class:`OutputSpec`; made by :func:`wrap_network`."""
 
     def __init__(self, network: Callable[..., Any], outputs: OutputSpec, preprocess: Preprocess) -> None:
@@ -112,7 +113,7 @@ def load_exported(path: str | Path, outputs: OutputSpec, preprocess: Preprocess 
 
 
 class _Exported(nn.Module):
-    """An exported program, which keeps the mode it was exported in: torch refuses even ``eval()`` on it."""
+    """An exported program, which keeps the mode it was exported in; torch's own refuses even ``eval()``."""
 
     def __init__(self, program: nn.Module) -> None:
         super().__init__()
@@ -123,8 +124,6 @@ class _Exported(nn.Module):
         return self.program(image)
 
     def train(self, mode: bool = True) -> _Exported:
-        if mode:
-            raise ValueError("a torch.export program has no training mode; train the module it was exported from")
         return self
 
 

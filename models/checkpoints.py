@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import tempfile
+import secrets
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,20 @@ from torch import Tensor, nn
 _CONTAINERS = ("state_dict", "model_state_dict", "model")
 _PREFIXES = ("module.", "_orig_mod.", "state_dict.", "model.", "network.")
 _TORCH_SUFFIXES = (".pth", ".pt", ".ckpt", ".bin", ".tar")
+# How the files of torch.save begin: an archive, or (before 1.6) the pickled magic number of its own format.
+_BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
+# What the restricted unpickler was seen to raise on damaged bytes; it documents none of it.
+_DAMAGE = (
+    EOFError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    AssertionError,
+    struct.error,
+)
 _SHOWN = 8  # keys named in an error message
 
 
@@ -53,7 +68,7 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
 
     Raises:
         FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also where
-            keys are missing or unexpected, or shapes differ. The module is unchanged then.
+            keys are missing or unexpected, shapes differ, or values are not finite. The module is unchanged then.
     """
     path = Path(path)
     state, expected = _read(path), module.state_dict()
@@ -65,7 +80,9 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
         for key in expected
         if key in state and state[key].shape != expected[key].shape
     ]
+    not_finite = [key for key in sorted(state) if not torch.isfinite(state[key]).all()]
     faults = [("missing", missing), ("unexpected", unexpected), ("of another shape", shapes)]
+    faults.append(("with NaN or infinity", not_finite))
     texts = [f"{len(keys)} {what}: {_some(keys)}" for what, keys in faults if keys]
     if texts:
         raise CheckpointError(f"{path} does not fit {type(module).__name__} ({len(expected)} keys): {'; '.join(texts)}")
@@ -90,15 +107,15 @@ def save_checkpoint(
     state = weights.state_dict() if isinstance(weights, nn.Module) else dict(weights)
     state = {key: value.detach().cpu().contiguous() for key, value in state.items()}
     text = json.dumps(dict(metadata or {}))
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")  # same folder: renaming is atomic
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             _write(file, path, state, text)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -129,6 +146,10 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 
 def _read_torch(path: Path) -> Any:
+    with path.open("rb") as file:
+        beginning = file.read(max(map(len, _BEGINNINGS)))
+    if not beginning.startswith(_BEGINNINGS):
+        raise CheckpointError(f"{path} is damaged or not a file of torch.save: it begins with {beginning[:8]!r}")
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
@@ -136,7 +157,7 @@ def _read_torch(path: Path) -> Any:
             f"{path} is damaged or holds pickled Python objects (a whole module?), which are never loaded because "
             "they can run code; save the module's state_dict() with the program that made it, and load that"
         ) from error
-    except (RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
+    except _DAMAGE as error:
         raise CheckpointError(f"{path} is damaged or not a file of torch.save: {error}") from error
 
 

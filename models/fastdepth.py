@@ -9,6 +9,7 @@ The channel widths are data, because the published network is pruned to irregula
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,7 +18,9 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.onnx_weights import ConvLayer, read_conv_chain
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
@@ -105,7 +108,7 @@ class SeparableUnit(nn.Module):
         return self.pointwise(self.depthwise(x))
 
 
-class FastDepth(nn.Module):
+class FastDepth(DepthNetwork):
     """Monocular metric depth at 224 x 224 for small computers.
 
     ``preprocess`` makes its input: the centre crop of NYU's validation, RGB in [0, 1]. The weights are
@@ -186,6 +189,17 @@ class FastDepth(nn.Module):
         network = cls(FastDepthWidths(encoder, decoder), norm=not folded.pop())
         network._fill(layers, str(path))
         return network.eval()
+
+    def folded(self) -> FastDepth:
+        """A copy for inference with every batch norm folded into its convolution, in eval mode: the same
+        function up to rounding in about two thirds of the time on a CPU."""
+        network = FastDepth(self.widths, norm=False)
+        for (_, source), (_, target) in zip(self._units(), network._units(), strict=True):
+            conv, norm = source.conv, source.norm
+            if isinstance(norm, nn.BatchNorm2d):
+                conv = fuse_conv_bn_eval(copy.deepcopy(conv).eval(), copy.deepcopy(norm).eval())
+            target.conv.load_state_dict(conv.state_dict())
+        return network.to(self.head.conv.weight).eval()
 
     def _units(self) -> Iterator[tuple[str, ConvUnit]]:
         """The convolutions in the order of execution."""

@@ -6,17 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torch import nn
-
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import OutputSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
 
-def load_network(name: str, weights: str | Path | None = None, **options: Any) -> nn.Module:
+def load_network(name: str, weights: str | Path | None = None, **options: Any) -> DepthNetwork:
     """A depth network in eval mode, on the CPU.
-
-    The network has an attribute ``preprocess`` (a :class:`Preprocess`): ``network(network.preprocess(image,
-    K)[0])`` is a ``DepthPrediction``.
 
     Args:
         name: one of :func:`network_names`.
@@ -43,7 +39,7 @@ def network_names() -> tuple[str, ...]:
     return tuple(sorted(_BUILDERS))
 
 
-def _fastdepth(weights: Path) -> nn.Module:
+def _fastdepth(weights: Path) -> DepthNetwork:
     from ufmstar_torch.models.checkpoints import load_state_dict_file, load_weights
     from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
 
@@ -59,7 +55,7 @@ def _fastdepth(weights: Path) -> nn.Module:
     return network
 
 
-def _onnx(weights: Path, spec: Any = None, **options: Any) -> nn.Module:
+def _onnx(weights: Path, spec: Any = None, **options: Any) -> DepthNetwork:
     from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
 
     if spec is None:
@@ -74,13 +70,13 @@ def _onnx(weights: Path, spec: Any = None, **options: Any) -> nn.Module:
     return OnnxNetwork(weights, spec, **options)
 
 
-def _torchscript(weights: Path, spec: Any = None) -> nn.Module:
+def _torchscript(weights: Path, spec: Any = None) -> DepthNetwork:
     from ufmstar_torch.models.any_network import load_torchscript
 
     return load_torchscript(weights, *_declared(spec))
 
 
-def _exported(weights: Path, spec: Any = None) -> nn.Module:
+def _exported(weights: Path, spec: Any = None) -> DepthNetwork:
     from ufmstar_torch.models.any_network import load_exported
 
     return load_exported(weights, *_declared(spec))
@@ -99,7 +95,7 @@ def _declared(spec: Any) -> tuple[OutputSpec, Preprocess]:
     return OutputSpec.from_dict(values["outputs"]), Preprocess.from_dict(values.get("preprocess") or {})
 
 
-_BUILDERS: dict[str, Callable[..., nn.Module]] = {
+_BUILDERS: dict[str, Callable[..., DepthNetwork]] = {
     "exported": _exported,
     "fastdepth": _fastdepth,
     "onnx": _onnx,

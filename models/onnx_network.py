@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import OutputSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
@@ -116,7 +117,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
     return values
 
 
-class OnnxNetwork(nn.Module):
+class OnnxNetwork(DepthNetwork):
     """An ONNX depth network as a module; no gradients, and the computation runs where ONNX Runtime does.
 
     Args:
@@ -155,9 +156,9 @@ class OnnxNetwork(nn.Module):
         if name not in inputs or len(inputs) != 1:
             raise ValueError(f"{self.path}: input {name!r} must be the graph's only input; it has {list(inputs)}")
         self.input = name
-        self.type = inputs[name].type
-        if self.type not in _NUMPY_TYPES:
-            raise ValueError(f"{self.path}: input {name!r} is {self.type}, expected one of {list(_NUMPY_TYPES)}")
+        self.input_type = inputs[name].type
+        if self.input_type not in _NUMPY_TYPES:
+            raise ValueError(f"{self.path}: input {name!r} is {self.input_type}, expected one of {list(_NUMPY_TYPES)}")
         shape = [d if isinstance(d, int) and d > 0 else None for d in inputs[name].shape]
         channels, self.size = _channels_and_size(shape, self.spec.layout)
         if len(shape) != 4 or channels not in (3, None):
@@ -231,7 +232,7 @@ class OnnxNetwork(nn.Module):
             )
 
     def _run(self, array: np.ndarray[Any, Any]) -> list[Tensor]:
-        dtype = _NUMPY_TYPES[self.type]
+        dtype = _NUMPY_TYPES[self.input_type]
         if dtype is np.uint8:
             array = array.round().clip(0, 255)
         results = self.session.run(self.fetched, {self.input: array.astype(dtype, copy=False)})
@@ -261,9 +262,11 @@ def _session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSe
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = _ERRORS_ONLY
+    refusals = (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.InvalidArgument)
+    failures = (ort_errors.Fail, ort_errors.NotImplemented)
     try:
         return ort.InferenceSession(path, options, providers=list(providers))
-    except (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.Fail, ort_errors.NotImplemented) as error:
+    except (*refusals, *failures) as error:
         raise ValueError(f"{path} is not an ONNX file that ONNX Runtime can run: {error}") from error
 
 

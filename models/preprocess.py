@@ -13,7 +13,7 @@ mean over a depth edge is a place where nothing is.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -81,7 +81,7 @@ class Preprocess:
     def nyu(cls, size: tuple[int, int] = (224, 224), **changes: Any) -> Preprocess:
         """NYU Depth V2's validation as FastDepth uses it: height 250 (480 x 640 becomes 250 x 333), centre
         228 x 304, then ``size``. Portrait images are resized to width 304 instead."""
-        return cls(**{"resize_height": 250, "crop": (228, 304), "size": size, **changes})
+        return replace(cls(resize_height=250, crop=(228, 304), size=size), **changes)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Preprocess:
@@ -93,7 +93,8 @@ class Preprocess:
         known = {f.name for f in fields(cls)}
         if unknown := sorted(set(values) - known):
             raise ValueError(f"Preprocess has no {unknown}; it has {sorted(known)}")
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**plain)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain values."""

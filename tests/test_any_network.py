@@ -1,0 +1,220 @@
+"""Networks of one's own: wrapping, saved programs, loading by name."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from onnx_files import small_network, write_fastdepth
+from torch import Tensor, nn
+
+import ufmstar_torch.models
+from ufmstar_torch.models import (
+    FastDepth,
+    OutputSpec,
+    Preprocess,
+    load_network,
+    save_checkpoint,
+    wrap_network,
+)
+from ufmstar_torch.models.any_network import load_exported, load_torchscript
+from ufmstar_torch.models.load import network_names
+from ufmstar_torch.prediction import DepthPrediction
+
+METRIC = OutputSpec("metric")
+
+
+@pytest.fixture
+def image() -> Tensor:
+    return torch.rand(2, 3, 6, 8, generator=torch.Generator().manual_seed(0))
+
+
+class Sum(nn.Module):
+    """Depth = a learned multiple of the channels' sum."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.factor * x.sum(1, keepdim=True)
+
+
+@dataclass
+class Result:
+    predicted_depth: Tensor
+    name: str = "not a tensor"
+
+
+# --- wrapping ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("returned", "output"),
+    [
+        (lambda d: d, None),
+        (lambda d: d[:, None], None),
+        (lambda d: d[..., None], None),
+        (lambda d: {"depth": d, "other": -d}, "depth"),
+        (lambda d: {"only": d}, None),
+        (lambda d: (-d, d), 1),
+        (lambda d: [d], None),
+        (lambda d: Result(d), "predicted_depth"),
+        (lambda d: Result(d), None),
+        (lambda d: DepthPrediction(d), None),
+        (lambda d: d.to(torch.float64), None),
+    ],
+)
+def test_forms_of_depth(image: Tensor, returned: Any, output: str | int | None) -> None:
+    network = wrap_network(lambda x: returned(x.sum(1)), output)
+    torch.testing.assert_close(network(image).depth, image.sum(1), check_dtype=False)
+
+
+def test_units_and_variances(image: Tensor) -> None:
+    """Millimetres with a standard deviation in millimetres and a log-variance in log mm^2."""
+    network = wrap_network(
+        lambda x: {"d": x.sum(1), "s": x[:, 0], "l": x[:, :1]},
+        "d",
+        scale=0.001,
+        aleatoric="s",
+        aleatoric_kind="std",
+        epistemic="l",
+        epistemic_kind="log_variance",
+    )
+    got = network(image)
+    torch.testing.assert_close(got.depth, image.sum(1) * 1e-3)
+    torch.testing.assert_close(got.aleatoric_variance, image[:, 0] ** 2 * 1e-6)
+    torch.testing.assert_close(got.epistemic_variance, image[:, 0].exp() * 1e-6)
+
+
+def test_a_wrapped_module_stays_a_module(image: Tensor) -> None:
+    """Parameters, gradients, modes and state_dict pass through the wrapper."""
+    network = wrap_network(Sum(), preprocess=Preprocess(size=(6, 8)))
+    network(image).depth.sum().backward()
+    assert [name for name, _ in network.named_parameters()] == ["network.factor"]
+    factor = dict(network.named_parameters())["network.factor"]
+    assert factor.grad is not None
+    torch.testing.assert_close(factor.grad, image.sum())
+    assert network.preprocess.size == (6, 8)
+    assert all(not module.training for module in network.eval().modules())
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda d: (d, d), r"returns \[0, 1\]; declare which one is depth"),
+        (lambda d: {"a": d, "b": d}, r"returns \['a', 'b'\]; declare"),
+        (lambda d: d[:, :3], r"output 'depth' has \(3, 8\) px, expected the input's \(6, 8\)"),
+        (lambda d: d[0], r"must be \[B, 1, H, W\]"),
+        (lambda d: 3.0, "must return tensors or a DepthPrediction, got float"),
+        (lambda d: {}, r"returns \[\]; declare"),
+    ],
+)
+def test_returns_that_are_not_depth(image: Tensor, returned: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        wrap_network(lambda x: returned(x.sum(1)))(image)
+
+
+def test_refusals_of_the_wrapper(image: Tensor) -> None:
+    with pytest.raises(ValueError, match=r"declared 'inverse', but UfM\* needs metric depth"):
+        wrap_network(Sum(), inverse=True)
+    with pytest.raises(TypeError, match=r"nn.Module or a function, got str"):
+        wrap_network("weights.pth")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"no output 'metric'; it has \['depth'\]"):
+        wrap_network(Sum(), "metric")(image)
+
+
+# --- saved programs ----------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
+def test_torchscript(tmp_path: Path, image: Tensor) -> None:
+    torch.jit.save(torch.jit.trace(Sum(), image), str(tmp_path / "n.ts"))
+    expected = Sum()(image)[:, 0]
+    torch.testing.assert_close(load_torchscript(tmp_path / "n.ts", METRIC)(image).depth, expected)
+    network = load_network("torchscript", tmp_path / "n.ts", spec={"outputs": {"kind": "metric", "scale": 2}})
+    torch.testing.assert_close(network(image).depth, 2 * expected)
+    (tmp_path / "broken.ts").write_bytes((tmp_path / "n.ts").read_bytes()[:200])
+    with pytest.raises(ValueError, match=r"broken.ts is not a readable TorchScript file"):
+        load_torchscript(tmp_path / "broken.ts", METRIC)
+    with pytest.raises(FileNotFoundError, match="none"):
+        load_torchscript(tmp_path / "none", METRIC)
+
+
+def test_exported_program(tmp_path: Path, image: Tensor) -> None:
+    program = torch.export.export(nn.Sequential(Sum(), nn.Dropout(0.5)).eval(), (image,))
+    torch.export.save(program, str(tmp_path / "n.pt2"))
+    network = load_exported(tmp_path / "n.pt2", METRIC)
+    torch.testing.assert_close(network.eval()(image).depth, Sum()(image)[:, 0])
+    torch.testing.assert_close(network.train()(image).depth, Sum()(image)[:, 0])  # exported without dropout
+    spec = tmp_path / "spec.json"
+    spec.write_text(json.dumps({"outputs": {"kind": "metric"}, "preprocess": {"size": [6, 8]}}))
+    loaded = load_network("exported", tmp_path / "n.pt2", spec=spec)
+    assert loaded.preprocess == Preprocess(size=(6, 8))
+    (tmp_path / "broken.pt2").write_bytes((tmp_path / "n.pt2").read_bytes()[:200])
+    with pytest.raises(ValueError, match=r"broken.pt2 is not a readable torch.export file"):
+        load_exported(tmp_path / "broken.pt2", METRIC)
+
+
+# --- by name -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["onnx", "pth", "safetensors"])
+@pytest.mark.parametrize("folded", [False, True])
+def test_fastdepth_from_any_file(tmp_path: Path, suffix: str, folded: bool) -> None:
+    """The same network out of an ONNX export and out of our own checkpoints, of whatever widths."""
+    source = small_network().folded() if folded else small_network()
+    path = tmp_path / f"w.{suffix}"
+    if suffix == "onnx":
+        write_fastdepth(path, source)
+    else:
+        save_checkpoint(path, {f"module.{k}": v for k, v in source.state_dict().items()})
+    network = load_network("fastdepth", path)
+    assert isinstance(network, FastDepth)
+    assert network.widths == source.widths
+    assert not network.training
+    x = network.preprocess.apply_image(torch.rand(1, 3, 300, 400))
+    with torch.inference_mode():
+        assert torch.equal(network(x).depth, source(x).depth)
+
+
+def test_refusals_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"unknown network 'fast', expected one of \['exported', 'fastdepth'"):
+        load_network("fast", "w.pth")
+    with pytest.raises(ValueError, match="'fastdepth' needs weights"):
+        load_network("fastdepth")
+    with pytest.raises(TypeError, match="threads"):
+        load_network("fastdepth", "w.pth", threads=3)
+    torch.save({"a": torch.zeros(1)}, tmp_path / "w.pth")
+    with pytest.raises(ValueError, match=r"w.pth: not the weights of a FastDepth"):
+        load_network("fastdepth", tmp_path / "w.pth")
+    for name in ("onnx", "torchscript", "exported"):
+        with pytest.raises(ValueError, match="needs a spec"):
+            load_network(name, "n")
+    with pytest.raises(ValueError, match=r"'outputs' and, if needed, 'preprocess', got \['kind'\]"):
+        load_network("exported", "n", spec={"kind": "metric"})
+    assert network_names() == ("exported", "fastdepth", "onnx", "torchscript")
+
+
+def test_the_package_is_light_and_complete() -> None:
+    """Importing it loads no file of it, nor onnx, onnxruntime or safetensors; every name then resolves."""
+    code = (
+        "import sys, ufmstar_torch.models as m\n"
+        "heavy = {'onnx', 'onnxruntime', 'safetensors', 'torchvision'} & set(sys.modules)\n"
+        "own = [n for n in sys.modules if n.startswith('ufmstar_torch.models.')]\n"
+        "assert not heavy and not own, (heavy, own)\n"
+        "m.FastDepth, m.OnnxNetwork, m.load_network, m.wrap_network, m.save_checkpoint\n"
+        "heavy = {'onnx', 'onnxruntime', 'safetensors', 'torchvision'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    for name in dir(ufmstar_torch.models):
+        assert getattr(ufmstar_torch.models, name).__name__ == name
+    with pytest.raises(AttributeError, match="no attribute 'FastDeath'"):
+        _ = ufmstar_torch.models.FastDeath

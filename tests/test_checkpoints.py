@@ -1,0 +1,292 @@
+"""Weights in files: round trips, prefixes, strictness, damage, and writing that cannot half happen."""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.torch import load_file
+from shared_data import require_shared
+from torch import Tensor, nn
+
+from ufmstar_torch.models import checkpoints
+from ufmstar_torch.models.checkpoints import (
+    CheckpointError,
+    load_state_dict_file,
+    load_weights,
+    save_checkpoint,
+)
+
+FORMATS = ["w.pth", "w.pt", "w.safetensors"]
+
+
+class Small(nn.Module):
+    """Some parameters, a buffer and an integer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(3, 2, 3)
+        self.norm = nn.BatchNorm2d(2)
+
+
+class Nested(nn.Module):
+    """A network with a part of the name that is usually a wrapper's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.model = Small()
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return set(a) == set(b) and all(torch.equal(a[k], b[k]) and a[k].dtype == b[k].dtype for k in a)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_round_trip(tmp_path: Path, name: str) -> None:
+    source, target = Small(), Small()
+    source.norm.num_batches_tracked.add_(7)  # type: ignore[union-attr]
+    save_checkpoint(tmp_path / name, source, {"widths": [3, 2]})
+    assert same(load_state_dict_file(tmp_path / name), source.state_dict())
+    load_weights(target, tmp_path / name)
+    assert same(target.state_dict(), source.state_dict())
+    assert [p.name for p in tmp_path.iterdir()] == [name]  # nothing temporary stays
+
+
+def test_metadata_stays_beside_the_weights(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "w.pth", Small(), {"widths": [3, 2]})
+    content = torch.load(tmp_path / "w.pth", weights_only=True)
+    assert content["metadata"] == {"widths": [3, 2]}
+    from safetensors import safe_open
+
+    save_checkpoint(tmp_path / "w.safetensors", Small(), {"widths": [3, 2]})
+    with safe_open(tmp_path / "w.safetensors", "pt") as file:
+        assert file.metadata() == {"metadata": '{"widths": [3, 2]}'}
+
+
+def test_tensors_that_share_memory(tmp_path: Path) -> None:
+    """Tied weights, transposed and expanded views are written as they read."""
+    base = torch.arange(6.0).reshape(2, 3)
+    state = {"a": base, "b": base, "t": base.mT, "e": base[:1].expand(4, 3)}
+    for name in FORMATS:
+        save_checkpoint(tmp_path / name, state)
+        assert same(load_state_dict_file(tmp_path / name), state)
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda s: s,
+        lambda s: {"state_dict": s, "epoch": 3},
+        lambda s: {"model": s, "optimizer": {"lr": 1.0}},
+        lambda s: {"model_state_dict": s},
+        lambda s: {f"module.{k}": v for k, v in s.items()},
+        lambda s: {"state_dict": {f"model.module.{k}": v for k, v in s.items()}},
+        lambda s: {f"_orig_mod.{k}": v for k, v in s.items()},
+        lambda s: {f"state_dict.{k}": v for k, v in s.items()},
+    ],
+    ids=["plain", "state_dict", "model", "model_state_dict", "ddp", "lightning", "compiled", "prefix"],
+)
+def test_what_wrappers_add_is_taken_off(tmp_path: Path, wrap: Callable[[dict[str, Tensor]], Any]) -> None:
+    source, target = Small(), Small()
+    torch.save(wrap(dict(source.state_dict())), tmp_path / "w.pth")
+    assert same(load_state_dict_file(tmp_path / "w.pth"), source.state_dict())
+    load_weights(target, tmp_path / "w.pth")
+    assert same(target.state_dict(), source.state_dict())
+
+
+def test_a_part_called_model_keeps_its_name(tmp_path: Path) -> None:
+    source, target = Nested(), Nested()
+    torch.save({f"module.{k}": v for k, v in source.state_dict().items()}, tmp_path / "w.pth")
+    load_weights(target, tmp_path / "w.pth")
+    assert same(target.state_dict(), source.state_dict())
+
+
+def test_half_precision_fills_a_float32_network(tmp_path: Path) -> None:
+    source, target = Small().half(), Small()
+    save_checkpoint(tmp_path / "w.safetensors", source)
+    assert load_state_dict_file(tmp_path / "w.safetensors")["conv.weight"].dtype == torch.float16
+    load_weights(target, tmp_path / "w.safetensors")
+    assert target.conv.weight.dtype == torch.float32
+    assert torch.equal(target.conv.weight, source.conv.weight.float())
+
+
+def test_everything_that_does_not_fit_is_named_and_nothing_is_loaded(tmp_path: Path) -> None:
+    state = dict(Small().state_dict())
+    del state["conv.bias"]
+    state["head.weight"] = torch.zeros(1)
+    state["norm.weight"] = torch.zeros(5)
+    torch.save(state, tmp_path / "w.pth")
+    target = Small()
+    before = {k: v.clone() for k, v in target.state_dict().items()}
+    with pytest.raises(CheckpointError) as error:
+        load_weights(target, tmp_path / "w.pth")
+    text = str(error.value)
+    assert "w.pth does not fit Small (7 keys)" in text
+    assert "1 missing: conv.bias" in text
+    assert "1 unexpected: head.weight" in text
+    assert "1 of another shape: norm.weight is (5,), expected (2,)" in text
+    assert same(target.state_dict(), before)
+
+
+def test_weights_that_are_not_finite(tmp_path: Path) -> None:
+    state = {k: v.clone() for k, v in Small().state_dict().items()}
+    state["conv.bias"][1] = float("nan")
+    save_checkpoint(tmp_path / "w.pth", state)
+    with pytest.raises(CheckpointError, match=r"w.pth does not fit .*1 with NaN or infinity: conv.bias"):
+        load_weights(Small(), tmp_path / "w.pth")
+
+
+def test_long_lists_of_keys_are_shortened(tmp_path: Path) -> None:
+    torch.save({f"k{i:02}": torch.zeros(1) for i in range(30)}, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"30 unexpected: k00, .*k07, \.\.\. \(22 more\)"):
+        load_weights(Small(), tmp_path / "w.pth")
+
+
+# --- damage ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@given(data=st.data())
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_cut_off_files_are_named(tmp_path: Path, name: str, data: st.DataObject) -> None:
+    """Wherever a file ends early, the error is ours and says which file."""
+    save_checkpoint(tmp_path / name, Small())
+    whole = (tmp_path / name).read_bytes()
+    broken = tmp_path / f"broken_{name}"
+    broken.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1), label="bytes kept")])
+    with pytest.raises(CheckpointError, match=f"broken_{name}"):
+        load_state_dict_file(broken)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@given(content=st.binary(max_size=300))
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_arbitrary_bytes_are_named(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(CheckpointError, match=name):
+        load_state_dict_file(tmp_path / name)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")
+@given(place=st.integers(0, 2000), value=st.integers(0, 255), kept=st.integers(16, 3000))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_damage_to_the_format_of_old_releases(tmp_path: Path, place: int, value: int, kept: int) -> None:
+    """Files from before torch 1.6 are one pickle; damaged ones load with other values or name the file."""
+    path = tmp_path / "old.pth"
+    torch.save(Small().state_dict(), path, _use_new_zipfile_serialization=False)
+    content = bytearray(path.read_bytes())
+    content[place % len(content)] = value
+    path.write_bytes(content[:kept])
+    message = ""
+    try:
+        load_state_dict_file(path)
+    except CheckpointError as error:
+        message = str(error)
+    assert not message or "old.pth" in message
+
+
+def test_the_format_of_old_releases(tmp_path: Path) -> None:
+    source = Small()
+    torch.save(source.state_dict(), tmp_path / "old.pth", _use_new_zipfile_serialization=False)
+    assert same(load_state_dict_file(tmp_path / "old.pth"), source.state_dict())
+
+
+class Malice:
+    """Unpickling it would run code."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (os.environ["UFMSTAR_TEST_TRAP"],)
+
+
+def test_pickled_objects_are_refused_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trap = tmp_path / "trap"
+    monkeypatch.setenv("UFMSTAR_TEST_TRAP", str(trap))
+    torch.save({"state_dict": Malice()}, tmp_path / "evil.pth")
+    torch.save(nn.Linear(2, 2), tmp_path / "module.pth.tar")
+    for name in ("evil.pth", "module.pth.tar"):
+        with pytest.raises(CheckpointError, match=f"{name} .*pickled Python objects"):
+            load_state_dict_file(tmp_path / name)
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({}, "holds no weights but dict"),
+        ([1, 2], "holds no weights but list"),
+        (torch.zeros(3), "holds no weights but Tensor"),
+        ({"a": torch.zeros(1), "epoch": 3}, "more than named tensors: epoch"),
+        ({3: torch.zeros(1)}, "more than named tensors: 3"),
+    ],
+)
+def test_files_of_something_else(tmp_path: Path, content: object, message: str) -> None:
+    torch.save(content, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=message):
+        load_state_dict_file(tmp_path / "w.pth")
+
+
+def test_missing_files_and_unknown_suffixes(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"none\.pth"):
+        load_state_dict_file(tmp_path / "none.pth")
+    (tmp_path / "w.h5").write_bytes(b"x")
+    with pytest.raises(CheckpointError, match=r"w\.h5 must end in \.safetensors or one of \.pth"):
+        load_state_dict_file(tmp_path / "w.h5")
+    with pytest.raises(CheckpointError, match=r"w\.npz must end in"):
+        save_checkpoint(tmp_path / "w.npz", Small())
+    assert not (tmp_path / "w.npz").exists()
+
+
+def test_missing_safetensors_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(tmp_path / "w.safetensors", Small())
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    with pytest.raises(ModuleNotFoundError, match="needs the package safetensors"):
+        load_state_dict_file(tmp_path / "w.safetensors")
+
+
+# --- writing -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk fills up at the last moment: the old weights are still there, and nothing else."""
+    old = Small()
+    save_checkpoint(tmp_path / name, old)
+
+    def full_disk(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoints.os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(tmp_path / name, Small())
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert same(load_state_dict_file(tmp_path / name), old.state_dict())
+
+
+def test_written_files_are_as_readable_as_others(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "w.pth", Small())
+    (tmp_path / "other").write_bytes(b"")
+    assert stat.S_IMODE((tmp_path / "w.pth").stat().st_mode) == stat.S_IMODE((tmp_path / "other").stat().st_mode)
+
+
+def test_weights_that_others_trained() -> None:
+    """ResNet50 in half precision, with torchvision's names, without its classifier."""
+    state = load_state_dict_file(require_shared("weights/resnet50_v1_imagenet_fp16_nofc.pth"))
+    assert state["conv1.weight"].shape == (64, 3, 7, 7)
+    assert state["layer4.2.conv3.weight"].shape == (2048, 512, 1, 1)
+    assert not any(key.startswith("fc.") for key in state)
+
+
+def test_other_programs_read_what_is_written(tmp_path: Path) -> None:
+    source = Small()
+    save_checkpoint(tmp_path / "w.safetensors", source)
+    assert same(load_file(tmp_path / "w.safetensors"), source.state_dict())
+    save_checkpoint(tmp_path / "w.pth", source)
+    assert same(torch.load(tmp_path / "w.pth", weights_only=True)["state_dict"], source.state_dict())

@@ -1,0 +1,318 @@
+"""FastDepth: the paper's sizes, agreement with ONNX Runtime, what the import refuses, fine-tuning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import helper, numpy_helper
+from onnx_files import Edit, edited, run_onnx, small_network, write_fastdepth
+from PIL import Image
+from shared_data import require_shared
+from torch import Tensor, nn
+
+from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
+
+WEIGHTS = "weights/fastdepth_nyu.onnx"
+TUM = "data/rgbd_dataset_freiburg1_xyz"
+
+
+@pytest.fixture(scope="module")
+def network() -> FastDepth:
+    return FastDepth.from_onnx(require_shared(WEIGHTS))
+
+
+def tum_frames(step: int) -> list[tuple[Tensor, Tensor]]:
+    """Every step-th frame: image [1, 3, 480, 640] uint8, depth [1, 480, 640] [m], 0 = none."""
+    root = require_shared(TUM)
+    depth_files = sorted((root / "depth").glob("*.png"))
+    times = np.array([float(f.stem) for f in depth_files])
+    frames = []
+    for file in sorted((root / "rgb").glob("*.png"))[::step]:
+        nearest = depth_files[int(np.abs(times - float(file.stem)).argmin())]
+        image = np.array(Image.open(file))
+        depth = np.array(Image.open(nearest)).astype(np.float32) / 5000
+        frames.append((torch.from_numpy(image).permute(2, 0, 1)[None], torch.from_numpy(depth)[None]))
+    return frames
+
+
+# --- sizes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("widths", "weights", "macs"),
+    [(FastDepthWidths.full(), 3.93e6, 0.74e9), (FastDepthWidths.pruned(), 1.34e6, 0.37e9)],
+    ids=["full", "pruned"],
+)
+def test_weights_and_operations_are_the_papers(widths: FastDepthWidths, weights: float, macs: float) -> None:
+    """Wofk et al. state 3.93 M weights and 0.74 G multiply-adds, pruned 1.34 M and 0.37 G, at 224 x 224."""
+    network = FastDepth(widths).eval()
+    counted = {"weights": 0, "macs": 0}
+
+    def count(module: nn.Module, _: object, output: Tensor) -> None:
+        assert isinstance(module, nn.Conv2d)
+        counted["weights"] += module.weight.numel()
+        counted["macs"] += output.numel() * module.weight[0].numel()
+
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            module.register_forward_hook(count)
+    with torch.inference_mode():
+        assert network(torch.rand(1, 3, 224, 224)).depth.shape == (1, 224, 224)
+    assert counted["weights"] == pytest.approx(weights, rel=0.003)
+    assert counted["macs"] == pytest.approx(macs, rel=0.01)
+
+
+def test_widths_that_cannot_be_added_are_refused() -> None:
+    full = FastDepthWidths.full()
+    with pytest.raises(ValueError, match=r"decoder\[1\] = 255 must equal encoder\[5\] = 256"):
+        FastDepthWidths(full.encoder, (512, 255, 128, 64, 32))
+    with pytest.raises(ValueError, match="encoder must be 14"):
+        FastDepthWidths(full.encoder[1:], full.decoder)
+    with pytest.raises(ValueError, match="decoder must be 5 positive"):
+        FastDepthWidths(full.encoder, (512, 256, 128, 64, 0))
+
+
+def test_widths_of_a_state_dict() -> None:
+    network = small_network()
+    assert FastDepthWidths.of_state_dict(network.state_dict()) == network.widths
+    with pytest.raises(ValueError, match=r"no 'decoder.4.pointwise.conv.weight' \(1 such"):
+        FastDepthWidths.of_state_dict({k: v for k, v in network.state_dict().items() if "decoder.4" not in k})
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 240, 320), (1, 3, 224, 230), (1, 3, 0, 32)])
+def test_size_must_be_a_multiple_of_32(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="multiples of 32"):
+        small_network()(torch.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    "image", [torch.zeros(1, 1, 64, 64), torch.zeros(3, 64, 64), torch.zeros(1, 3, 64, 64, dtype=torch.uint8)]
+)
+def test_image_shape_and_type(image: Tensor) -> None:
+    with pytest.raises(ValueError, match=r"image must be floating-point \[B, 3, H, W\]"):
+        small_network()(image)
+
+
+# --- agreement with ONNX Runtime ---------------------------------------------------------------------
+
+
+def test_published_weights_agree_with_onnx_runtime(network: FastDepth) -> None:
+    """1e-4 m is required; observed 9e-7 m on noise and 8e-6 m on photographs (of 1.5 m)."""
+    assert network.widths == FastDepthWidths.pruned()
+    noise = torch.rand(2, 3, 224, 224, generator=torch.Generator().manual_seed(0))
+    photographs = torch.cat([network.preprocess.apply_image(image) for image, _ in tum_frames(8)])
+    image = torch.cat([noise, photographs])
+    with torch.inference_mode():
+        depth = network(image).depth
+    expected = run_onnx(require_shared(WEIGHTS), image)[:, 0]
+    assert float(depth.std()) > 0.1  # not a constant that agrees by itself
+    torch.testing.assert_close(depth, expected, rtol=0, atol=2e-5)
+
+
+def test_published_weights_are_all_taken(network: FastDepth) -> None:
+    """As many tensors in the file as in the state_dict, with the same sum of absolute values."""
+    initialisers = onnx.load(str(require_shared(WEIGHTS))).graph.initializer
+    state = network.state_dict()
+    assert len(initialisers) == len(state) == 38 * 6
+    total = sum(float(np.abs(numpy_helper.to_array(t).astype(np.float64)).sum()) for t in initialisers)
+    assert sum(float(v.double().abs().sum()) for v in state.values()) == pytest.approx(total, rel=1e-12)
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_import_of_other_widths_and_folded_norms(tmp_path: Path, folded: bool) -> None:
+    """A graph of a newer opset, any widths, batch norms kept or folded, comes back as the same function."""
+    source = small_network()
+    source = source.folded() if folded else source
+    path = write_fastdepth(tmp_path / "small.onnx", source)
+    loaded = FastDepth.from_onnx(path)
+    assert loaded.widths == source.widths
+    assert not loaded.training
+    assert any(isinstance(m, nn.BatchNorm2d) for m in loaded.modules()) is not folded
+    for key, value in loaded.state_dict().items():  # the graph has no counters, which start again
+        assert torch.equal(value, source.state_dict()[key] * (not key.endswith("num_batches_tracked"))), key
+    image = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        depth = loaded(image).depth
+    assert float(depth.std()) > 0.5
+    # Untrained layers amplify rounding: torch's own float32 and float64 differ by 1e-4 here.
+    torch.testing.assert_close(depth, run_onnx(path, image)[:, 0], rtol=0, atol=2e-3)
+
+
+def test_folding_keeps_the_function(network: FastDepth) -> None:
+    image = network.preprocess.apply_image(tum_frames(20)[0][0])
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    with torch.inference_mode():
+        torch.testing.assert_close(network.folded()(image).depth, network(image).depth, rtol=0, atol=2e-5)
+    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
+
+
+# --- what is not a FastDepth -------------------------------------------------------------------------
+
+
+def node(model: onnx.ModelProto, kind: str, index: int) -> onnx.NodeProto:
+    return [n for n in model.graph.node if n.op_type == kind][index]
+
+
+def drop_weights(model: onnx.ModelProto, names: list[str]) -> None:
+    kept = [t for t in model.graph.initializer if t.name not in names]
+    del model.graph.initializer[:]
+    model.graph.initializer.extend(kept)
+
+
+def other_stride(model: onnx.ModelProto) -> None:
+    stem = node(model, "Conv", 0)
+    next(a for a in stem.attribute if a.name == "strides").ints[:] = [1, 1]
+
+
+def other_activation(model: onnx.ModelProto) -> None:
+    node(model, "Relu", 2).op_type = "Sigmoid"
+
+
+def relu_for_relu6(model: onnx.ModelProto) -> None:
+    clip = node(model, "Clip", 3)
+    clip.op_type = "Relu"
+    bounds = list(clip.input[1:])
+    del clip.input[1:]
+    drop_weights(model, bounds)
+
+
+def other_clip(model: onnx.ModelProto) -> None:
+    six = next(t for t in model.graph.initializer if t.name == "encoder.1.depthwise/6")
+    six.CopyFrom(numpy_helper.from_array(np.array(5, np.float32), six.name))
+
+
+def swapped_skips(model: onnx.ModelProto) -> None:
+    node(model, "Add", 1).input[0] = "encoder.2.pointwise"
+
+
+def no_skip(model: onnx.ModelProto) -> None:
+    add = node(model, "Add", 0)
+    for n in model.graph.node:
+        n.input[:] = [add.input[1] if name == add.output[0] else name for name in n.input]
+    model.graph.node.remove(add)
+
+
+def linear_upsampling(model: onnx.ModelProto) -> None:
+    next(a for a in node(model, "Resize", 0).attribute if a.name == "mode").s = b"linear"
+
+
+def threefold_upsampling(model: onnx.ModelProto) -> None:
+    scales = next(t for t in model.graph.initializer if t.name == "scales0")
+    scales.CopyFrom(numpy_helper.from_array(np.array([1, 1, 3, 3], np.float32), scales.name))
+
+
+def leftover_weight(model: onnx.ModelProto) -> None:
+    model.graph.initializer.append(numpy_helper.from_array(np.ones(5, np.float32), "left_over"))
+
+
+def truncated_chain(model: onnx.ModelProto) -> None:
+    model.graph.output[0].name = model.graph.node[-2].output[0]
+
+
+def norm_after_some(model: onnx.ModelProto) -> None:
+    norm = node(model, "BatchNormalization", 4)
+    for n in model.graph.node:
+        n.input[:] = [norm.input[0] if name == norm.output[0] else name for name in n.input]
+    model.graph.node.remove(norm)
+    drop_weights(model, list(norm.input[1:]))
+
+
+def second_input(model: onnx.ModelProto) -> None:
+    model.graph.input.append(helper.make_tensor_value_info("pose", onnx.TensorProto.FLOAT, [4, 4]))
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (other_stride, "convolution for encoder.0 has stride 1, expected 2"),
+        (other_activation, r"\(Sigmoid\) does not fit"),
+        (relu_for_relu6, "activation relu, expected relu6"),
+        (other_clip, r"expected a clip to \[0, 6\].*got \[0.0, 5.0\]"),
+        (swapped_skips, "decoder.2.pointwise has skip 4, expected 6"),
+        (no_skip, "decoder.1.pointwise has skip None, expected 10"),
+        (linear_upsampling, "expected every pixel repeated twice"),
+        (threefold_upsampling, r"repeated twice, got scales \[1.0, 1.0, 3.0, 3.0\]"),
+        (leftover_weight, r"initialiser 'left_over' \(5,\) is used by no layer"),
+        (truncated_chain, "not in the graph's output"),
+        (norm_after_some, "batch norm after some convolutions only"),
+        (second_input, "must have one input"),
+    ],
+)
+def test_other_graphs_are_refused(tmp_path: Path, edit: Edit, message: str) -> None:
+    good = write_fastdepth(tmp_path / "good.onnx", small_network())
+    with pytest.raises(ValueError, match=message):
+        FastDepth.from_onnx(edited(good, tmp_path / "edited.onnx", edit))
+
+
+def test_other_number_of_convolutions(tmp_path: Path) -> None:
+    def without_last(model: onnx.ModelProto) -> None:
+        del model.graph.node[-3:]
+        model.graph.output[0].name = model.graph.node[-1].output[0]
+        drop_weights(model, [t.name for t in model.graph.initializer if t.name.startswith("head")])
+
+    good = write_fastdepth(tmp_path / "good.onnx", small_network())
+    with pytest.raises(ValueError, match=r"edited.onnx is not a FastDepth: expected 38 convolutions, got 37"):
+        FastDepth.from_onnx(edited(good, tmp_path / "edited.onnx", without_last))
+
+
+@pytest.mark.parametrize("kept", [0, 1, 100, 0.5, 0.999])
+def test_cut_off_files_are_named(tmp_path: Path, kept: float) -> None:
+    good = write_fastdepth(tmp_path / "good.onnx", small_network()).read_bytes()
+    broken = tmp_path / "broken.onnx"
+    broken.write_bytes(good[: int(kept * len(good)) if isinstance(kept, float) else kept])
+    with pytest.raises(ValueError, match=r"broken\.onnx"):
+        FastDepth.from_onnx(broken)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"none\.onnx"):
+        FastDepth.from_onnx(tmp_path / "none.onnx")
+
+
+# --- real frames and training ------------------------------------------------------------------------
+
+
+def test_depth_of_real_frames(network: FastDepth) -> None:
+    """Out of distribution, but not wrong: over fr1/xyz the median frame has delta1 .48, .37 after a stretch
+    instead of the crop, .30 with red and blue exchanged."""
+    scores = []
+    with torch.inference_mode():
+        for image, truth in tum_frames(4):
+            depth = network(network.preprocess.apply_image(image)).depth
+            target = network.preprocess.apply_depth(truth)
+            right = (depth - target).abs() <= 0.25 * target
+            scores.append(float(right[target > 0].float().mean()))
+    assert 0.4 < float(np.median(scores)) < 0.7
+
+
+def test_fine_tuning_reaches_every_parameter() -> None:
+    """Imported or not, the network trains: gradients everywhere, norms that learn, a loss that falls."""
+    torch.manual_seed(0)
+    network = small_network().train()
+    image, target = torch.rand(4, 3, 64, 64), torch.full((4, 64, 64), 2.0)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
+    counter = next(m for m in network.modules() if isinstance(m, nn.BatchNorm2d)).num_batches_tracked
+    losses = []
+    for _ in range(8):
+        loss = (network(image).depth - target).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        losses.append(loss.item())
+        optimizer.step()
+    silent = [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert silent == []
+    assert losses[-1] < 0.9 * losses[0]
+    assert counter is not None
+    assert int(counter) == 9  # one of them from small_network
+
+
+def test_fine_tuning_of_imported_weights(network: FastDepth) -> None:
+    """The counters and statistics of the published training are there, and go on from there."""
+    norms = [m for m in network.modules() if isinstance(m, nn.BatchNorm2d)]
+    assert len(norms) == 38
+    assert all(int(m.num_batches_tracked) > 50_000 for m in norms if m.num_batches_tracked is not None)
+    assert all(p.requires_grad for p in network.parameters())

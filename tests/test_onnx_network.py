@@ -1,0 +1,285 @@
+"""The ONNX adapter: tiny graphs with known answers, layouts, units, batches, and every refusal."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from onnx_files import save
+from shared_data import require_shared
+from torch import Tensor
+
+from ufmstar_torch.models.fastdepth import FastDepth
+from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
+from ufmstar_torch.models.outputs import OutputSpec
+from ufmstar_torch.models.preprocess import Preprocess
+
+METRIC = OutputSpec("metric")
+COEFFICIENTS = (0.5, 0.25, 2.0)  # depth = .5 R + .25 G + 2 B
+
+
+def depth_of(image: Tensor) -> Tensor:
+    """[B, H, W] what the tiny graphs compute from an RGB image [B, 3, H, W]."""
+    return (image * image.new_tensor(COEFFICIENTS)[:, None, None]).sum(1)
+
+
+def write(
+    path: Path,
+    shape: list[int | str] | None = None,
+    *,
+    coefficients: tuple[float, ...] = COEFFICIENTS,
+    nhwc: bool = False,
+    kind: int = TensorProto.FLOAT,
+    spread: str | None = None,
+    declared: list[int | str] | None = None,
+) -> Path:
+    """depth = a weighted sum of channels, as a 1x1 convolution; ``spread`` adds an output of R - 1."""
+    kernel = np.array([coefficients], np.float32)[:, :, None, None]
+    weights = [numpy_helper.from_array(kernel, "kernel")]
+    nodes, x = [], "image"
+    if kind != TensorProto.FLOAT:
+        nodes.append(helper.make_node("Cast", [x], ["as_float"], to=TensorProto.FLOAT))
+        x = "as_float"
+    if nhwc:
+        nodes.append(helper.make_node("Transpose", [x], ["nchw"], perm=[0, 3, 1, 2]))
+        x = "nchw"
+    nodes.append(helper.make_node("Conv", [x, "kernel"], ["depth" if not nhwc else "d"]))
+    if nhwc:
+        nodes.append(helper.make_node("Transpose", ["d"], ["depth"], perm=[0, 2, 3, 1]))
+    outputs: list[tuple[str, list[int | str] | None]] = [("depth", None)]
+    if spread:
+        red = np.array([[1, 0, 0]], np.float32)[:, :, None, None]
+        weights += [numpy_helper.from_array(red, "red"), numpy_helper.from_array(np.array(1, np.float32), "one")]
+        nodes.append(helper.make_node("Conv", [x, "red"], ["r"]))
+        nodes.append(helper.make_node("Sub", ["r", "one"], [spread]))
+        outputs.append((spread, None))
+    shape = shape or (["n", "h", "w", 3] if nhwc else ["n", 3, "h", "w"])
+    return save(path, nodes, weights, [("image", shape)], outputs, types=[kind])
+
+
+@pytest.fixture
+def image() -> Tensor:
+    return torch.rand(3, 3, 6, 8, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("shape", [["n", 3, "h", "w"], [1, 3, 6, 8], [3, 3, 6, 8], ["n", 3, 6, 8]], ids=str)
+def test_depth_of_every_image_in_the_batch(tmp_path: Path, image: Tensor, shape: list[int | str]) -> None:
+    """Fixed batches of 1 and 3 and free ones give the same maps."""
+    network = OnnxNetwork(write(tmp_path / "n.onnx", shape), OnnxSpec(METRIC), threads=1)
+    torch.testing.assert_close(network(image).depth, depth_of(image))
+    assert network(image).aleatoric_variance is None
+
+
+def test_layout_channels_and_scale(tmp_path: Path, image: Tensor) -> None:
+    """NHWC, and a graph that wants blue first, in millimetres."""
+    path = write(tmp_path / "n.onnx", nhwc=True, coefficients=COEFFICIENTS[::-1])
+    spec = OnnxSpec(OutputSpec("metric", scale=0.001), layout="NHWC", channels="bgr")
+    torch.testing.assert_close(OnnxNetwork(path, spec)(image).depth, depth_of(image) / 1000)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value_range", "tolerance"),
+    [(TensorProto.FLOAT16, 1.0, 2e-3), (TensorProto.DOUBLE, 1.0, 1e-6), (TensorProto.UINT8, 255.0, 2.75 * 0.5)],
+    ids=["half", "double", "bytes"],
+)
+def test_input_types(tmp_path: Path, image: Tensor, kind: int, value_range: float, tolerance: float) -> None:
+    """The graph's own input type is served; bytes are rounded, by at most half of one each."""
+    spec = OnnxSpec(METRIC, Preprocess(value_range=value_range))
+    network = OnnxNetwork(write(tmp_path / "n.onnx", kind=kind), spec)
+    x = network.preprocess.apply_image(image)
+    torch.testing.assert_close(network(x).depth, depth_of(image) * value_range, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("kind", ["variance", "std", "log_variance"])
+def test_variances_in_square_metres(tmp_path: Path, image: Tensor, kind: str) -> None:
+    """A spread in the depth's own unit becomes m^2, whatever form it has."""
+    path = write(tmp_path / "n.onnx", spread="spread")
+    outputs = OutputSpec("metric", "depth", 0.5, aleatoric="spread", aleatoric_kind=kind)
+    got = OnnxNetwork(path, OnnxSpec(outputs))(image).aleatoric_variance
+    raw = image[:, 0] - 1
+    expected = {"variance": raw, "std": raw**2, "log_variance": raw.exp()}[kind] / 4
+    torch.testing.assert_close(got, expected)
+    other = OutputSpec("metric", "depth", 0.5, epistemic="spread", epistemic_kind=kind)
+    torch.testing.assert_close(OnnxNetwork(path, OnnxSpec(other))(image).epistemic_variance, expected)
+
+
+def test_a_fixed_size_becomes_the_preprocessing(tmp_path: Path) -> None:
+    """What the graph states need not be declared; what contradicts it is refused."""
+    path = write(tmp_path / "n.onnx", ["n", 3, 6, 8])
+    assert OnnxNetwork(path, OnnxSpec(METRIC)).preprocess == Preprocess(size=(6, 8))
+    cropped = Preprocess(resize_height=20, crop=(12, 16))
+    network = OnnxNetwork(path, OnnxSpec(METRIC, cropped))
+    assert network.preprocess == Preprocess(resize_height=20, crop=(12, 16), size=(6, 8))
+    x, _ = network.preprocess(torch.rand(1, 3, 48, 64), torch.eye(3)[None])
+    assert network(x).depth.shape == (1, 6, 8)
+    with pytest.raises(ValueError, match=r"input 'image' has a fixed size of 6 x 8 px, but .* is \(8, 8\)"):
+        OnnxNetwork(path, OnnxSpec(METRIC, Preprocess(size=(8, 8))))
+
+
+def test_fastdepth_through_the_adapter() -> None:
+    """The published file, declared in JSON's terms, gives what the network in torch gives."""
+    path = require_shared("weights/fastdepth_nyu.onnx")
+    values = {"preprocess": {"resize_height": 250, "crop": [228, 304]}, "outputs": {"kind": "metric"}}
+    adapter, network = OnnxNetwork(path, OnnxSpec.from_dict(values), threads=1), FastDepth.from_onnx(path)
+    assert adapter.preprocess == network.preprocess
+    image = torch.randint(0, 256, (2, 3, 360, 540), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    x = network.preprocess.apply_image(image)
+    with torch.inference_mode():
+        torch.testing.assert_close(adapter(x).depth, network(x).depth, rtol=0, atol=2e-5)
+
+
+def test_copies_and_pickles(tmp_path: Path, image: Tensor) -> None:
+    """A session cannot be copied, so a copy opens its own."""
+    network = OnnxNetwork(write(tmp_path / "n.onnx"), OnnxSpec(METRIC), threads=1)
+    for twin in (copy.deepcopy(network), pickle.loads(pickle.dumps(network))):
+        assert twin.session is not network.session
+        assert torch.equal(twin(image).depth, network(image).depth)
+        assert twin.preprocess == network.preprocess
+
+
+# --- refusals ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["inverse", "disparity", "relative", "affine"])
+def test_depth_that_is_not_metric_is_refused(kind: str) -> None:
+    with pytest.raises(ValueError, match=f"declared '{kind}', but UfM\\* needs metric depth"):
+        OnnxSpec.from_dict({"outputs": {"kind": kind}})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({}, "must declare its outputs"),
+        ({"outputs": {}}, "must declare their 'kind'"),
+        ({"outputs": {"kind": "meters"}}, "kind must be 'metric'"),
+        ({"outputs": {"kind": "metric", "unit": "mm"}}, r"no \['unit'\]"),
+        ({"outputs": {"kind": "metric", "scale": 0}}, "scale must be positive"),
+        ({"outputs": {"kind": "metric", "aleatoric_kind": "sigma"}}, "aleatoric_kind must be one of"),
+        ({"outputs": {"kind": "metric"}, "inputs": "x"}, r"no \['inputs'\]"),
+        ({"outputs": {"kind": "metric"}, "layout": "CHW"}, "layout must be"),
+        ({"outputs": {"kind": "metric"}, "channels": "gray"}, "channels must be"),
+        ({"outputs": {"kind": "metric", "depth": 0}}, "must name ONNX outputs, got position 0"),
+        ({"outputs": {"kind": "metric"}, "preprocess": {"resize": 3}}, r"Preprocess has no \['resize'\]"),
+    ],
+)
+def test_wrong_specs(tmp_path: Path, values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        OnnxSpec.from_dict(values)
+    file = tmp_path / "spec.json"
+    file.write_text(json.dumps(values))
+    with pytest.raises(ValueError, match=f"spec.json: .*{message}"):
+        OnnxSpec.from_json(file)
+
+
+@pytest.mark.parametrize(("text", "message"), [("{", "is not JSON"), ("[1]", "JSON object, got list")])
+def test_broken_spec_files(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "spec.json"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=f"spec.json .*{message}"):
+        OnnxSpec.from_json(file)
+
+
+def test_names_that_the_graph_does_not_have(tmp_path: Path) -> None:
+    path = write(tmp_path / "n.onnx", spread="spread")
+    with pytest.raises(ValueError, match=r"outputs are \['depth', 'spread'\]; declare which one is depth"):
+        OnnxNetwork(path, OnnxSpec(METRIC))
+    with pytest.raises(ValueError, match=r"outputs are \['depth', 'spread'\]; it has no \['sigma'\]"):
+        OnnxNetwork(path, OnnxSpec(OutputSpec("metric", "depth", aleatoric="sigma")))
+    with pytest.raises(ValueError, match=r"input 'x' must be the graph's only input; it has \['image'\]"):
+        OnnxNetwork(path, OnnxSpec(OutputSpec("metric", "depth"), input="x"))
+
+
+def test_a_layout_that_the_graph_contradicts(tmp_path: Path) -> None:
+    path = write(tmp_path / "n.onnx", nhwc=True, shape=[1, 6, 8, 3])
+    with pytest.raises(ValueError, match=r"'image' has shape \[1, 6, 8, 3\], expected 4 dimensions with 3 channels"):
+        OnnxNetwork(path, OnnxSpec(METRIC))
+
+
+def test_an_integer_graph_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "n.onnx", kind=TensorProto.INT32)
+    with pytest.raises(ValueError, match=r"input 'image' is tensor\(int32\), expected one of"):
+        OnnxNetwork(path, OnnxSpec(METRIC))
+
+
+def test_images_that_do_not_fit(tmp_path: Path, image: Tensor) -> None:
+    network = OnnxNetwork(write(tmp_path / "n.onnx", [2, 3, 6, 8]), OnnxSpec(METRIC))
+    with pytest.raises(ValueError, match="fixed batch of 2, which must divide the number of images, got 3"):
+        network(image)
+    with pytest.raises(ValueError, match=r"input 'image' must be floating-point \[B, 3, 6, 8\]"):
+        network(torch.zeros(2, 3, 8, 6))
+    with pytest.raises(ValueError, match=r"input 'image' must be floating-point \[B, 3, 6, 8\], got torch.uint8"):
+        network(torch.zeros(2, 3, 6, 8, dtype=torch.uint8))
+
+
+def pooled(tmp_path: Path) -> Path:
+    """Depth at half the resolution, as many networks have it."""
+    nodes = [
+        helper.make_node("ReduceMax", ["image"], ["max"], axes=[1], keepdims=1),
+        helper.make_node("MaxPool", ["max"], ["depth"], kernel_shape=[2, 2], strides=[2, 2]),
+    ]
+    return save(tmp_path / "n.onnx", nodes, [], [("image", ["n", 3, "h", "w"])], [("depth", None)])
+
+
+def test_outputs_of_another_resolution(tmp_path: Path, image: Tensor) -> None:
+    """Refused, because the input's intrinsics would not fit; repeated pixel by pixel when asked."""
+    path = pooled(tmp_path)
+    with pytest.raises(ValueError, match=r"output 'depth' has \(3, 4\) px, expected the input's \(6, 8\)"):
+        OnnxNetwork(path, OnnxSpec(METRIC))(image)
+    got = OnnxNetwork(path, OnnxSpec(OutputSpec("metric", resize=True)))(image).depth
+    small = torch.nn.functional.max_pool2d(image.amax(1), 2)
+    torch.testing.assert_close(got, small.repeat_interleave(2, -1).repeat_interleave(2, -2))
+
+
+def test_outputs_of_another_shape(tmp_path: Path, image: Tensor) -> None:
+    nodes = [helper.make_node("Identity", ["image"], ["depth"])]
+    path = save(tmp_path / "n.onnx", nodes, [], [("image", ["n", 3, "h", "w"])], [("depth", None)])
+    with pytest.raises(ValueError, match=r"output 'depth' must be \[B, 1, H, W\].*got \(3, 3, 6, 8\)"):
+        OnnxNetwork(path, OnnxSpec(METRIC))(image)
+
+
+def test_one_map_for_many_images(tmp_path: Path, image: Tensor) -> None:
+    nodes = [helper.make_node("ReduceMax", ["image"], ["depth"], axes=[0, 1], keepdims=1)]
+    path = save(tmp_path / "n.onnx", nodes, [], [("image", ["n", 3, "h", "w"])], [("depth", None)])
+    with pytest.raises(ValueError, match="holds 1 maps for 3 images"):
+        OnnxNetwork(path, OnnxSpec(METRIC))(image)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a graph", None])
+def test_files_that_are_no_graphs(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "broken.onnx"
+    whole = write(tmp_path / "n.onnx").read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    with pytest.raises(ValueError, match=r"broken.onnx is not an ONNX file that ONNX Runtime can run"):
+        OnnxNetwork(path, OnnxSpec(METRIC))
+    with pytest.raises(FileNotFoundError, match=r"none.onnx"):
+        OnnxNetwork(tmp_path / "none.onnx", OnnxSpec(METRIC))
+
+
+def test_an_unknown_operator(tmp_path: Path) -> None:
+    nodes = [helper.make_node("DeepMagic", ["image"], ["depth"])]
+    path = save(tmp_path / "n.onnx", nodes, [], [("image", [1, 3, 6, 8])], [("depth", None)])
+    with pytest.raises(ValueError, match=r"n.onnx is not an ONNX file .*DeepMagic"):
+        OnnxNetwork(path, OnnxSpec(METRIC))
+
+
+def test_an_absent_provider(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"providers \['NoSuchProvider'\] are not available"):
+        OnnxNetwork(write(tmp_path / "n.onnx"), OnnxSpec(METRIC), providers=("NoSuchProvider",))
+
+
+def test_missing_packages_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "n.onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs the package onnxruntime: .*ufmstar-torch\[models\]"):
+        OnnxNetwork(path, OnnxSpec(METRIC))
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ModuleNotFoundError, match=r"needs the package onnx: .*ufmstar-torch\[models\]"):
+        FastDepth.from_onnx(path)
