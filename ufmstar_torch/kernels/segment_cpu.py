@@ -97,22 +97,32 @@ def spgf(
     absent = (z.shape[0], 1, 0)  # rows of no pixels stand for "not given"
     use = np.empty(absent, np.bool_) if valid is None else valid.contiguous().numpy()
     spread = np.empty(absent, z.dtype) if given.variance is None else _array(given.variance)
-    cameras = np.array(
-        [
-            (K[0][0], K[1][1], K[0][2], K[1][2], given.config.slope(min(K[0][0], K[1][1])))
-            for K in given.intrinsics.tolist()
-        ]
-    )
+    limits = _limits(given, before_pruning)
+    labels = np.empty(z.shape, np.int64)
+    found = []
+    for b, K in enumerate(given.intrinsics.tolist()):
+        fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
+        slope = given.config.slope(min(fx, fy))
+        found.append(_image(z[b], use[b], spread[b], fx, fy, cx, cy, slope, limits, labels[b]))
+    return _mixture(found, given, labels), torch.from_numpy(labels)
+
+
+def _mixture(
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], given: SegmentInput, labels: np.ndarray
+) -> GaussianMixture:
+    """The kept Gaussians of all streams, padded to the largest."""
     dtype = np.float32 if given.dtype == torch.float32 else np.float64
-    mean, covariance, weight, count, labels = _segment(
-        z, use, spread, cameras, _limits(given, before_pruning), np.empty(0, dtype)
-    )
+    b, k = len(found), max(1, *(kept.size for kept, _, _ in found))
+    mean, covariance = np.zeros((b, k, 3), dtype), np.zeros((b, k, 3, 3), dtype)
+    weight, count = np.zeros((b, k), dtype), np.zeros((b, k), np.int64)
+    for i, (kept, gaussians, whole) in enumerate(found):
+        _write(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
     if given.features is None:
-        extra = np.empty((*weight.shape, 0), dtype)
+        features = np.empty((b, k, 0), dtype)
     else:
-        extra = _feature_means(_array(given.features), labels, weight)
-    fields = (mean, covariance, weight, np.zeros_like(weight), count, extra)
-    return GaussianMixture(*map(torch.from_numpy, fields)), torch.from_numpy(labels)
+        features = _feature_means(_array(given.features), labels, weight)
+    fields = (mean, covariance, weight, np.zeros((b, k), dtype), count, features)
+    return GaussianMixture(*map(torch.from_numpy, fields))
 
 
 def _array(value: Tensor) -> np.ndarray:
@@ -144,31 +154,13 @@ def _limits(given: SegmentInput, before_pruning: bool) -> _Limits:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _segment(z, use, spread, cameras, limits, like):
-    """All streams: moments, pixel counts, occupied slots and labels, padded to the largest stream."""
-    streams, height, width = z.shape
-    labels = np.empty((streams, height, width), np.int64)
-    found = []
-    most = 1
-    for b in range(streams):
-        kept, values, whole = _image(z[b], use[b], spread[b], cameras[b], limits, labels[b])
-        found.append((kept, values, whole))
-        most = max(most, kept.size)
-    mean, covariance = np.zeros((streams, most, 3), like.dtype), np.zeros((streams, most, 3, 3), like.dtype)
-    weight, count = np.zeros((streams, most), like.dtype), np.zeros((streams, most), np.int64)
-    for b in range(streams):
-        kept, values, whole = found[b]
-        _write(kept, values, whole, mean[b], covariance[b], weight[b], count[b])
-    return mean, covariance, weight, count, labels
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _image(z, use, spread, camera, limits, labels):
+def _image(z, use, spread, fx, fy, cx, cy, slope, limits, labels):
     """One image; writes its labels. Returns which Gaussians are kept, in emission order, and all their values."""
     height, width = z.shape
-    fx, fy, cx, cy, slope = camera[0], camera[1], camera[2], camera[3], camera[4]
     lengths2, edges = _depth_bins(0.5 * min(width / fx, height / fy), limits)
-    depth, s2, rx = np.empty(width), np.zeros(width), (np.arange(width) - cx) / fx
+    depth, s2, rx = np.empty(width), np.zeros(width), np.empty(width)
+    for u in range(width):
+        rx[u] = (u - cx) / fx
 
     most = width // (limits.sparse + 1)  # segments of one row
     segments, segments_int = np.empty((most, _SEGMENT)), np.empty((most, _SEGMENT_INT), np.int64)
@@ -177,7 +169,7 @@ def _image(z, use, spread, camera, limits, labels):
     active = np.empty(2 * most, np.int64)
     gaussians, whole = np.empty((4 * most + 64, _GAUSSIAN)), np.empty((4 * most + 64, _GAUSSIAN_INT), np.int64)
     older, older_int = np.empty((limits.max_open, 10)), np.empty((limits.max_open, 5), np.int64)
-    before, created, emitted = 0, 0, 0
+    before = created = emitted = np.int64(0)  # a plain 0 is a type of its own and doubles the compile time
     for v in range(height):
         ry = (v - cy) / fy
         _usable(z[v], use[v % use.shape[0]], spread[v % spread.shape[0]], limits.max_depth, depth, s2)
@@ -203,7 +195,9 @@ def _image(z, use, spread, camera, limits, labels):
 def _doubled(table):
     """The same rows with as many free ones behind them."""
     out = np.empty((2 * table.shape[0], table.shape[1]), table.dtype)
-    out[: table.shape[0]] = table
+    for i in range(table.shape[0]):
+        for j in range(table.shape[1]):  # a slice assignment takes seconds to compile
+            out[i, j] = table[i, j]
     return out
 
 
@@ -245,7 +239,7 @@ def _scanline(
     """
     y_factor = 1.0 + ry * ry
     room = limits.max_open - 1
-    front, waiting, started, done, k = 0, 0, 0, 0, 0
+    front = waiting = started = done = k = np.int64(0)  # see _image
     newest = _Open(0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for u in range(depth.size):
         z = depth[u]
@@ -381,8 +375,10 @@ def _join_row(
             whole[o, _ROW] = v
             member[j] = o
         else:
-            gaussians[created] = h
-            whole[created, :_SEGMENT_INT] = segments_int[j]
+            for i in range(_GAUSSIAN):
+                gaussians[created, i] = h[i]
+            for i in range(_SEGMENT_INT):
+                whole[created, i] = segments_int[j, i]
             whole[created, _MERGED], whole[created, _ROW] = 1, v
             active[n] = member[j] = created
             n += 1
@@ -411,7 +407,8 @@ def _retire(active, n, v, last, whole, emitted):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lift(segment, ry, h):
     """A segment as a Gaussian of its own: y and the moments with y follow from y = ry z."""
-    h[:] = 0.0
+    for i in range(h.size):
+        h[i] = 0.0
     h[_M], h[_M + 1], h[_M + 2] = segment[_MX], ry * segment[_MZ], segment[_MZ]
     xx, xz, zz = segment[_CXX], segment[_CXZ], segment[_CZZ]
     h[_C], h[_C + 1], h[_C + 2] = xx, ry * xz, xz
@@ -500,9 +497,10 @@ def _prune(whole, created, limits, labels):
     emitted = np.empty(created, np.int64)
     for g in range(created):
         emitted[whole[g, _ORDER]] = g
-    slot, n = np.full(created, -1), 0
-    kept = np.empty(created, np.int64)
+    slot, kept = np.empty(created, np.int64), np.empty(created, np.int64)
+    n = 0
     for g in emitted:
+        slot[g] = -1
         if _keeps(whole[g, _N], whole[g, _MERGED], limits):
             kept[n] = g
             slot[g] = n
