@@ -192,7 +192,7 @@ class FastDepth(DepthNetwork):
 
     def folded(self) -> FastDepth:
         """A copy for inference with every batch norm folded into its convolution, in eval mode: the same
-        function up to rounding in about two thirds of the time on a CPU."""
+        function up to rounding in about three quarters of the time on a CPU."""
         network = FastDepth(self.widths, norm=False)
         for (_, source), (_, target) in zip(self._units(), network._units(), strict=True):
             conv, norm = source.conv, source.norm
@@ -241,8 +241,8 @@ class FastDepth(DepthNetwork):
             bias = layer.bias
             if isinstance(unit.norm, nn.BatchNorm2d):
                 unit.norm.eps = layer.norm_eps
-                layer.norm.setdefault("num_batches_tracked", torch.zeros((), dtype=torch.int64))
-                state.update({f"{name}.norm.{key}": value for key, value in layer.norm.items()})
+                counter = {"num_batches_tracked": torch.zeros((), dtype=torch.int64)}
+                state.update({f"{name}.norm.{key}": value for key, value in (counter | layer.norm).items()})
                 if bias is not None:
                     # A bias before batch norm only shifts the mean that is subtracted again.
                     state[f"{name}.norm.running_mean"] = layer.norm["running_mean"] - bias
