@@ -90,7 +90,7 @@ def _output(
     append(table, torch.zeros_like(count), emitted, kept)
 
     # A pixel's segment of its row -> Gaussian in order of creation -> slot.
-    created = torch.where(exists, g.index[..., 0].to(torch.int64), total)
+    created = torch.where(exists, g.born[..., 0].to(torch.int64), total)
     slot = torch.where(kept, kept.cumsum(1) - 1, -1)
     slot_of = slot.new_zeros(slot.shape[0], total + 1).scatter(1, created, slot)
     segment = segments.pixel.view(given.depth.shape)

@@ -29,7 +29,7 @@ class Gaussian(NamedTuple):
     u_left: Tensor
     u_right: Tensor
     row: Tensor  # that extended it last
-    index: Tensor  # in order of creation
+    born: Tensor  # how many had been created before
 
 
 _WIDTHS = (3, 6, 3, 3, 3, 1, 1, 1, 1, 1, 1, 1, 1)
@@ -60,7 +60,7 @@ def _lift(frame: Frame, segments: Segments) -> Tensor:
             u_left=s.u_left,
             u_right=s.u_right,
             row=row,
-            index=none,
+            born=none,
         ),
         -1,
     )
@@ -144,7 +144,7 @@ def _join_row(
         join = (present > j)[:, None] & overlaps & _same_plane(parts(o), parts(h), frame)
         merged = torch.cat(_merged(parts(o), parts(h)), -1)
         active = active.scatter(1, at, torch.where(join[..., None], merged, o))
-        joined[:, j] = torch.where(join, parts(o).index[..., 0].to(torch.int64), -1)[:, 0]
+        joined[:, j] = torch.where(join, parts(o).born[..., 0].to(torch.int64), -1)[:, 0]
     return active, joined
 
 
@@ -198,5 +198,5 @@ def _merged(o: Gaussian, h: Gaussian) -> Gaussian:
         u_left=((o.u_left + h.u_left) / 2).floor(),
         u_right=((o.u_right + h.u_right) / 2).floor(),
         row=h.row,
-        index=o.index,
+        born=o.born,
     )
