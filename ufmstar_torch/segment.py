@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.segment_fusion import GAUSSIAN_WIDTH, Gaussian, append, fuse_segments, parts
+from ufmstar_torch.segment_fusion import GAUSSIAN_WIDTH, Gaussian, append, fuse_segments, parts, reads_are_free
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.segment_scanline import Frame, Segments, scanlines
 
@@ -82,7 +82,7 @@ def _output(
     kept = exists
     if not before_pruning:
         kept = exists & _keeps(g.n[..., 0], g.merged[..., 0], given.config)
-    if count.device.type == "cpu":
+    if reads_are_free(count.device):
         capacity = max(1, int(kept.sum(1).max()))
     else:
         capacity = total if before_pruning else min(total, _most_kept(given))

@@ -103,13 +103,18 @@ def fuse_segments(frame: Frame, segments: Segments) -> tuple[Tensor, Tensor, Ten
     return emitted[:, :total], emitted_count, member
 
 
+def reads_are_free(device: torch.device) -> bool:
+    """Can a value decide how often a loop runs? Elsewhere than on the CPU that would wait for the device."""
+    return device.type == "cpu"
+
+
 def _trip_counts(given: SegmentInput, present: Tensor) -> tuple[list[int], int, int]:
     """Segments to visit in each row, the most in any row, and the most Gaussians of any stream.
 
     Read from the data on the CPU; elsewhere bounds, since reading would wait for the device.
     """
     height = given.depth.shape[1]
-    if present.device.type != "cpu":
+    if not reads_are_free(present.device):
         most = given.segments_per_row
         return [most] * height, most, most * height
     trips = present.amax(0).tolist()
