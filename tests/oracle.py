@@ -71,6 +71,7 @@ class Segmentation:
     settings: oracle_spgf.Settings
     min_pixels: int
     min_rows: int
+    thickness_floor: bool
     prune: str  # "both": drop if both are small, "either": drop if one is, "none"
 
     def keeps(self, piece):
@@ -79,7 +80,7 @@ class Segmentation:
 
 
 def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
-    """C_i with the footprint of a pixel (at the near plane, if nearer) as floor; features [F, H, W] are averaged over the pixels of a component."""
+    """C_i with the footprint of a pixel (at the near plane, if nearer) and the thickness of a slab as floor; features [F, H, W] are averaged over the pixels of a component."""
     camera = oracle_spgf.Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     pieces, _ = oracle_spgf.segment(depth, camera, segmentation.settings, valid=valid)
     components = []
@@ -88,6 +89,8 @@ def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
             continue
         rows, columns = np.array(piece.pixels).T
         floor = (max(piece.mu[2], near) / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
+        if segmentation.thickness_floor:
+            floor = max(floor, segmentation.settings.noise_floor**2 / 3)
         components.append({
             "mean": piece.mu,
             "cov": floor_eigenvalues(piece.covariance, floor),

@@ -220,14 +220,14 @@ def test_thresholds_follow_the_image():
     assert iou > 0.87
     fixed_small, fixed_large, fixed_iou = partitions(SPGFConfig(scale_with_image=False))
     assert fixed_iou < iou
-    assert not torch.equal(fixed_small[1], small[1])
+    assert torch.equal(fixed_small[1], small[1])  # the reference size: both are the same there
     assert not torch.equal(fixed_large[1], large[1])
 
 
 def test_slope_keeps_metric_thresholds():
     scaled, fixed = SPGFConfig(), SPGFConfig(scale_with_image=False)
-    assert scaled.slope(525.0) == pytest.approx(2.4 / 525)
-    assert scaled.slope(100.0) == pytest.approx(2.4 / 525)
+    assert scaled.slope(525.0) == pytest.approx(2.4 / 200)
+    assert scaled.slope(100.0) == pytest.approx(2.4 / 200)
     assert fixed.slope(100.0) == pytest.approx(2.4 / 100)
 
 

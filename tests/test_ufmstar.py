@@ -18,7 +18,7 @@ SPGF = SPGFConfig(
 BACKENDS = ("torch", "numba")
 
 
-def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
+def oracle_settings(config: SPGFConfig, thickness_floor: bool = True) -> oracle.Segmentation:
     settings = oracle_spgf.Settings(
         a=config.adaptive_thresh_scale,
         noise_floor=config.noise_floor,
@@ -33,27 +33,27 @@ def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
         frame_max_scale=config.frame_max_scale,
         max_depth=config.max_depth,
     )
-    return oracle.Segmentation(settings, config.min_pixels, config.min_rows, config.prune)
+    return oracle.Segmentation(settings, config.min_pixels, config.min_rows, thickness_floor, config.prune)
 
 
-@pytest.fixture(scope="module")
-def truth():
+@pytest.fixture(scope="module", params=[True, False], ids=["thick", "thin"])
+def truth(request):
     """The oracle's run over 30 rendered frames: inputs, maps, mixtures, matches."""
     depths, poses, K = scenes.sequence(30, HEIGHT, WIDTH, 0.04)
     rng = np.random.default_rng(1)
     aleatoric = [0.01 + 0.02 * rng.random(d.shape) for d in depths]
-    judge = oracle.Oracle(oracle_settings(SPGF))
+    judge = oracle.Oracle(oracle_settings(SPGF, request.param))
     maps, matches, sizes = [], [], []
     for depth, T, a in zip(depths, poses, aleatoric, strict=True):
         features = np.stack([a, np.nan_to_num(depth)])
         maps.append(judge.step(depth, T, K, aleatoric=a, features=features))
         matches.append(judge.matches)
         sizes.append(len(judge.mixture))
-    return depths, poses, K, aleatoric, maps, matches, judge.mixture, sizes
+    return depths, poses, K, aleatoric, maps, matches, judge.mixture, sizes, request.param
 
 
 def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
-    depths, poses, K, _, _, matches, mixture, sizes = truth
+    depths, poses, K, _, _, matches, mixture, sizes, thick = truth
     per_c = [len(ks) for frame in matches for ks in frame]
     per_k = [sum(k in ks for ks in frame) for frame in matches for k in range(100)]
     assert max(per_c) > 1, "one current component must match many"
@@ -62,7 +62,7 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
     assert sizes[-1] > sizes[0] + 5, "new places must be seen"
     assert max(g["count"] for g in mixture) > 10, "places must be revisited"
     # The occlusion filter must have had work to do: without it, other matches follow.
-    judge = oracle.Oracle(oracle_settings(SPGF), eta_occl=1.0)
+    judge = oracle.Oracle(oracle_settings(SPGF, thick), eta_occl=1.0)
     hidden = 0
     for i in range(12):
         valid = np.isfinite(depths[i])
@@ -84,8 +84,10 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("streams", [1, 4])
 def test_thirty_frames_agree_with_the_oracle(truth, backend, streams):
-    depths, poses, K, aleatoric, maps, matches, mixture, sizes = truth
-    config = UfMStarConfig(segment=SPGF, backend=backend, features=2, initial_capacity=8)
+    depths, poses, K, aleatoric, maps, matches, mixture, sizes, thick = truth
+    config = UfMStarConfig(
+        segment=SPGF, backend=backend, features=2, initial_capacity=8, thickness_floor=thick
+    )
     ufm = UfMStar(config, dtype=torch.float64)
 
     def batch(x):

@@ -61,6 +61,9 @@ class _Checked:
 class SPGFConfig(_Checked):
     """Single Pass Gaussian Fitting (section "3D Gaussian segmentation"; Li et al., ICRA 2022).
 
+    Upstream's constants (:meth:`preset` has all of its configurations), stated as the paper applies them:
+    to images of 224 x 224 with the focal length of its NYU preprocessing, about 200 px.
+
     Lengths are metres. Thresholds in pixels, and ``adaptive_thresh_scale``, which multiplies 1/f,
     are stated for an image of ``reference_size`` seen with ``reference_focal``; with
     ``scale_with_image`` they follow the image they are applied to (see :meth:`scaled_to`).
@@ -84,9 +87,9 @@ class SPGFConfig(_Checked):
     prune: str = _choice("both", "either", "none")
 
     scale_with_image: bool = True
-    reference_focal: float = _number(525.0, "f_ref", "px", 0.0, open_low=True)
-    reference_height: int = _number(480, "H_ref", "px", 1)
-    reference_width: int = _number(640, "W_ref", "px", 1)
+    reference_focal: float = _number(200.0, "f_ref", "px", 0.0, open_low=True)
+    reference_height: int = _number(224, "H_ref", "px", 1)
+    reference_width: int = _number(224, "W_ref", "px", 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -155,6 +158,8 @@ class UfMStarConfig(_Checked):
     """Everything UfM* can be told. The defaults are the paper's unless a comment says otherwise."""
 
     segment: SPGFConfig = field(default_factory=SPGFConfig)
+    # Not in the paper, which is silent on thin surfaces: see ufmstar_torch.step.covariance_floor.
+    thickness_floor: bool = True
 
     # Correspondence (section "Multiview Gaussian Correspondence")
     eta: float = _number(0.5, "eta", "1", 0.0, 1.0, open_low=True)

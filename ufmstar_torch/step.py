@@ -182,15 +182,28 @@ def raise_faults(faults: list[int]) -> None:
 
 
 def segment(frame: FrameInput, config: UfMStarConfig, backend: Backend) -> tuple[GaussianMixture, Tensor]:
-    """Step 2: C_i in the camera frame, float64, eigenvalues at least the pixel footprint; and its labels."""
+    """Step 2: C_i in the camera frame, float64, eigenvalues at least :func:`covariance_floor`; and its labels."""
     mixture, labels = backend.spgf(
         frame.depth, frame.intrinsics, config.segment, valid=frame.valid, features=frame.features
     )
     mixture = mixture.to(torch.float64)
-    fx, fy, _, _ = focal_and_centre(frame.intrinsics)
-    # Nearer than the near plane nothing is ever matched; the footprint there keeps the floor above zero.
-    floor = pixel_footprint(mixture.mean[..., 2].clamp_min(config.near_plane), torch.minimum(fx, fy)[:, None])
+    floor = covariance_floor(mixture.mean[..., 2], frame.intrinsics, config)
     return mixture.replace(covariance=backend.floor_covariance(mixture.covariance, floor)), labels
+
+
+def covariance_floor(z: Tensor, intrinsics: Tensor, config: UfMStarConfig) -> Tensor:
+    """[B, C] the least eigenvalue of a segment's covariance [m^2]; SPGF's raw moments have no floor.
+
+    Two lengths that the segmentation cannot resolve, each as the variance of a uniform density over it:
+    the width of one pixel, (z/f)^2/12, and with ``config.thickness_floor`` the slab of +- noise_floor within
+    which SPGF counts points to one plane, noise_floor^2/3. Without the second, a wall as flat as a network
+    (or a renderer) likes it explains nothing a few centimetres off itself, and the regression
+    returns the prior just where views disagree (docs/disagreement.md has the measurement).
+    """
+    fx, fy, _, _ = focal_and_centre(intrinsics)
+    # Nearer than the near plane nothing is ever matched; the footprint there keeps the floor above zero.
+    pixel = pixel_footprint(z.clamp_min(config.near_plane), torch.minimum(fx, fy)[:, None])
+    return pixel.clamp_min(config.segment.noise_floor**2 / 3) if config.thickness_floor else pixel
 
 
 def _make_room(

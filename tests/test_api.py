@@ -1,0 +1,60 @@
+"""The public API, pinned: a change here is a change for everyone who builds on the package."""
+
+from __future__ import annotations
+
+import inspect
+
+import ufmstar_torch
+from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.segment import spgf
+
+PUBLIC = {
+    "DepthPrediction",
+    "GaussianMixture",
+    "SPGFConfig",
+    "UfMStar",
+    "UfMStarConfig",
+    "UfMStarOutput",
+    "UncertainDepth",
+}
+
+
+def names(function) -> list[str]:
+    return [n for n in inspect.signature(function).parameters if n != "self"]
+
+
+def test_public_names():
+    public = {n for n in vars(ufmstar_torch) if n[0].isupper()}
+    assert public == PUBLIC
+    assert ufmstar_torch.__version__ == "0.1.0"
+
+
+def test_signatures():
+    observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features"]
+    assert names(UfMStar.__init__) == ["config", "dtype", "device"]
+    assert names(UfMStar.forward) == observation
+    assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average"]
+    assert names(UfMStar.query) == ["points", "frame"]
+    assert names(UfMStar.reset) == ["streams"]
+    assert names(UncertainDepth.__init__) == ["networks", "config", "mode", "samples", "preprocess"]
+    assert names(UncertainDepth.forward) == ["image", "pose", "intrinsics", "valid"]
+    assert names(spgf)[:3] == ["depth", "intrinsics", "config"]
+    assert "before_pruning" in names(spgf)
+
+
+def test_the_papers_defaults():
+    config = UfMStarConfig()
+    assert (config.eta, config.eta_occlusion) == (0.5, 0.7)
+    assert (config.prior_weight, config.prior_mean) == (1.0, 0.0)
+    assert (config.near_radius, config.far_radius) == (0.1, 0.5)
+    assert config.ema_alpha == 0.5
+    assert config.variance_floor == 0.0
+    assert not config.overlap_weighted
+
+
+def test_public_functions_are_documented():
+    for name in PUBLIC:
+        assert inspect.getdoc(getattr(ufmstar_torch, name)), name
+    for function in (UfMStar.forward, UfMStar.mean_uncertainty, UfMStar.query, UfMStar.reset, spgf):
+        text = inspect.getdoc(function)
+        assert "Raises" in text or "Returns" in text, function

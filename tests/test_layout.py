@@ -1,0 +1,121 @@
+"""The house: layers point one way, the folders on disk are the packages, a bare import stays light."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LAYERS = {"core": 0, "models": 1, "eval": 2, "train": 3}
+HEAVY = ("lightning", "torchvision", "kornia", "matplotlib", "torchmetrics", "scipy", "cv2", "onnxruntime", "numba")
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+REFERENCE = ("gaussian", "camera", "segment", "correspond", "fuse", "regress", "mixture", "step", "frame")
+
+
+def layer_of(path: Path) -> str:
+    top = path.relative_to(ROOT).parts[0]
+    return "core" if top == "ufmstar_torch" else top
+
+
+def sources() -> list[Path]:
+    return [p for top in ("ufmstar_torch", "models", "eval", "train") for p in sorted((ROOT / top).rglob("*.py"))]
+
+
+def imported(path: Path) -> list[tuple[str, list[str]]]:
+    """(module, names) of every import statement, at any depth."""
+    found: list[tuple[str, list[str]]] = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, []) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide which layer is meant"
+            found.append((node.module or "", [alias.name for alias in node.names]))
+    return found
+
+
+def target_layer(module: str, names: list[str]) -> str | None:
+    parts = module.split(".")
+    if parts[0] != "ufmstar_torch":
+        return None
+    candidates = parts[1:2] or names
+    return next((c for c in candidates if c in LAYERS), "core")
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda p: str(p.relative_to(ROOT)))
+def test_layers_import_leftward_only(path):
+    if path.name == "cli.py":
+        return  # the roof: imports everything
+    own = LAYERS[layer_of(path)]
+    for module, names in imported(path):
+        layer = target_layer(module, names)
+        assert layer is None or LAYERS[layer] <= own, f"{path} (layer {layer_of(path)}) imports {module}"
+        assert module != "ufmstar_torch.cli", "nobody imports the roof"
+        assert "cli" not in names or module != "ufmstar_torch"
+
+
+def test_no_slow_tier_imports_a_fast_one():
+    for path in sources():
+        if path.parent == ROOT / "ufmstar_torch" and path.stem.startswith(REFERENCE):
+            assert not any("kernels" in module for module, _ in imported(path)), path
+
+
+def test_kernels_import_back_only_plain_types():
+    plain = {"GaussianMixture", "Regression", "Correspondence", "PIXEL_VARIANCE", "UfMStarConfig", "SPGFConfig"}
+    for path in (ROOT / "ufmstar_torch" / "kernels").glob("*.py"):
+        for module, names in imported(path):
+            if module.startswith("ufmstar_torch.") and not module.startswith("ufmstar_torch.kernels"):
+                own = {n for n in names if n in plain or module == "ufmstar_torch.segment_input"}
+                assert set(names) == own, f"{path} imports {names} from {module}"
+
+
+def test_folders_on_disk_are_the_packages():
+    on_disk = set()
+    for top in ("ufmstar_torch", "models", "eval", "train"):
+        for init in (ROOT / top).rglob("__init__.py"):
+            dotted = ".".join(init.parent.relative_to(ROOT).parts)
+            on_disk.add(dotted if top == "ufmstar_torch" else f"ufmstar_torch.{dotted}")
+        for folder in (ROOT / top).rglob("*"):
+            if folder.is_dir() and any(folder.glob("*.py")):
+                assert (folder / "__init__.py").exists(), f"{folder} would vanish from the wheel"
+    assert set(PYPROJECT["packages"]) == on_disk
+    mapping = {"ufmstar_torch": "ufmstar_torch"} | {f"ufmstar_torch.{x}": x for x in ("models", "eval", "train")}
+    assert PYPROJECT["package-dir"] == mapping
+
+
+@pytest.mark.parametrize(
+    "module", ["ufmstar_torch", "ufmstar_torch.models", "ufmstar_torch.eval", "ufmstar_torch.train", "ufmstar_torch.cli"]
+)
+def test_a_bare_import_is_light(module):
+    code = f"import sys, {module}; print([m for m in {HEAVY!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", ["models", "eval", "train"])
+def test_generic_names_are_not_importable(name, tmp_path):
+    code = f"import importlib.util; print(importlib.util.find_spec({name!r}))"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stdout.strip() == "None"
+
+
+def test_every_module_says_what_it_is_for():
+    for path in sources():
+        assert ast.get_docstring(ast.parse(path.read_text())) or path.read_text() == "", path
+
+
+def test_no_utility_rooms_no_blanket_excepts():
+    for path in sources():
+        assert path.stem not in ("utils", "helpers", "common", "misc"), path
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ExceptHandler):
+                names = ast.unparse(node.type) if node.type else ""
+                assert names, f"{path}:{node.lineno} bare except"
+                blanket = re.search(r"\b(Base)?Exception\b", names)
+                reraises = any(isinstance(n, ast.Raise) and n.exc is None for n in ast.walk(node))
+                assert not blanket or reraises, f"{path}:{node.lineno} catches everything"

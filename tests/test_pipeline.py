@@ -1,0 +1,175 @@
+"""UncertainDepth: alternation, the full modes, preprocessing, state."""
+
+from __future__ import annotations
+
+import pytest
+import scenes
+import torch
+from test_ufmstar import SPGF
+from torch import nn
+
+from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.pipeline import combine
+
+H, W = 30, 40
+CONFIG = UfMStarConfig(segment=SPGF)
+K = torch.tensor(scenes.intrinsics(H, W))
+POSES = [torch.tensor(T) for T in scenes.tour(30)[:9]]
+
+
+class Scaled(nn.Module):
+    """A network whose image is the depth itself, times a factor of its own."""
+
+    def __init__(self, factor: float, aleatoric: float | None = None) -> None:
+        super().__init__()
+        self.factor, self.aleatoric, self.calls = nn.Parameter(torch.tensor(factor)), aleatoric, 0
+
+    def forward(self, image):
+        self.calls += 1
+        depth = image[:, 0] * self.factor
+        return DepthPrediction(depth, None if self.aleatoric is None else torch.full_like(depth, self.aleatoric))
+
+
+class Noisy(nn.Module):
+    """A stochastic network that samples in eval mode."""
+
+    def forward(self, image):
+        return DepthPrediction(image[:, 0] * (1 + 0.1 * torch.randn(())))
+
+
+def image(i: int) -> torch.Tensor:
+    depth = torch.tensor(scenes.render(POSES[i].numpy(), K.numpy(), H, W), dtype=torch.float32)
+    return depth.expand(1, 3, H, W)
+
+
+def test_members_take_turns():
+    members = [Scaled(1.0), Scaled(1.1), Scaled(0.9)]
+    model = UncertainDepth(members, CONFIG)
+    used = [model(image(i), POSES[i], K).member for i in range(7)]
+    assert used == [0, 1, 2, 0, 1, 2, 0]
+    assert [m.calls for m in members] == [3, 2, 2]
+
+
+def test_one_inference_then_ufmstar():
+    model, ufm = UncertainDepth(Scaled(1.2, aleatoric=0.04), CONFIG), UfMStar(CONFIG)
+    for i in range(4):
+        out = model(image(i), POSES[i], K)
+        expected = ufm(image(i)[:, 0] * 1.2, POSES[i], K, aleatoric=torch.full((1, H, W), 0.04))
+        torch.testing.assert_close(out.variance, expected.variance, equal_nan=True)
+        torch.testing.assert_close(out.std, expected.std, equal_nan=True)
+        assert torch.equal(out.depth, out.prediction.depth)
+        assert not out.variance.requires_grad
+
+
+def test_alternating_members_that_differ_disagree_more_than_one():
+    single, ensemble = UncertainDepth([Scaled(1.0)], CONFIG), UncertainDepth([Scaled(1.0), Scaled(1.15)], CONFIG)
+    for _ in range(6):
+        a, b = single(image(0), POSES[0], K), ensemble(image(0), POSES[0], K)
+    assert single.ufm.mixture.disagreement.max() < 1e-12
+    assert ensemble.ufm.mixture.disagreement.max() > 0.01
+    assert b.disagreement.mean() > 1e3 * a.disagreement.mean()
+
+
+def test_full_ensemble_is_the_predictive_mixture():
+    members = [Scaled(1.0, 0.01), Scaled(1.2, 0.03)]
+    model = UncertainDepth(members, CONFIG, mode="full")
+    out = model(image(0), POSES[0], K)
+    d = image(0)[:, 0]
+    assert out.member is None
+    torch.testing.assert_close(out.depth, 1.1 * d)
+    torch.testing.assert_close(out.prediction.aleatoric_variance, torch.full_like(d, 0.02))
+    torch.testing.assert_close(out.prediction.epistemic_variance, (0.1 * d) ** 2)
+    torch.testing.assert_close(out.variance, out.disagreement + 0.02 + (0.1 * d) ** 2)
+
+
+def test_full_stochastic_network_samples():
+    torch.manual_seed(0)
+    out = UncertainDepth(Noisy(), CONFIG, mode="full", samples=200)(image(0), POSES[0], K)
+    relative = (out.prediction.epistemic_variance / image(0)[:, 0] ** 2).mean().sqrt().item()
+    assert relative == pytest.approx(0.1, rel=0.2)
+
+
+def test_stochastic_network_samples_once_per_image():
+    torch.manual_seed(0)
+    model = UncertainDepth(Noisy(), CONFIG)
+    a, b = model(image(0), POSES[0], K), model(image(0), POSES[0], K)
+    assert not torch.equal(a.depth, b.depth)
+    assert b.prediction.epistemic_variance is None
+
+
+def test_combine():
+    x = torch.ones(1, 2, 2)
+    with_e = [DepthPrediction(x, x, 0.5 * x), DepthPrediction(3 * x, x, 1.5 * x)]
+    torch.testing.assert_close(combine(with_e).epistemic_variance, 2 * x)
+    mixed = combine([DepthPrediction(x, x), DepthPrediction(3 * x)])
+    assert mixed.aleatoric_variance is None
+    torch.testing.assert_close(mixed.epistemic_variance, x)
+    with pytest.raises(ValueError, match="empty"):
+        combine([])
+
+
+def test_preprocess_carries_the_intrinsics():
+    from ufmstar_torch.camera import resize_intrinsics
+
+    def half(x, K):
+        return nn.functional.interpolate(x, scale_factor=0.5), resize_intrinsics(K, (H, W), (H // 2, W // 2))
+
+    out = UncertainDepth(Scaled(1.0), CONFIG, preprocess=half)(image(0), POSES[0], K)
+    assert out.depth.shape == (1, H // 2, W // 2)
+    torch.testing.assert_close(out.intrinsics[0], resize_intrinsics(K, (H, W), (H // 2, W // 2)))
+
+
+def test_networks_stay_in_eval_mode():
+    model = UncertainDepth(nn.Sequential(Scaled(1.0)), CONFIG)
+    model.train()
+    assert not model.networks.training
+    assert not any(m.training for m in model.networks.modules())
+
+
+def test_a_failed_frame_does_not_advance_the_alternation():
+    model = UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
+    model(image(0), POSES[0], K)
+    with pytest.raises(ValueError, match="NaN"):
+        model(image(1), torch.full((4, 4), torch.nan), K)
+    assert model(image(1), POSES[1], K).member == 1
+
+
+def test_state_continues_and_resets():
+    def fresh():
+        return UncertainDepth([Scaled(1.0), Scaled(1.1)], CONFIG)
+
+    whole, first, second = fresh(), fresh(), fresh()
+    expected = [whole(image(i), POSES[i], K).variance for i in range(5)]
+    for i in range(3):
+        first(image(i), POSES[i], K)
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(second(image(3), POSES[3], K).variance, expected[3])
+    whole.reset()
+    assert whole(image(0), POSES[0], K).member == 0
+
+
+def test_what_cannot_be_meant_is_refused():
+    for arguments in (
+        {"networks": []},
+        {"networks": [lambda x: x]},
+        {"networks": Scaled(1.0), "mode": "all"},
+        {"networks": Scaled(1.0), "mode": "full"},
+        {"networks": Scaled(1.0), "samples": 10},
+        {"networks": [Scaled(1.0), Scaled(1.1)], "mode": "full", "samples": 10},
+    ):
+        with pytest.raises(ValueError, match="networks|mode|samples"):
+            UncertainDepth(**arguments)
+    with pytest.raises(ValueError, match=r"image must be \[B, 3, H, W\]"):
+        UncertainDepth(Scaled(1.0), CONFIG)(image(0)[0], POSES[0], K)
+    with pytest.raises(TypeError, match="DepthPrediction"):
+        UncertainDepth(nn.Identity(), CONFIG)(image(0), POSES[0], K)
+
+
+def test_prediction_checks_itself():
+    with pytest.raises(ValueError, match="depth must be"):
+        DepthPrediction(torch.ones(2, 2))
+    with pytest.raises(ValueError, match="aleatoric_variance must have"):
+        DepthPrediction(torch.ones(1, 2, 2), torch.ones(1, 2, 3))
+    both = DepthPrediction(torch.ones(1, 2, 2), torch.ones(1, 2, 2), 2 * torch.ones(1, 2, 2))
+    assert torch.equal(both.variance, torch.full((1, 2, 2), 3.0))
+    assert DepthPrediction(torch.ones(1, 2, 2)).variance is None
