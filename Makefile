@@ -1,0 +1,37 @@
+# Everything a contributor runs. VENV may point to an environment of your own.
+VENV ?= .venv
+BIN = $(VENV)/bin
+
+.PHONY: install test lint types package bench clean
+
+install:
+	python3 -m venv $(VENV)
+	$(BIN)/pip install -e ".[dev]" -c constraints.txt
+
+test:
+	$(BIN)/pytest
+
+lint:
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# Type checkers cannot follow setuptools' package-dir map: check a flat copy.
+types:
+	rm -rf build/flat
+	$(BIN)/pip install --quiet --no-deps --target build/flat .
+	$(BIN)/mypy build/flat/ufmstar_torch
+
+# The wheel and the sdist, each installed over the editable package, imported from elsewhere, and taken back.
+package:
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	for archive in dist/*.whl dist/*.tar.gz; do \
+		$(BIN)/pip install --quiet --no-deps --force-reinstall $$archive && $(BIN)/python -P tests/installed.py || exit 1; \
+	done
+	$(BIN)/pip install --quiet --no-deps -e .
+
+bench:
+	$(BIN)/ufmstar bench
+
+clean:
+	rm -rf build dist *.egg-info
