@@ -1,0 +1,85 @@
+"""Maps of one pinhole camera as another one sees them: ground truth at the prediction's pixels.
+
+Both cameras stand at the same place and look the same way; only focal length, principal point and size
+differ. That covers resizing and cropping of one image, and depth maps with intrinsics of their own
+(ScanNet's 640x480 depth beside 1296x968 colour, where the export leaves the millimetres between the two
+cameras out as well). A depth along the optical axis keeps its value from one such camera to the other.
+7-Scenes, whose cameras lie 2.5 cm apart, is registered by its reader.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
+from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
+
+# [px] Centres that fall on the border of two pixels by construction (a resize by 2) must not be sent to
+# either side by the rounding of the intrinsics; it is below the accuracy of any calibration.
+_BORDER = 1e-6
+
+
+def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size) -> NDArray:
+    """Every pixel of the second camera takes the value of the first one's pixel that its ray falls into.
+
+    Values are copied, never mixed: a mean over a depth edge is a place where nothing is. For an image that
+    was resized and cropped this equals ``Preprocess.apply_depth``.
+
+    Args:
+        values: [H, W, ...] of the first camera.
+        K_from, K_to: [3, 3] intrinsics of the two cameras [px].
+        size: (h, w) of the second one.
+
+    Returns:
+        [h, w, ...] of the same type; 0 (False) where the first camera does not look.
+    """
+    mapping = K_from @ np.linalg.inv(K_to)
+    v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64)
+    column = np.floor(mapping[0, 0] * u + mapping[0, 1] * v + mapping[0, 2] + 0.5 + _BORDER).astype(np.intp)
+    row = np.floor(mapping[1, 1] * v + mapping[1, 2] + 0.5 + _BORDER).astype(np.intp)
+    height, width = values.shape[:2]
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    found = values[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), found, np.zeros((), values.dtype))
+
+
+def scaled_to_map(K: NDArray, image_size: Size | None, map_size: Size) -> NDArray:
+    """[3, 3] K of an image (H, W), for a map of the whole image at another size.
+
+    Raises:
+        ValueError: the aspect ratios differ, so that the map does not show the whole image.
+    """
+    return K if image_size is None else scale_intrinsics(K, image_size, map_size)
+
+
+def depth_camera(frame: Frame) -> NDArray:
+    """[3, 3] intrinsics of the frame's depth map [px].
+
+    Raises:
+        FrameError: depth and image have aspect ratios of their own, and no intrinsics are known for the depth.
+    """
+    if frame.depth_intrinsics is not None or frame.depth is None or frame.image is None:
+        return frame.intrinsics if frame.depth_intrinsics is None else frame.depth_intrinsics
+    try:
+        return scaled_to_map(frame.intrinsics, _size(frame.image), _size(frame.depth))
+    except ValueError as error:
+        raise FrameError(frame.name, f"the depth map has no camera: {error}") from error
+
+
+def truth_at(frame: Frame, K: NDArray, size: Size) -> NDArray | None:
+    """Ground truth [h, w] float32 [m] at the pixels of a prediction, 0 = none; None without a depth map.
+
+    Args:
+        frame: with its depth.
+        K: [3, 3] of the prediction [px].
+        size: (h, w) of the prediction.
+
+    Raises:
+        FrameError: see ``depth_camera``.
+    """
+    return None if frame.depth is None else resample_nearest(frame.depth, depth_camera(frame), K, size)
+
+
+def _size(array: NDArray) -> Size:
+    return array.shape[0], array.shape[1]

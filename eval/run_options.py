@@ -1,0 +1,161 @@
+"""The options of ``ufmstar run``: what a user can say, before anything heavy is imported."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import MISSING, Field, fields
+from typing import TYPE_CHECKING, Any
+
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser
+
+LAYOUTS = ("auto", "tum", "7scenes", "scannet", "tartanair", "generic")
+PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
+OWN_DEPTH = ("self", "ground-truth")
+
+_DESCRIPTION = """Depth with a variance for every pixel of a sequence of posed images.
+
+The depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR), or
+from the sequence itself (--depth self)."""
+_TYPES = {"float": float, "int": int, "bool": bool, "str": str, "int | None": int | None}
+# (option, type, default, help): all of them may also stand in the file given as --config.
+_SEQUENCE = (
+    ("--layout", LAYOUTS, "auto", "of the sequence's folder"),
+    ("--frames", str, None, "START:STOP:STEP, which frames, counted from 0 as Python does"),
+    ("--trajectory", str, None, "trajectory file (TUM or KITTI format) instead of the layout's own"),
+    ("--images", str, None, "folder of images, or video file, in or beside a generic sequence"),
+    ("--fps", float, None, "frames per second of images without timestamps"),
+    ("--time-offset", float, 0.0, "added to the images' times [s]"),
+    ("--max-pose-gap", float, 0.1, "poses are interpolated between samples at most this far apart [s]"),
+    ("--truth", str, None, "folder of ground-truth depth of a generic sequence"),
+    ("--truth-scale", float, None, "metres per unit of the sequence's own depth, instead of the layout's"),
+)
+_DEPTH = (
+    ("--model", str, None, "network: fastdepth, onnx, torchscript or exported"),
+    ("--spec", str, None, "JSON file that declares an ONNX file's (or saved program's) inputs and outputs"),
+    ("--mode", ("alternate", "full"), "alternate", "several --weights: one per image in turn, or all on every image"),
+    ("--depth", str, None, "folder of predicted depth maps (16-bit PNG, EXR, npy), or 'self'"),
+    ("--variance", str, None, "folder of variance maps [m^2] that belong to --depth DIR"),
+    ("--depth-scale", float, None, "metres per unit of --depth DIR's maps"),
+    ("--size", str, None, "HxW, to which the maps of --depth are brought"),
+)
+_RUN = (
+    ("--device", str, "cpu", "cpu or cuda"),
+    ("--threads", int, None, "CPU threads; default: as many as there are"),
+    ("--preset", PRESETS, None, "upstream's segmentation thresholds; --ufm.segment.* go before them"),
+)
+_FLAGS = (
+    ("--resume", "go on with the run in --out"),
+    ("--overwrite", "replace the run in --out"),
+    ("--no-video", "leave preview.mp4 out"),
+    ("--no-sheet", "leave contact_sheet.png out"),
+    ("--debug", "show tracebacks"),
+)
+_OTHER_DEFAULTS = {"on_bad_frame": "skip"}
+
+
+def run_parser() -> ArgumentParser:
+    """The parser of ``ufmstar run``; it raises ``ArgumentError`` instead of ending the program."""
+    from jsonargparse import ActionConfigFile, ArgumentParser
+
+    parser = ArgumentParser(prog="ufmstar run", description=_DESCRIPTION, exit_on_error=False)
+    parser.add_argument("sequence", type=str, help="folder of the sequence, or a video file")
+    parser.add_argument("--config", action=ActionConfigFile, help="JSON or YAML file with any of these options")
+    parser.add_argument("--out", type=str, required=True, help="folder for everything that is written")
+    for name, kind, default, text in (*_SEQUENCE, *_DEPTH, *_RUN):
+        choice = {"choices": kind} if isinstance(kind, tuple) else {"type": kind}
+        parser.add_argument(name, default=default, help=text, **choice)
+    parser.add_argument("--weights", nargs="+", default=[], help="file; several are the members of an ensemble")
+    for name in ("--intrinsics", "--depth-intrinsics"):
+        what = "the images" if name == "--intrinsics" else "the sequence's own depth"
+        parser.add_argument(name, nargs="+", default=[], help=f"of {what}: a file, or fx fy cx cy [px]")
+    for name, text in _FLAGS:
+        parser.add_argument(name, action="store_true", help=text)
+    _add_config(parser, UfMStarConfig, "ufm", _OTHER_DEFAULTS)
+    return parser
+
+
+def parse_run(parser: ArgumentParser, arguments: Sequence[str]) -> dict[str, Any]:
+    """The options as plain values, "ufm" being what ``UfMStarConfig.from_dict`` takes.
+
+    Raises:
+        ArgumentError: an unknown option, or a value of the wrong kind.
+        SystemExit: help was asked for.
+    """
+    words = list(arguments)
+    options = parser.parse_args(words)
+    if options.preset is not None:
+        preset = SPGFConfig.preset(options.preset).to_dict()
+        parser.set_defaults({f"ufm.segment.{name}": value for name, value in preset.items()})
+        options = parser.parse_args(words)
+    plain: dict[str, Any] = options.as_dict()
+    plain["config"] = [str(file) for file in plain["config"] or []]
+    return plain
+
+
+def parse_slice(text: str | None) -> slice:
+    """START:STOP:STEP as a slice, any part of it left out.
+
+    Raises:
+        ValueError: another form, or a step below 1.
+    """
+    parts = (text or ":").split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
+        raise ValueError(f"--frames must be START:STOP or START:STOP:STEP with STEP at least 1, got {text!r}")
+    return slice(*numbers)
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """HxW as (H, W), None for None.
+
+    Raises:
+        ValueError: another form.
+    """
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
+        raise ValueError(f"--size must be HxW in pixels, 240x320 say, got {text!r}")
+    return int(parts[0]), int(parts[1])
+
+
+def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:
+    """A file's name, or fx, fy, cx, cy [px]; None for no words.
+
+    Raises:
+        ValueError: neither.
+    """
+    if len(words) <= 1:
+        return words[0] if words else None
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4:
+        raise ValueError(f"{option} must be a file, or the four numbers fx fy cx cy, got {' '.join(words)!r}")
+    return numbers
+
+
+def _add_config(parser: ArgumentParser, config: type, prefix: str, changed: dict[str, Any]) -> None:
+    """An option for every field of a config class, and of the config classes in it."""
+    for f in fields(config):
+        if f.default is MISSING:
+            _add_config(parser, SPGFConfig, f"{prefix}.{f.name}", {})
+            continue
+        choices = f.metadata.get("choices")
+        kind = {"choices": choices} if choices else {"type": _TYPES[str(f.type)]}
+        parser.add_argument(f"--{prefix}.{f.name}", default=changed.get(f.name, f.default), help=_help(f), **kind)
+
+
+def _help(f: Field[Any]) -> str:
+    """The paper's symbol, the unit and the range."""
+    if "range" not in f.metadata:
+        return "one word" if "choices" in f.metadata else "true or false"
+    low, high, open_low = f.metadata["range"]
+    return f"{f.metadata['symbol']} [{f.metadata['unit']}], {'(' if open_low else '['}{low:g}, {high:g}]"

@@ -1,0 +1,260 @@
+"""Where a run's depth comes from: networks, a folder of maps that another program predicted, or the
+sequence's own depth. Each source carries UfM* and its state."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.ground_truth import depth_camera, resample_nearest, scaled_to_map
+from ufmstar_torch.eval.run_clock import Stopwatch
+from ufmstar_torch.eval.sequences.depth_folder import DepthFolder
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
+from ufmstar_torch.models.load import load_network
+from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
+from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.ufmstar import UfMStar
+
+
+class Source(ABC):
+    """Depth with UfM*'s variance, frame by frame, in the order of a sequence.
+
+    Attributes:
+        identity: plain values that tell this source from another one: a run cannot go on with another.
+        is_truth: whether the prediction is the sequence's own depth, so that it has no error to show.
+        clock: the stages "network" and "ufm" of the frames.
+    """
+
+    is_truth = False
+
+    def __init__(self, module: nn.Module, ufm: UfMStar, device: torch.device, identity: Mapping[str, Any]) -> None:
+        self._module = module.to(device)
+        self.ufm = ufm
+        self.device = device
+        self.identity = dict(identity)
+        self.clock = Stopwatch(device)
+        self.clock.watch(ufm, "ufm")
+
+    @abstractmethod
+    def predict(self, frame: Frame) -> UncertainPrediction:
+        """Depth [1, h, w] and its variance; UfM* has taken the frame in.
+
+        Raises:
+            FrameError: the frame has nothing to predict from; nothing has changed then.
+        """
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that the next prediction depends on, without the networks' weights."""
+        return {k: v for k, v in self._module.state_dict().items() if not k.startswith("networks.")}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where ``state`` was taken.
+
+        Raises:
+            ValueError: the state belongs to another kind of source.
+        """
+        result = self._module.load_state_dict(dict(state), strict=False)
+        missing = [name for name in result.missing_keys if not name.startswith("networks.")]
+        if missing or result.unexpected_keys:
+            raise ValueError(f"the saved state lacks {missing} and has {result.unexpected_keys} too many")
+
+
+class NetworkSource(Source):
+    """Depth from networks.
+
+    Args:
+        pipeline: networks, alternation and UfM*.
+        device: where they run.
+        identity: see :class:`Source`.
+    """
+
+    def __init__(self, pipeline: UncertainDepth, device: torch.device, identity: Mapping[str, Any]) -> None:
+        super().__init__(pipeline, pipeline.ufm, device, identity)
+        self._pipeline = pipeline
+        for network in pipeline.networks:
+            self.clock.watch(network, "network")
+
+    def predict(self, frame: Frame) -> UncertainPrediction:
+        """See :meth:`Source.predict`."""
+        if frame.image is None:
+            raise FrameError(frame.name, "no image")
+        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].to(self.device)
+        # Pose and intrinsics stay on the host, where UfM* checks them without waiting for a device.
+        pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
+        return self._pipeline(image, pose, K)
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedMap:
+    """A depth map from elsewhere.
+
+    Attributes:
+        depth: [H, W] float32 [m], 0 = no prediction.
+        variance: [H, W] float32 [m^2], or None.
+        intrinsics: [3, 3] float64 of the map [px].
+    """
+
+    depth: np.ndarray
+    variance: np.ndarray | None
+    intrinsics: np.ndarray
+
+    def resized(self, size: Size | None) -> PredictedMap:
+        """At another size (h, w), by taking the nearest pixel."""
+        old = (self.depth.shape[0], self.depth.shape[1])
+        if size is None or size == old:
+            return self
+        K = resize_intrinsics(torch.from_numpy(self.intrinsics), old, size).numpy()
+        variance = None if self.variance is None else resample_nearest(self.variance, self.intrinsics, K, size)
+        return PredictedMap(resample_nearest(self.depth, self.intrinsics, K, size), variance, K)
+
+
+class MapSource(Source):
+    """Depth that is already there.
+
+    Args:
+        read: the map of a frame.
+        config: of UfM*.
+        size: (h, w) to which the maps are brought; None = as they are.
+        device, identity: see :class:`Source`.
+        is_truth: the maps are the sequence's own depth.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[Frame], PredictedMap],
+        config: UfMStarConfig,
+        device: torch.device,
+        identity: Mapping[str, Any],
+        *,
+        size: Size | None = None,
+        is_truth: bool = False,
+    ) -> None:
+        ufm = UfMStar(config)
+        super().__init__(ufm, ufm, device, identity)
+        self._read, self._size, self.is_truth = read, size, is_truth
+
+    def predict(self, frame: Frame) -> UncertainPrediction:
+        """See :meth:`Source.predict`."""
+        found = self._read(frame).resized(self._size)
+        depth = torch.from_numpy(found.depth)[None].to(self.device)
+        variance = None if found.variance is None else torch.from_numpy(found.variance)[None].to(self.device)
+        pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(found.intrinsics)[None]
+        with torch.no_grad():
+            ufm = self.ufm(depth, pose, K, variance)
+        return UncertainPrediction(DepthPrediction(depth, variance), ufm, K, None)
+
+
+def network_source(
+    model: str,
+    weights: Iterable[str | Path],
+    config: UfMStarConfig,
+    *,
+    spec: str | Path | None = None,
+    mode: str = "alternate",
+    threads: int | None = None,
+    device: str = "cpu",
+) -> NetworkSource:
+    """One network, or the members of an ensemble, from files.
+
+    Args:
+        model: a name that ``load_network`` knows.
+        weights: one file for each member.
+        config: of UfM*.
+        spec: declares what an ONNX file or saved program does not say.
+        mode: "alternate" (one member per image in turn) or "full" (all of them on every image).
+        threads: CPU threads of ONNX Runtime; None = its own choice.
+        device: "cpu", "cuda", ...
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: unknown model, files that do not fit it, members that want different inputs.
+    """
+    files = [Path(file) for file in weights]
+    for file in [*files, *([Path(spec)] if spec is not None else [])]:
+        if not file.is_file():
+            raise FileNotFoundError(f"no such file: {file}")
+    options: dict[str, Any] = {} if spec is None else {"spec": spec}
+    if model == "onnx" and threads is not None:
+        options["threads"] = threads
+    try:
+        members = [load_network(model, file, **options) for file in files]
+    except TypeError as error:
+        raise ValueError(f"model {model!r} does not take {sorted(options)}: {error}") from error
+    wanted = [member.preprocess for member in members]
+    if any(other != wanted[0] for other in wanted[1:]):
+        raise ValueError(f"weights: the members of an ensemble must want the same input, got {wanted}")
+    pipeline = UncertainDepth(members, config, mode=mode, preprocess=wanted[0])
+    identity = {
+        "model": model,
+        "weights": [{"name": file.name, "sha256": sha256(file)} for file in files],
+        "mode": mode,
+        "spec": None if spec is None else sha256(Path(spec)),
+    }
+    return NetworkSource(pipeline, torch.device(device), identity)
+
+
+def folder_source(
+    sequence: Sequence,
+    folder: str | Path,
+    config: UfMStarConfig,
+    *,
+    variance: str | Path | None = None,
+    scale: float | None = None,
+    size: Size | None = None,
+    device: str = "cpu",
+) -> MapSource:
+    """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
+
+    The maps show the whole image: their intrinsics are the image's, scaled by the sizes' ratio.
+
+    Raises:
+        NotADirectoryError: no such folder.
+        ValueError: no maps, maps that fit no frame or have another aspect ratio than the images.
+    """
+    maps = DepthFolder(folder, scale, variance).for_frames(sequence.names, sequence.names_on_disk)
+
+    def read(frame: Frame) -> PredictedMap:
+        depth, spread = maps[frame.index]
+        try:
+            K = scaled_to_map(frame.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
+        except ValueError as error:
+            raise FrameError(maps.depth_files[frame.index], f"does not show the whole image: {error}") from error
+        return PredictedMap(depth, spread, K)
+
+    files = (*maps.depth_files, *maps.variance_files)
+    listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
+    identity = {
+        "maps": {"count": len(maps.depth_files), "names_and_sizes": hashlib.sha256(listing.encode()).hexdigest()},
+        "with_variance": variance is not None,
+        "scale": scale,
+        "size": size,
+    }
+    return MapSource(read, config, torch.device(device), identity, size=size)
+
+
+def own_depth_source(config: UfMStarConfig, *, size: Size | None = None, device: str = "cpu") -> MapSource:
+    """The sequence's own depth as the prediction: what UfM* says of perfect depth, the method's floor."""
+
+    def read(frame: Frame) -> PredictedMap:
+        if frame.depth is None:
+            raise FrameError(frame.name, "no depth map")
+        return PredictedMap(frame.depth, None, depth_camera(frame))
+
+    identity = {"maps": "the sequence's own depth", "size": size}
+    return MapSource(read, config, torch.device(device), identity, size=size, is_truth=True)
+
+
+def sha256(file: Path) -> str:
+    """Hex digest of a file's content."""
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()

@@ -1,0 +1,231 @@
+"""The command line, ``ufmstar COMMAND ...``: the roof of the package, imported by nobody.
+
+Each command imports what it needs when it is called, so that help and errors come at once.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.run import Progress
+
+OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+_HELP = """usage: ufmstar COMMAND ...
+
+Calibrated per-pixel variance for monocular depth, from the disagreement between views (UfM*).
+
+commands:
+{commands}
+
+ufmstar COMMAND --help tells a command's options, ufmstar --version the version.
+"""
+
+
+class UsageError(Exception):
+    """What the user asked for cannot be done; the message is one line that says why."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code: 0 done, 1 failed, 2 wrong usage, 130 interrupted.
+
+    Args:
+        arguments: without the program's name; None = the process's.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] in ([], ["-h"], ["--help"]):
+        told = "\n".join(f"  {name:8}{(command.__doc__ or '').splitlines()[0]}" for name, command in COMMANDS.items())
+        print(_HELP.format(commands=told), end="")
+        return OK if words else USAGE
+    if words == ["--version"]:
+        from ufmstar_torch import __version__
+
+        print(__version__)
+        return OK
+    if words[0] not in COMMANDS:
+        return _told(f"ufmstar: no command {words[0]!r}, there are {', '.join(COMMANDS)}", USAGE)
+    try:
+        return COMMANDS[words[0]](words[1:])
+    except UsageError as error:
+        return _told(f"ufmstar {words[0]}: {error}", USAGE)
+    except KeyboardInterrupt:
+        return _told(f"ufmstar {words[0]}: interrupted", INTERRUPTED)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """depth and variance of a sequence of posed images, onto disk"""
+    from jsonargparse import ArgumentError
+
+    from ufmstar_torch.eval.run_options import parse_run, run_parser
+
+    try:
+        options = parse_run(run_parser(), arguments)
+    except ArgumentError as error:
+        raise UsageError(_one_line(error)) from error
+    try:
+        summary = _run(options)
+    except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
+        # What a network or a full disk may raise: one line for a user, the traceback on request.
+        if options["debug"]:
+            traceback.print_exc()
+        return _told(f"ufmstar run: failed: {_one_line(error)}", FAILED)
+    return _report(summary, options["out"])
+
+
+def bench(arguments: Sequence[str]) -> int:
+    """time per stage and memory, beside the depth network's own"""
+    from ufmstar_torch.eval import benchmark
+
+    return int(benchmark.main(list(arguments)) or OK)
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {"run": run, "bench": bench}
+
+
+def _run(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Open what the options name, and run it.
+
+    Raises:
+        UsageError: it cannot be opened.
+    """
+    from ufmstar_torch.eval.run import run as run_job
+    from ufmstar_torch.eval.run_folder import FolderError
+    from ufmstar_torch.eval.run_job import job_from
+
+    try:
+        _set_threads(options["threads"])
+        job = job_from(options)
+    except (ImportError, OSError, ValueError) as error:
+        if options["debug"]:
+            traceback.print_exc()
+        raise UsageError(_one_line(error)) from error
+    try:
+        with _Bars() as bars, _stop_signals(bars.say) as stop:
+            return run_job(
+                job,
+                options["out"],
+                resume=options["resume"],
+                overwrite=options["overwrite"],
+                progress=bars.show,
+                stop=stop,
+            )
+    except FolderError as error:
+        raise UsageError(str(error)) from error
+
+
+def _report(summary: Mapping[str, Any], out: str) -> int:
+    """Print the table and where the outputs are; the exit code."""
+    from ufmstar_torch.eval.summary import FINISHED, table
+    from ufmstar_torch.eval.summary import INTERRUPTED as STOPPED
+
+    print(table(summary))
+    made = [name for name, reason in summary["outputs"].items() if reason is None]
+    print("\n".join(f"no {name}: {reason}" for name, reason in summary["outputs"].items() if reason), end="")
+    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', 'depth/', 'sigma/', *made])}")
+    told = f"ufmstar run: {summary['state']}: {summary['reason']}"
+    if summary["state"] == FINISHED:
+        print(told)
+        return OK
+    return _told(told, INTERRUPTED if summary["state"] == STOPPED else FAILED)
+
+
+def _set_threads(count: int | None) -> None:
+    """CPU threads of torch and of the compiled kernels.
+
+    Raises:
+        ValueError: not a positive number.
+    """
+    if count is None:
+        return
+    if count < 1:
+        raise ValueError(f"--threads must be at least 1, got {count}")
+    import torch
+
+    torch.set_num_threads(count)
+    try:
+        import numba
+    except ImportError:  # the torch reference serves then
+        return
+    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+
+
+class _Bars:
+    """A progress bar for each stage of a run."""
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+        self._stage = ""
+
+    def show(self, progress: Progress) -> None:
+        """Bring the bar of the stage up to date."""
+        from tqdm import tqdm
+
+        if progress.stage != self._stage:
+            self._close()
+            first = progress.done if progress.components is None and progress.stage == "frames" else 0
+            self._bar = tqdm(total=progress.total, initial=first, desc=progress.stage, unit="frame", dynamic_ncols=True)
+            self._stage = progress.stage
+        if progress.components is not None:
+            skipped = {"skipped": progress.skipped} if progress.skipped else {}
+            self._bar.set_postfix(K=progress.components, refresh=False, **skipped)
+        self._bar.update(progress.done - self._bar.n)
+
+    def say(self, text: str) -> None:
+        """Print a line without breaking the bar."""
+        from tqdm import tqdm
+
+        tqdm.write(text, file=sys.stderr)
+
+    def __enter__(self) -> _Bars:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+
+@contextmanager
+def _stop_signals(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM end the run after the frame in hand; a second one ends it at once.
+
+    Yields:
+        Whether one has come.
+    """
+    received: list[int] = []
+
+    def handle(number: int, _: object) -> None:
+        received.append(number)
+        if len(received) > 1:
+            raise KeyboardInterrupt
+        say("stopping after this frame; once more stops at once")
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _told(text: str, code: int) -> int:
+    print(text, file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
