@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shared_data import require_shared
 from torch import Tensor
 
-from ufmstar_torch.camera import rays, resize_intrinsics
+from ufmstar_torch.camera import resize_intrinsics, unproject
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.kernels import segment_cpu
 from ufmstar_torch.segment import spgf as torch_spgf
@@ -115,7 +115,7 @@ def clutter(seed: int, height: int, width: int) -> tuple[Tensor, Tensor]:
 def room(height: int, width: int) -> tuple[Tensor, Tensor]:
     """Depth [1, H, W] and camera of one smooth scene at any size: floor, ceiling, three walls, two boxes."""
     K = resize_intrinsics(camera(200.0, 205.0, 111.5, 111.5), (224, 224), (height, width))
-    x, y, one = rays(height, width, K)[0].unbind(-1)
+    x, y, one = unproject(torch.ones(1, height, width, dtype=K.dtype), K)[0].unbind(-1)
     z = 4.0 * one
     for normal, distance in (((0, 1, 0), 1.2), ((0, -1, 0), 1.3), ((1, 0, 0.15), 1.9), ((-1, 0, 0.1), 1.7)):
         towards = normal[0] * x + normal[1] * y + normal[2] * one

@@ -31,12 +31,15 @@ def test_unproject_inverts_projection():
     torch.testing.assert_close(pixels.view(5, 7, 2), torch.stack([u, v], -1).double(), rtol=0, atol=1e-12)
 
 
-def test_unproject_agrees_with_kornia():
-    from kornia.geometry.depth import depth_to_3d_v2
-
-    K = torch.tensor(scenes.intrinsics(6, 9), dtype=torch.float64)[None]
-    depth = 1 + torch.rand(1, 6, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(camera.unproject(depth, K), depth_to_3d_v2(depth, K), rtol=0, atol=1e-13)
+def test_unproject_is_the_papers_formula():
+    K = torch.tensor(scenes.intrinsics(6, 9), dtype=torch.float64)[None].repeat(2, 1, 1)
+    K[1, 0, 2] += 0.7
+    depth = 1 + torch.rand(2, 6, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    points = camera.unproject(depth, K)
+    for b, v, u in [(0, 0, 0), (0, 5, 8), (1, 2, 7)]:
+        d, k = depth[b, v, u], K[b]
+        expected = torch.stack([(u - k[0, 2]) / k[0, 0] * d, (v - k[1, 2]) / k[1, 1] * d, d])
+        torch.testing.assert_close(points[b, v, u], expected, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize(("old", "new"), [((480, 640), (224, 224)), ((540, 360), (97, 131)), ((30, 40), (90, 120))])

@@ -24,17 +24,9 @@ def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
     Returns:
         [B, H, W, 3] points in the camera frame [m].
     """
-    return rays(depth.shape[-2], depth.shape[-1], intrinsics.to(depth.dtype)) * depth[..., None]
+    from kornia.geometry.depth import depth_to_3d_v2  # a second of import time, at the first call only
 
-
-def rays(height: int, width: int, intrinsics: Tensor) -> Tensor:
-    """[B, H, W, 3] the ray ((u-cx)/fx, (v-cy)/fy, 1) of every pixel; shapes as in :func:`unproject`."""
-    u = torch.arange(width, dtype=intrinsics.dtype, device=intrinsics.device)
-    v = torch.arange(height, dtype=intrinsics.dtype, device=intrinsics.device)
-    fx, fy, cx, cy = focal_and_centre(intrinsics)
-    x = ((u - cx[:, None]) / fx[:, None])[:, None, :].expand(-1, height, -1)
-    y = ((v - cy[:, None]) / fy[:, None])[:, :, None].expand(-1, -1, width)
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    return depth_to_3d_v2(depth, intrinsics.to(depth.dtype))
 
 
 def focal_and_centre(intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
