@@ -1,0 +1,34 @@
+"""Dataset readers: posed frames from TUM RGB-D, 7-Scenes, ScanNet, TartanAir, or any images and poses."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.sequences.check import SequenceCheck as SequenceCheck
+    from ufmstar_torch.eval.sequences.check import check_sequence as check_sequence
+    from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder
+    from ufmstar_torch.eval.sequences.frame import Frame as Frame
+    from ufmstar_torch.eval.sequences.frame import FrameError as FrameError
+    from ufmstar_torch.eval.sequences.frame import Sequence as Sequence
+    from ufmstar_torch.eval.sequences.frame import Skipped as Skipped
+    from ufmstar_torch.eval.sequences.layout import open_sequence as open_sequence
+
+_HOME = {
+    "DepthFolder": "depth_folder",
+    "Frame": "frame",
+    "FrameError": "frame",
+    "Sequence": "frame",
+    "SequenceCheck": "check",
+    "Skipped": "frame",
+    "check_sequence": "check",
+    "open_sequence": "layout",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Imports a name's module when it is first asked for (PEP 562): Pillow and SciPy are not free."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

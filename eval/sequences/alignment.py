@@ -1,0 +1,118 @@
+"""Does a depth map lie on its image? Depth edges are compared with image edges, as they are and displaced."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+# A pixel is a depth edge if it is nearer, in inverse depth, than its neighbours on both sides predict by
+# this share: planes are linear in inverse depth, so that slanted ones give no edge at any slope.
+_EDGE_JUMP = 0.05
+_EDGE_REACH = 3  # [px] Kinect-type depth blurs an edge over that many pixels
+_IMAGE_SIGMA = 1.5  # [px]
+_POINTS_PER_FRAME = 1000
+# Displacements tried: zoom about the image's centre (7-Scenes' depth needs 0.9), and shifts as a share of
+# the width (19 px of 640 to either side, 2.5 cm at 0.7 m; half of it up and down).
+_ZOOMS = np.arange(0.86, 1.141, 0.02)
+_SHIFT, _SHIFT_STEP = 0.0375, 0.0047
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How well depth edges meet image edges.
+
+    Attributes:
+        quality: 1 where no displacement is better than none, 0 where none is as bad as a random one; NaN
+            without edges.
+        contrast: mean gradient rank (0 to 1) at the best displacement less that at a random one; small
+            where image edges are everywhere, so that nothing can be told.
+        zoom, shift_x, shift_y: the best displacement of the depth map: zoom about the centre, then shift
+            [px].
+        edges: number of edge pixels compared.
+    """
+
+    quality: float
+    contrast: float
+    zoom: float
+    shift_x: float
+    shift_y: float
+    edges: int
+
+
+def alignment(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> Alignment:
+    """Alignment over pairs of an image [H, W, 3] uint8 and a depth map [H, W] [m] (0 = invalid).
+
+    Each edge pixel scores the rank of the image gradient there (ranks, because a lamp's gradient would
+    outweigh all others); scores are averaged over all frames, for each displacement. Observed quality: at
+    least 0.5 on registered recordings, at most 0.2 with 7-Scenes' unregistered geometry.
+    """
+    total: np.ndarray | float = 0.0
+    count: np.ndarray | float = 0.0
+    edges, width = 0, 1
+    for image, depth in frames:
+        rank = _gradient_rank(image)
+        v, u = _sample(depth_edges(depth))
+        width = depth.shape[1]
+        dx, dy = _shifts(width)
+        scores = [_scores(rank, v, u, zoom, dx, dy) for zoom in _ZOOMS]
+        total = total + np.stack([s for s, _ in scores])
+        count = count + np.stack([n for _, n in scores])
+        edges += len(v)
+    if edges == 0:
+        return Alignment(float("nan"), 0.0, 1.0, 0.0, 0.0, 0)
+    mean = total / np.maximum(count, 1)
+    dx, dy = _shifts(width)
+    at = np.unravel_index(np.argmax(mean), mean.shape)
+    here = mean[np.argmin(np.abs(_ZOOMS - 1)), len(dy) // 2, len(dx) // 2]
+    typical = np.median(mean)
+    contrast = mean.max() - typical
+    quality = (here - typical) / max(contrast, 1e-12)
+    return Alignment(float(quality), float(contrast), float(_ZOOMS[at[0]]), float(dx[at[2]]), float(dy[at[1]]), edges)
+
+
+def depth_edges(depth: np.ndarray) -> np.ndarray:
+    """[H, W] bool: pixels on the near side of a depth discontinuity, of depth [H, W] [m], 0 = invalid."""
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), np.nan)
+    edge = np.zeros(depth.shape, dtype=bool)
+    r = _EDGE_REACH
+    for along in (inverse, inverse.T):
+        middle = along[r:-r]
+        out = edge if along is inverse else edge.T
+        out[r:-r] |= 2 * middle - along[: -2 * r] - along[2 * r :] > _EDGE_JUMP * middle  # False at NaN
+    return edge
+
+
+def _gradient_rank(image: np.ndarray) -> np.ndarray:
+    grey = gaussian_filter(image.astype(np.float32).mean(axis=2), _IMAGE_SIGMA)
+    strength = np.hypot(*np.gradient(grey))
+    rank = np.empty(strength.size, dtype=np.float32)
+    rank[np.argsort(strength, axis=None)] = np.linspace(0, 1, strength.size, dtype=np.float32)
+    return rank.reshape(strength.shape)
+
+
+def _sample(edge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    v, u = np.nonzero(edge)
+    keep = np.unique(np.linspace(0, max(len(v) - 1, 0), min(len(v), _POINTS_PER_FRAME)).astype(int))
+    return v[keep], u[keep]
+
+
+def _shifts(width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts along x and y [px], both with 0 in the middle."""
+    step = max(1, round(_SHIFT_STEP * width))
+    steps = max(1, round(_SHIFT * width / step))
+    return step * np.arange(-steps, steps + 1), step * np.arange(-(steps // 2), steps // 2 + 1)
+
+
+def _scores(
+    rank: np.ndarray, v: np.ndarray, u: np.ndarray, zoom: float, dx: np.ndarray, dy: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Summed rank and number of points inside the image, [len(dy), len(dx)] each."""
+    height, width = rank.shape
+    x = np.rint((u - (width - 1) / 2) * zoom + (width - 1) / 2).astype(int)[None, None, :] + dx[None, :, None]
+    y = np.rint((v - (height - 1) / 2) * zoom + (height - 1) / 2).astype(int)[None, None, :] + dy[:, None, None]
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    values = rank[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+    return (values * inside).sum(axis=-1), inside.sum(axis=-1)

@@ -1,0 +1,137 @@
+"""Depth maps that another program predicted, with optional variance maps, one file per frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Names
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.images import (
+    DEPTH_SUFFIXES,
+    SCALE_KEY,
+    check_scale,
+    list_files,
+    read_depth,
+    read_map,
+)
+from ufmstar_torch.eval.sequences.pairing import pair_by_name
+
+_VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i.
+
+    Attributes:
+        depth_files: one for each frame.
+        variance_files: one for each frame, or empty.
+        scale: metres per unit of the depth files, or None (see :class:`DepthFolder`).
+    """
+
+    depth_files: tuple[Path, ...]
+    variance_files: tuple[Path, ...] = ()
+    scale: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.depth_files)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Depth [H, W] float32 [m] (0 = invalid) and variance [H, W] float32 [m^2], or None without one.
+
+        Where the variance is negative or not finite, both are 0: such a pixel has no prediction.
+
+        Raises:
+            FrameError: a file cannot be decoded, or the two differ in size.
+        """
+        depth = read_depth(self.depth_files[index], self.scale)
+        if not self.variance_files:
+            return depth, None
+        path = self.variance_files[index]
+        variance = read_map(path, key="variance")[0].astype(np.float32)
+        if variance.shape != depth.shape:
+            raise FrameError(path, f"the variance is {list(variance.shape)}, its depth {list(depth.shape)}")
+        usable = np.isfinite(variance) & (variance >= 0)
+        zero = np.float32(0)
+        return np.where(usable, depth, zero), np.where(usable, variance, zero)
+
+
+class DepthFolder:
+    """A folder of predicted depth maps: 16-bit PNG or TIFF, float TIFF, EXR, npy or npz.
+
+    Args:
+        path: the folder; all its maps must have the same suffix.
+        scale: metres per unit, for any of the formats. None: a PNG names it in its text ``depth_scale``
+            (each map for itself), the others are in metres.
+        variance: folder of variance maps [m^2] as npy, npz, EXR or float TIFF. It may be ``path`` itself,
+            where npz files hold the keys ``depth`` and ``variance``.
+
+    Raises:
+        NotADirectoryError: a folder does not exist.
+        ValueError: no map, maps of several formats, integers whose scale is not known, ``scale`` out of
+            range.
+    """
+
+    def __init__(self, path: str | Path, scale: float | None = None, variance: str | Path | None = None) -> None:
+        check_scale(scale)
+        self.path = Path(path)
+        self.scale = scale
+        self.files = _maps(self.path, DEPTH_SUFFIXES, "depth")
+        self.variance_path = None if variance is None else Path(variance)
+        self.variance_files = [] if variance is None else _maps(Path(variance), _VARIANCE_SUFFIXES, "variance")
+        if scale is None:
+            values, named = read_map(self.files[0], key="depth")
+            if named is None and np.issubdtype(values.dtype, np.integer):
+                raise ValueError(
+                    f"scale: {self.files[0]} holds integers and no text {SCALE_KEY!r}: pass metres per unit"
+                )
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def for_frames(self, names: Names[str], names_on_disk: Names[str] = ()) -> DepthMaps:
+        """The maps of a sequence's frames: by stem, or by the numbers in the names, or else in sorted order.
+
+        Args:
+            names: the frames' names (:attr:`Sequence.names`).
+            names_on_disk: the same with the frames that the sequence skips (:attr:`Sequence.names_on_disk`);
+                sorted order counts on there being as many maps as one of the two.
+
+        Raises:
+            ValueError: some frames have no map (they are listed).
+        """
+        depth = _paired(self.path, self.files, names, names_on_disk or names)
+        variance: tuple[Path, ...] = ()
+        if self.variance_path is not None:
+            variance = _paired(self.variance_path, self.variance_files, names, names_on_disk or names)
+        return DepthMaps(depth, variance, self.scale)
+
+
+def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{what}: no such folder: {folder}")
+    files = list_files(folder, suffixes)
+    found = sorted({file.suffix.lower() for file in files})
+    if len(found) != 1:
+        told = f"several formats, {', '.join(found)}" if found else f"no map ({', '.join(suffixes)})"
+        raise ValueError(f"{what}: the folder {folder} holds {told}")
+    return files
+
+
+def _paired(folder: Path, files: list[Path], names: Names[str], names_on_disk: Names[str]) -> tuple[Path, ...]:
+    pairs = pair_by_name(names, files)
+    missing = [name for name in names if name not in pairs]
+    if not missing:
+        return tuple(pairs[name] for name in names)
+    for order in (names_on_disk, names):
+        if len(files) == len(order):
+            by_order = dict(zip(order, files, strict=True))
+            return tuple(by_order[name] for name in names)
+    shown = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
+    raise ValueError(
+        f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); its {len(files)} files are "
+        f"named {files[0].name}, ..., and there are not as many as frames, so that order does not pair them"
+    )

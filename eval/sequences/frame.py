@@ -1,0 +1,232 @@
+"""Posed frames and the sequence that yields them: what every dataset reader returns.
+
+Poses are camera-to-world (``T_world_cam``), camera axes x right, y down, z forward [m]; intrinsics are
+in pixels with the centre of the first pixel at (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+Loader = Callable[[], np.ndarray]
+Size = tuple[int, int]
+
+# A principal point outside this share of the image, on either axis, belongs to another image size: real
+# cameras and the usual crops stay within it, a K given for twice or half the size does not.
+_CENTRE_RANGE = (0.2, 0.8)
+
+
+class FrameError(Exception):
+    """A frame's file is missing, truncated, corrupt, or not of the sequence's size; found when decoding.
+
+    Callers may count such frames and go on (:meth:`Sequence.readable` does).
+
+    Attributes:
+        path: the file, or the frame's name where the file decodes but does not belong to the sequence.
+        reason: what is wrong with it.
+    """
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        super().__init__(str(path), reason)  # both in args, so that it survives pickling by a worker
+        self.path = Path(path)
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One posed frame.
+
+    Attributes:
+        index: position in the sequence, 0-based.
+        name: the frame's name on disk without suffix; unique in its sequence.
+        image: [H, W, 3] uint8 RGB, or None.
+        depth: [Hd, Wd] float32 depth along z [m], 0 = invalid, or None where the frame has none.
+        T_world_cam: [4, 4] float64 camera-to-world [m].
+        intrinsics: [3, 3] float64 of the image [px].
+        depth_intrinsics: [3, 3] float64 of the depth map where it has a size or camera of its own, else
+            None (then ``intrinsics`` holds for it).
+        timestamp: [s], or None.
+    """
+
+    index: int
+    name: str
+    image: np.ndarray | None
+    depth: np.ndarray | None
+    T_world_cam: np.ndarray
+    intrinsics: np.ndarray
+    depth_intrinsics: np.ndarray | None = None
+    timestamp: float | None = None
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A frame on disk that the sequence leaves out, and why (known when the sequence was opened)."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A frame before it is decoded: ``load_image`` and ``load_depth`` return what :class:`Frame` holds.
+
+    A ``T_world_cam`` with a non-finite entry makes :func:`make_sequence` skip and count the frame.
+    """
+
+    name: str
+    T_world_cam: np.ndarray
+    load_image: Loader | None
+    load_depth: Loader | None = None
+    timestamp: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Posed frames, decoded lazily. Build one with :func:`make_sequence`.
+
+    Attributes:
+        name: of the sequence.
+        layout: which reader opened it.
+        entries: the frames with a usable pose, in order.
+        intrinsics: [3, 3] of the images [px].
+        image_size: (H, W) of the images; an image of another size raises :class:`FrameError`.
+        depth_intrinsics: [3, 3] of the depth maps [px], where they differ from ``intrinsics``.
+        depth_size: (H, W) of the depth maps, or None where there are none.
+        skipped: the frames left out.
+        names_on_disk: every frame's name in order, skipped ones included.
+    """
+
+    name: str
+    layout: str
+    entries: tuple[Entry, ...]
+    intrinsics: np.ndarray
+    image_size: Size | None = None
+    depth_intrinsics: np.ndarray | None = None
+    depth_size: Size | None = None
+    skipped: tuple[Skipped, ...] = ()
+    names_on_disk: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The frames' names, in order."""
+        return tuple(entry.name for entry in self.entries)
+
+    @property
+    def without_depth(self) -> tuple[str, ...]:
+        """Names of the frames that have a pose but no depth map."""
+        return tuple(entry.name for entry in self.entries if entry.load_depth is None)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Decodes one frame (negative indices count from the end).
+
+        Raises:
+            IndexError: beyond the end.
+            FrameError: a file is missing, cannot be decoded, or has not the sequence's size.
+        """
+        entry = self.entries[index]
+        return Frame(
+            index=index % len(self.entries),
+            name=entry.name,
+            image=_load(entry.name, "image", entry.load_image, self.image_size),
+            depth=_load(entry.name, "depth map", entry.load_depth, self.depth_size),
+            T_world_cam=entry.T_world_cam.copy(),
+            intrinsics=self.intrinsics.copy(),
+            depth_intrinsics=None if self.depth_intrinsics is None else self.depth_intrinsics.copy(),
+            timestamp=entry.timestamp,
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        """All frames in order; the first that cannot be decoded raises :class:`FrameError`."""
+        return (self[index] for index in range(len(self)))
+
+    def readable(self, on_error: Callable[[FrameError], None]) -> Iterator[Frame]:
+        """The frames that can be decoded, in order; each other one's error is handed to ``on_error``."""
+        for index in range(len(self)):
+            try:
+                frame = self[index]
+            except FrameError as error:
+                on_error(error)
+            else:
+                yield frame
+
+
+def make_sequence(
+    name: str,
+    layout: str,
+    frames: Iterable[Entry | Skipped],
+    intrinsics: np.ndarray,
+    *,
+    image_size: Size | None,
+    depth_intrinsics: np.ndarray | None = None,
+    depth_size: Size | None = None,
+) -> Sequence:
+    """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W).
+
+    Raises:
+        ValueError: no frame is usable (the reasons are counted in the message); two frames share a name;
+            the intrinsics are malformed or belong to another image size.
+    """
+    listed = [_skip_non_finite(frame) for frame in frames]
+    entries = tuple(frame for frame in listed if isinstance(frame, Entry))
+    skipped = tuple(frame for frame in listed if isinstance(frame, Skipped))
+    if not entries:
+        reasons = Counter(frame.reason for frame in skipped).most_common(3)
+        told = "; ".join(f"{count} x {reason}" for reason, count in reasons) or "no frame was found"
+        raise ValueError(f"{layout} sequence {name!r} has no usable frame: {told}")
+    names = tuple(frame.name for frame in listed)
+    repeated = [frame_name for frame_name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise ValueError(f"{layout} sequence {name!r}: frame names must be unique, {repeated[:3]} occur twice")
+    check_intrinsics("intrinsics", intrinsics, image_size)
+    if depth_intrinsics is not None:
+        check_intrinsics("depth_intrinsics", depth_intrinsics, depth_size)
+    return Sequence(name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names)
+
+
+def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
+    """Raises ValueError unless K [3, 3] is a pinhole matrix whose centre lies well inside ``size`` (H, W)."""
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise ValueError(f"{argument} must be a finite 3x3 matrix with positive focal lengths, got {K.tolist()}")
+    if np.abs(K[2] - [0, 0, 1]).max() > 1e-9 or abs(K[1, 0]) > 1e-9:
+        raise ValueError(f"{argument} must have rows (fx s cx), (0 fy cy), (0 0 1), got {K.tolist()}")
+    if size is not None and not fits(K, size):
+        raise ValueError(
+            f"{argument} with principal point ({K[0, 2]:g}, {K[1, 2]:g}) px do not fit images of "
+            f"{size[1]}x{size[0]}: were they given for another image size?"
+        )
+
+
+def fits(K: np.ndarray, size: Size) -> bool:
+    """Whether K's principal point lies where a camera with images of ``size`` (H, W) can have it."""
+    low, high = _CENTRE_RANGE
+    return bool(low < K[0, 2] / size[1] < high and low < K[1, 2] / size[0] < high)
+
+
+def _skip_non_finite(frame: Entry | Skipped) -> Entry | Skipped:
+    if isinstance(frame, Entry) and not np.isfinite(frame.T_world_cam).all():
+        return Skipped(frame.name, "non-finite pose")
+    return frame
+
+
+def _load(name: str, what: str, load: Loader | None, size: Size | None) -> np.ndarray | None:
+    if load is None:
+        return None
+    array = load()
+    if size is not None and array.shape[:2] != size:
+        raise FrameError(
+            name,
+            f"the {what} is {array.shape[1]}x{array.shape[0]}, the sequence's are {size[1]}x{size[0]} "
+            "(its intrinsics hold for that size only)",
+        )
+    return array

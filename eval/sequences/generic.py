@@ -1,0 +1,230 @@
+"""Any posed images: a folder or a video, a trajectory, intrinsics, and optionally depth maps.
+
+Looked for in the sequence's folder (each can be given instead): images in one of ``images image rgb color
+frames`` or in the folder itself, or one video file; a trajectory ``poses.txt trajectory.txt groundtruth.txt
+...``; intrinsics ``K.txt intrinsics.txt ...``; depth maps in ``depth``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import Entry, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.images import (
+    DEPTH_SUFFIXES,
+    IMAGE_SUFFIXES,
+    common_size,
+    depth_loader,
+    first_image_size,
+    list_files,
+    read_color,
+)
+from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.pairing import pair_by_name
+from ufmstar_torch.eval.sequences.poses import Trajectory, associate, interpolate, read_trajectory
+from ufmstar_torch.eval.sequences.tum import read_file_list
+from ufmstar_torch.eval.sequences.video import VIDEO_SUFFIXES, Video
+
+IMAGES = ("images", "image", "rgb", "color", "frames")
+DEPTHS = ("depth", "depths")
+TRAJECTORIES = (
+    "poses.txt",
+    "pose.txt",
+    "trajectory.txt",
+    "traj.txt",
+    "groundtruth.txt",
+    "CameraTrajectory.txt",
+    "KeyFrameTrajectory.txt",
+    "cam0_to_world.txt",
+)
+INTRINSICS = ("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt")
+LOOKED_FOR = f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}), {INTRINSICS[0]}"
+# Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
+_NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14
+
+
+def detect(path: Path) -> bool:
+    """Whether images and a trajectory lie where this reader looks for them."""
+    if path.is_file():
+        return path.suffix.lower() in VIDEO_SUFFIXES
+    has_trajectory = any((path / name).is_file() for name in TRAJECTORIES)
+    return has_trajectory and bool(_image_sources(path))
+
+
+def open_generic(path: Path, options: Options) -> Sequence:
+    """Opens images or a video with a trajectory.
+
+    Without timestamps in the trajectory, pose i belongs to the i-th image (numbers sorted by value).
+    With them, an image's time is, in this order: its line in ``rgb.txt`` beside the images or their folder;
+    index / ``fps`` (a video has its own fps); its name as a number [s, or us or ns if as large]; each plus
+    ``time_offset``. The pose is interpolated as for TUM RGB-D.
+    Depth maps belong to the image with the same stem or the same numbers in their names, or else, where
+    their names are timestamps too, to the nearest within ``max_time_difference``, one-to-one.
+
+    Raises:
+        ValueError: images, trajectory or intrinsics are not found or found twice; more or fewer poses than
+            images; no image has a pose (both time ranges are given); depth maps that fit no image.
+    """
+    options.reject("generic", "T_color_depth")
+    root = path if path.is_dir() else path.parent
+    names, loaders, size, times = _images(path, options)
+    trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
+    poses = _poses(names, times, trajectory, options)
+    depth_files = _depth_files(root, names, times, options)
+    frames: list[Entry | Skipped] = []
+    for i, (name, T) in enumerate(zip(names, poses, strict=True)):
+        if T is None:
+            frames.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
+            continue
+        load_depth = depth_loader(depth_files.get(name), options.depth_scale)
+        frames.append(Entry(name, T, loaders[i], load_depth, None if times is None else float(times[i])))
+    K = read_intrinsics(
+        options.intrinsics if options.intrinsics is not None else _given_or_found(root, None, INTRINSICS, "intrinsics")
+    )
+    depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
+    return make_sequence(
+        path.resolve().stem if path.is_file() else path.resolve().name,
+        "generic",
+        frames,
+        K,
+        image_size=size,
+        depth_intrinsics=_depth_intrinsics(options, K, size, depth_size),
+        depth_size=depth_size,
+    )
+
+
+def _images(path: Path, options: Options) -> tuple[list[str], list[Loader], Size | None, np.ndarray | None]:
+    """Names, loaders, (H, W) and timestamps (None where nothing tells them) of the images."""
+    source = path
+    if options.images is not None:
+        source = _resolve(path, options.images)
+    elif path.is_dir():
+        found = _image_sources(path)
+        if len(found) != 1:
+            told = f"found {[str(f) for f in found]}" if found else f"looked for {IMAGES} and a video file"
+            raise ValueError(f"{path}: pass images, there must be one folder of them or one video ({told})")
+        source = found[0]
+    if source.is_file():
+        video = Video(source)
+        names = [f"{i:06d}" for i in range(len(video))]
+        times = np.arange(len(video)) / (options.fps or video.fps) + options.time_offset
+        return names, [partial(video.read, i) for i in range(len(video))], video.size, times
+    files = list_files(source, IMAGE_SUFFIXES)
+    if not files:
+        raise ValueError(f"{source} holds no image ({', '.join(IMAGE_SUFFIXES)})")
+    loaders: list[Loader] = [partial(read_color, file) for file in files]
+    return [file.stem for file in files], loaders, first_image_size(files), _image_times(source, files, options)
+
+
+def _image_sources(path: Path) -> list[Path]:
+    """Folders with images, or else the folder itself, or else its video files."""
+    folders = [path / name for name in IMAGES if (path / name).is_dir()]
+    if folders:
+        return folders
+    if list_files(path, IMAGE_SUFFIXES):
+        return [path]
+    return list_files(path, VIDEO_SUFFIXES)
+
+
+def _image_times(folder: Path, files: list[Path], options: Options) -> np.ndarray | None:
+    listing = next((f / "rgb.txt" for f in (folder, folder.parent) if (f / "rgb.txt").is_file()), None)
+    if listing is not None:
+        listed = {Path(name).name: time for time, name in zip(*read_file_list(listing), strict=True)}
+        absent = [file.name for file in files if file.name not in listed]
+        if absent:
+            raise ValueError(f"{listing} has no timestamp for {len(absent)} images: {absent[:3]}")
+        times = np.array([listed[file.name] for file in files])
+    elif options.fps is not None:
+        times = np.arange(len(files)) / options.fps
+    else:
+        stamps = _stem_times(files)
+        if stamps is None:
+            return None
+        times = stamps
+    return times + options.time_offset
+
+
+def _stem_times(files: list[Path]) -> np.ndarray | None:
+    """File names as timestamps [s]; None where one is no number."""
+    try:
+        times = np.array([float(file.stem) for file in files])
+    except ValueError:
+        return None
+    if times.max() > _MICROSECONDS_ABOVE:
+        times = times / (1e9 if times.max() > _NANOSECONDS_ABOVE else 1e6)
+    return times
+
+
+def _poses(
+    names: list[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
+) -> list[np.ndarray | None]:
+    """The pose of each image, None where the trajectory has none at its time."""
+    if trajectory.timestamps is None:
+        if len(trajectory) != len(names):
+            raise ValueError(
+                f"trajectory has {len(trajectory)} poses for {len(names)} images: without timestamps, there "
+                "must be one for each"
+            )
+        return list(trajectory.T_world_cam)
+    if times is None:
+        raise ValueError(
+            f"images: the name {names[0]!r} is no timestamp, and there is no rgb.txt; the trajectory has "
+            "timestamps, so pass fps (and time_offset)"
+        )
+    poses = [interpolate(trajectory, float(time), options.max_pose_gap) for time in times]
+    if all(T is None for T in poses):
+        known = trajectory.timestamps
+        raise ValueError(
+            f"no image has a pose: images lie at {times[0]:.3f} to {times[-1]:.3f} s, the trajectory's "
+            f"{len(known)} poses at {known[0]:.3f} to {known[-1]:.3f} s, used where they lie at most "
+            f"{options.max_pose_gap:g} s apart; see fps, time_offset and max_pose_gap"
+        )
+    return poses
+
+
+def _depth_files(root: Path, names: list[str], times: np.ndarray | None, options: Options) -> dict[str, Path]:
+    folder = next((root / name for name in DEPTHS if (root / name).is_dir()), None)
+    if options.depth is not None:
+        folder = _resolve(root, options.depth)
+    if folder is None:
+        return {}
+    files = list_files(folder, DEPTH_SUFFIXES)
+    pairs = pair_by_name(names, files)
+    depth_times = _stem_times(files) if files and not pairs else None
+    if depth_times is not None and times is not None:
+        near = associate(times, depth_times + options.time_offset, options.max_time_difference)
+        pairs = {names[i]: files[j] for i, j in near.items()}
+    if files and not pairs:
+        raise ValueError(f"{folder}: no depth map ({files[0].name}, ...) is named like an image ({names[0]}, ...)")
+    return pairs
+
+
+def _depth_intrinsics(options: Options, K: np.ndarray, size: Size | None, depth_size: Size | None) -> np.ndarray | None:
+    """K of the depth maps, where it is given or follows from a size that is not the images'."""
+    if options.depth_intrinsics is not None:
+        return read_intrinsics(options.depth_intrinsics)
+    if depth_size is None or size is None or depth_size == size:
+        return None
+    return scale_intrinsics(K, size, depth_size)
+
+
+def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...], option: str) -> Path:
+    if given is not None:
+        return _resolve(root, given)
+    found = [root / name for name in names if (root / name).is_file()]
+    if len(found) != 1:
+        told = f"found {[file.name for file in found]}" if found else f"looked for {', '.join(names)}"
+        raise ValueError(f"{root}: pass {option}, exactly one file must be it ({told})")
+    return found[0]
+
+
+def _resolve(root: Path, given: str | Path) -> Path:
+    """A path as the user gave it: inside the sequence's folder, or else from the working folder."""
+    for path in (root / given, Path(given)):
+        if path.exists():
+            return path
+    raise FileNotFoundError(f"no such file or folder: {given} (neither in {root} nor in the working folder)")

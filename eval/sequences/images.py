@@ -1,0 +1,167 @@
+"""Decoding of colour images and depth maps; every file that cannot be decoded raises ``FrameError``.
+
+Pillow decodes: it raises on truncated files, where OpenCV returns what it got. Pixels are taken as stored
+(an EXIF orientation is not applied: intrinsics hold for the stored pixels).
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ufmstar_torch.eval.sequences.exr import read_exr
+from ufmstar_torch.eval.sequences.frame import FrameError, Loader, Size
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
+# Pillow's plugins raise these for broken files, beside OSError (SyntaxError: bad PNG chunk).
+_BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError)
+# Key of a PNG's text chunk: metres per unit of its 16-bit values.
+SCALE_KEY = "depth_scale"
+_MILLIMETRE = 1e-3
+
+
+def read_color(path: str | Path) -> np.ndarray:
+    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped).
+
+    Raises:
+        FrameError: missing, truncated, corrupt, or not an 8-bit image.
+    """
+    try:
+        with Image.open(path) as image:
+            if image.mode[0] in "IF":  # Pillow would clip these at 255 without a word
+                raise FrameError(path, f"expected an 8-bit colour or grey image, got mode {image.mode}")
+            return np.array(image.convert("RGB"))
+    except _BROKEN_IMAGE as error:
+        raise FrameError(path, f"cannot be decoded: {error}") from error
+
+
+def read_depth(path: str | Path, scale: float | None = None, *, default_scale: float = _MILLIMETRE) -> np.ndarray:
+    """A depth map as [H, W] float32 [m]; non-finite and non-positive values become 0 (invalid).
+
+    Args:
+        path: 16-bit PNG or TIFF, float TIFF, EXR, npy or npz (key ``depth``, or its only array).
+        scale: metres per unit of the stored values, for any of these. None: floats are metres; integers
+            are in the unit that a PNG's text ``depth_scale`` names, or else in ``default_scale``.
+        default_scale: metres per unit of integers without another indication.
+
+    Raises:
+        FrameError: missing, truncated, corrupt, or not a depth map (8-bit, several channels).
+    """
+    values, named_scale = read_map(path, key="depth")
+    if scale is None and np.issubdtype(values.dtype, np.integer):
+        scale = named_scale or default_scale
+    depth = values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
+    """A one-channel map [H, W] as stored, and the metres per unit that a PNG's text names (or None).
+
+    Args:
+        path: PNG, TIFF, EXR, npy or npz.
+        key: which array of an npz to take, where it holds several.
+
+    Raises:
+        FrameError: as :func:`read_depth`.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    scale = None
+    try:
+        if suffix == ".exr":
+            values = read_exr(path)
+        elif suffix == ".npy":
+            values = np.load(path, allow_pickle=False)
+        elif suffix == ".npz":
+            values = _from_npz(path, key)
+        else:
+            values, scale = _from_image(path)
+    except (*_BROKEN_IMAGE, zipfile.BadZipFile, KeyError) as error:
+        raise FrameError(path, f"cannot be decoded: {error}") from error
+    if values.ndim == 3 and 1 in (values.shape[0], values.shape[-1]):
+        values = values[0] if values.shape[0] == 1 else values[..., 0]
+    if values.ndim != 2 or not (np.issubdtype(values.dtype, np.number) and np.isrealobj(values)):
+        raise FrameError(path, f"expected a map [H, W] of numbers, got {values.dtype} {list(values.shape)}")
+    return values, scale
+
+
+def image_size(path: str | Path) -> Size:
+    """(H, W) from an image's header; FrameError where even that cannot be read."""
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except _BROKEN_IMAGE as error:
+        raise FrameError(path, f"cannot be decoded: {error}") from error
+
+
+def first_image_size(paths: Iterable[Path]) -> Size | None:
+    """(H, W) of the first image whose header can be read; None where there is none."""
+    for path in paths:
+        try:
+            return image_size(path)
+        except FrameError:  # raised again, and counted, when that frame is asked for
+            continue
+    return None
+
+
+def common_size(loaders: Iterable[Loader | None]) -> Size | None:
+    """(H, W) of the first array that can be loaded; None where none can."""
+    for load in loaders:
+        if load is None:
+            continue
+        try:
+            array = load()
+        except FrameError:  # as above
+            continue
+        return array.shape[0], array.shape[1]
+    return None
+
+
+def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10)."""
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file()), key=natural_key)
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key of a file name: digit groups by value, the rest as text."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(0, int(part), part) if part.isdigit() else (1, 0, part) for part in parts]
+
+
+def depth_loader(path: Path | None, scale: float | None, default_scale: float = _MILLIMETRE) -> Loader | None:
+    """What :class:`Entry` keeps for a depth file (None stays None)."""
+    return None if path is None else partial(read_depth, path, scale, default_scale=default_scale)
+
+
+def check_scale(depth_scale: float | None) -> None:
+    """Raises ValueError unless metres per unit is a positive number of at most 1, or None."""
+    if depth_scale is not None and not 0 < depth_scale <= 1:
+        raise ValueError(
+            f"depth_scale is in metres per unit (0.001 for millimetres, 1/5000 for TUM), got {depth_scale}"
+        )
+
+
+def _from_image(path: Path) -> tuple[np.ndarray, float | None]:
+    with Image.open(path) as image:
+        image.load()
+        if image.mode[0] not in "IF":
+            raise FrameError(path, f"expected a 16-bit or float depth image with one channel, got {image.mode}")
+        text = image.info.get(SCALE_KEY)
+        values = np.array(image)
+    return values, None if text is None else float(text)
+
+
+def _from_npz(path: Path, key: str) -> np.ndarray:
+    # Opened here: given a path, NumPy leaves the file open when the archive turns out to be broken.
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        names = archive.files
+        if key not in names and len(names) != 1:
+            raise KeyError(f"expected the key {key!r} or a single array, got {names}")
+        return archive[key if key in names else names[0]]

@@ -1,0 +1,59 @@
+"""Intrinsics from the forms in which users have them, and their scaling to another image size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Numbers
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.sequences.frame import Size
+from ufmstar_torch.eval.sequences.poses import read_matrix
+
+# A file's path, a matrix [3, 3] (or [4, 4], as ScanNet writes it), or the numbers fx, fy, cx, cy [px].
+IntrinsicsLike = str | Path | np.ndarray | Numbers[float]
+
+# Sizes whose aspect ratios differ by more than this were cropped, not resized.
+_ASPECT_TOLERANCE = 0.02
+
+
+def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
+    """[3, 3] float64 [px] from a text file or numbers: 3x3, 4x4, 3x4, or ``fx fy cx cy``.
+
+    Raises:
+        ValueError: the file or array has another shape.
+    """
+    if isinstance(source, str | Path):
+        values, told = read_matrix(source), f"intrinsics file {source}"
+    else:
+        values, told = np.array(source, dtype=np.float64), "intrinsics"
+    if values.shape in ((4,), (1, 4), (4, 1)):
+        return pinhole(*values.ravel())
+    if values.size == 9:
+        values = values.reshape(3, 3)
+    if values.shape not in ((3, 3), (3, 4), (4, 4)):
+        raise ValueError(f"{told}: expected a 3x3 matrix or fx fy cx cy, got shape {list(values.shape)}")
+    return np.ascontiguousarray(values[:3, :3])
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """The matrix [3, 3] of a pinhole camera [px]."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def scale_intrinsics(K: np.ndarray, old: Size, new: Size) -> np.ndarray:
+    """K [3, 3] of images (H, W) ``old`` after they were resized to ``new``.
+
+    Raises:
+        ValueError: the aspect ratios differ, so that the images were not only resized.
+    """
+    if old == new:
+        return K.copy()
+    if abs((new[1] / new[0]) / (old[1] / old[0]) - 1) > _ASPECT_TOLERANCE:
+        raise ValueError(
+            f"intrinsics are known for {old[1]}x{old[0]} images, these are {new[1]}x{new[0]}, which is not "
+            "only a resize: pass intrinsics"
+        )
+    return resize_intrinsics(torch.from_numpy(K), old, new).numpy()

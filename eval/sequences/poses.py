@@ -1,0 +1,219 @@
+"""Trajectories: reading the common text formats, interpolation, association by timestamp.
+
+All poses are camera-to-world. Formats are told apart by the number of columns of a line:
+
+====  ==========================================================
+7     ``tx ty tz qx qy qz qw`` (TartanAir)
+8     ``timestamp tx ty tz qx qy qz qw`` (TUM, ORB-SLAM3, ...)
+12    3x4 rows of a matrix (KITTI)
+13    frame number or timestamp, then 3x4 rows
+16    4x4 rows of a matrix
+17    frame number or timestamp, then 4x4 rows (KITTI-360)
+====  ==========================================================
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+# TUM writes quaternions with four decimals, which leaves the norm within 2e-4 of 1; a hundred times that
+# is no rounding any more but another column order or unit.
+_QUATERNION_TOLERANCE = 0.02
+# An image this close to a sample takes its pose as it is, whatever the gap around it [s]: timestamps are
+# printed with four to six decimals, and at 1 m/s the camera moves 1 mm in that time.
+_SAME_TIME = 1e-3
+# printf on Windows writes NaN and infinity as 1.#IND, 1.#QNAN, 1.#INF.
+_WINDOWS_NON_FINITE = re.compile(r"[+-]?1\.?#(IND|QNAN|SNAN|INF)\d*", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Camera-to-world poses, in order.
+
+    Attributes:
+        timestamps: [N] float64, strictly increasing [s] (or frame numbers, if the file has those), or None
+            where pose i belongs to frame i.
+        T_world_cam: [N, 4, 4] float64; a pose that was not finite in the file is all NaN.
+    """
+
+    timestamps: np.ndarray | None
+    T_world_cam: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.T_world_cam)
+
+
+def read_trajectory(path: str | Path) -> Trajectory:
+    """Reads a trajectory in any of the formats of this module; ``#`` starts a comment.
+
+    Samples are sorted by time; of two with the same timestamp the first is kept.
+
+    Raises:
+        ValueError: a line (named by file and number) is no pose of a known format, the number of columns
+            changes, a quaternion's norm is not 1, a bottom row is not 0 0 0 1; or there is no pose at all.
+    """
+    rows: list[list[float]] = []
+    lines: list[str] = []
+    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+        content = _strip_comment(text)
+        if content:
+            where = f"{path}:{number}"
+            rows.append([_number(token, where) for token in content.split()])
+            lines.append(where)
+            _check_columns(len(rows[-1]), len(rows[0]), where)
+    if not rows:
+        raise ValueError(f"{path}: no pose found, expected lines of 7, 8, 12, 13, 16 or 17 numbers")
+    values = np.array(rows, dtype=np.float64)
+    timestamps = None
+    if values.shape[1] in (8, 13, 17):
+        timestamps, values = values[:, 0], values[:, 1:]
+        bad = np.flatnonzero(~np.isfinite(timestamps))
+        if bad.size:
+            raise ValueError(f"{lines[bad[0]]}: the timestamp must be finite, got {timestamps[bad[0]]}")
+    T_world_cam = _poses_from_columns(values, lines)
+    if timestamps is not None:
+        timestamps, first = np.unique(timestamps, return_index=True)
+        T_world_cam = T_world_cam[first]
+    return Trajectory(timestamps, T_world_cam)
+
+
+def interpolate(trajectory: Trajectory, time: float, max_gap: float) -> np.ndarray | None:
+    """The pose [4, 4] at ``time`` [s]: position linear, rotation by slerp between the bracketing samples.
+
+    A sample within 1 ms is taken as it is. NaN where a sample that is needed is not finite.
+
+    Returns:
+        None where the bracketing samples lie more than ``max_gap`` [s] apart, or ``time`` lies outside.
+
+    Raises:
+        ValueError: the trajectory has no timestamps.
+    """
+    times = trajectory.timestamps
+    if times is None:
+        raise ValueError("trajectory has no timestamps, so it cannot be interpolated")
+    after = int(np.searchsorted(times, time))
+    around = [i for i in (after - 1, after) if 0 <= i < len(times)]
+    nearest = min(around, key=lambda i: abs(times[i] - time))
+    if abs(times[nearest] - time) <= _SAME_TIME:
+        return trajectory.T_world_cam[nearest].copy()
+    if len(around) < 2 or times[after] - times[after - 1] > max_gap:
+        return None
+    first, second = trajectory.T_world_cam[after - 1], trajectory.T_world_cam[after]
+    if not (np.isfinite(first).all() and np.isfinite(second).all()):
+        return np.full((4, 4), np.nan)
+    share = (time - times[after - 1]) / (times[after] - times[after - 1])
+    turn = Slerp([0.0, 1.0], Rotation.from_matrix([first[:3, :3], second[:3, :3]]))
+    T = np.eye(4)
+    T[:3, :3] = turn(share).as_matrix()
+    T[:3, 3] = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    return T
+
+
+def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> dict[int, int]:
+    """One-to-one pairs {i: j} of timestamps [N] and [M] [s] that differ by at most ``max_difference``.
+
+    As TUM's tool pairs colour and depth: of all admissible pairs the closest comes first, and each
+    timestamp is used once (ties: the earlier one).
+    """
+    order = np.argsort(second, kind="stable")
+    ordered = second[order]
+    low = np.searchsorted(ordered, first - max_difference, side="left")
+    high = np.searchsorted(ordered, first + max_difference, side="right")
+    candidates = [
+        (abs(first[i] - ordered[k]), i, int(order[k])) for i in range(len(first)) for k in range(low[i], high[i])
+    ]
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in sorted(candidates):
+        if i not in pairs and j not in taken:
+            pairs[i] = j
+            taken.add(j)
+    return pairs
+
+
+def read_matrix(path: str | Path) -> np.ndarray:
+    """The numbers of a small text file, one row per line, [R, C] float64; non-finite ones are kept.
+
+    Raises:
+        ValueError: a line holds something else than numbers, or lines differ in length.
+    """
+    rows: list[list[float]] = []
+    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+        where = f"{path}:{number}"
+        row = [_number(token, where) for token in _strip_comment(text).split()]
+        if row and rows and len(row) != len(rows[0]):
+            raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first line, got {len(row)}")
+        if row:
+            rows.append(row)
+    return np.array(rows, dtype=np.float64)
+
+
+def read_pose(path: str | Path) -> np.ndarray:
+    """The camera-to-world pose [4, 4] of a file with one 4x4 matrix; all NaN if an entry is not finite.
+
+    Raises:
+        ValueError: the file does not hold 4x4 numbers with the bottom row 0 0 0 1.
+    """
+    T = read_matrix(path)
+    if T.shape != (4, 4):
+        raise ValueError(f"{path}: expected a 4x4 matrix, got {' x '.join(map(str, T.shape))} numbers")
+    return _poses_from_columns(T.reshape(1, 16), [str(path)])[0]
+
+
+def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) -> np.ndarray:
+    """[N, 4, 4] poses from positions [N, 3] [m] and finite quaternions [N, 4], normalised here."""
+    T = np.tile(np.eye(4), (len(position), 1, 1))
+    T[:, :3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
+    T[:, :3, 3] = position
+    return T
+
+
+def _poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
+    """[N, 4, 4] from rows of 7 (position, quaternion), 12 or 16 numbers; non-finite rows become NaN."""
+    T = np.full((len(values), 4, 4), np.nan)
+    finite = np.isfinite(values).all(axis=1)
+    if values.shape[1] == 7:
+        norm = np.linalg.norm(values[:, 3:], axis=1)
+        bad = np.flatnonzero(finite & (np.abs(norm - 1) > _QUATERNION_TOLERANCE))
+        if bad.size:
+            raise ValueError(f"{lines[bad[0]]}: the quaternion's norm is {norm[bad[0]]:.4g}, expected 1")
+        if finite.any():
+            T[finite] = poses_from_quaternions(values[finite, :3], values[finite, 3:])
+        return T
+    rows = values.reshape(len(values), -1, 4)
+    if rows.shape[1] == 4:
+        bad = np.flatnonzero(finite & (np.abs(rows[:, 3] - [0, 0, 0, 1]).max(axis=1) > 1e-6))
+        if bad.size:
+            raise ValueError(f"{lines[bad[0]]}: a pose's bottom row must be 0 0 0 1, got {rows[bad[0], 3]}")
+    T[finite, :3] = rows[finite, :3]
+    T[finite, 3] = [0, 0, 0, 1]
+    return T
+
+
+def _check_columns(count: int, expected: int, where: str) -> None:
+    if count not in (7, 8, 12, 13, 16, 17):
+        raise ValueError(
+            f"{where}: expected a pose of 7 or 8 (tx ty tz qx qy qz qw), 12 or 13 (3x4), 16 or 17 (4x4) "
+            f"numbers separated by spaces, got {count}"
+        )
+    if count != expected:
+        raise ValueError(f"{where}: expected {expected} numbers as in the first pose, got {count}")
+
+
+def _strip_comment(text: str) -> str:
+    """The line without its comment; a ``#`` inside a token (Windows' 1.#IND) starts none."""
+    return re.split(r"(?:^|\s)#", text, maxsplit=1)[0].strip()
+
+
+def _number(token: str, where: str) -> float:
+    if _WINDOWS_NON_FINITE.fullmatch(token):
+        return float("nan")
+    try:
+        return float(token)
+    except ValueError:
+        raise ValueError(f"{where}: expected a number, got {token!r}") from None

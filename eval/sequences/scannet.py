@@ -1,0 +1,84 @@
+"""ScanNet as SensReader exports it: ``color/N.jpg depth/N.png pose/N.txt intrinsic/intrinsic_*.txt``.
+
+Depth is 16-bit in mm and has its own size and intrinsics (640x480 beside 1296x968); poses that SensReader
+could not track are -inf. https://github.com/ScanNet/ScanNet/tree/master/SensReader
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Size, Skipped, fits, make_sequence
+from ufmstar_torch.eval.sequences.images import (
+    IMAGE_SUFFIXES,
+    common_size,
+    depth_loader,
+    first_image_size,
+    list_files,
+    read_color,
+)
+from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import read_pose
+
+LOOKED_FOR = "color/, pose/ and intrinsic/ folders"
+_NATIVE_COLOR, _NATIVE_DEPTH = (968, 1296), (480, 640)
+
+
+def detect(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return all((path / folder).is_dir() for folder in ("color", "pose", "intrinsic"))
+
+
+def open_scannet(path: Path, options: Options) -> Sequence:
+    """Opens a SensReader export; depth comes as it is, with ``depth_intrinsics``.
+
+    Exports with resized images keep the original ``intrinsic_color.txt``: intrinsics that fit 1296x968
+    (depth: 640x480) but not the files' size are scaled to it.
+
+    Raises:
+        ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file.
+        FileNotFoundError: no ``intrinsic_color.txt`` and ``intrinsics`` is not given.
+    """
+    options.reject("scannet", "trajectory", "images", "depth", "fps", "T_color_depth")
+    images = list_files(path / "color", IMAGE_SUFFIXES)
+    frames = [_frame(path, image, options.depth_scale) for image in images]
+    if not images:
+        raise ValueError(f"scannet sequence {path.name!r}: the folder color/ holds no image")
+    color_size = first_image_size(images) or _NATIVE_COLOR
+    depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
+    K = _intrinsics(options.intrinsics, path / "intrinsic" / "intrinsic_color.txt", _NATIVE_COLOR, color_size)
+    K_depth = None
+    if depth_size is not None:
+        file = path / "intrinsic" / "intrinsic_depth.txt"
+        K_depth = _intrinsics(options.depth_intrinsics, file, _NATIVE_DEPTH, depth_size)
+    return make_sequence(
+        path.resolve().name,
+        "scannet",
+        frames,
+        K,
+        image_size=color_size,
+        depth_intrinsics=K_depth,
+        depth_size=depth_size,
+    )
+
+
+def _frame(path: Path, image: Path, depth_scale: float | None) -> Entry | Skipped:
+    pose = path / "pose" / f"{image.stem}.txt"
+    if not pose.is_file():
+        return Skipped(image.stem, "missing pose file")
+    depth = path / "depth" / f"{image.stem}.png"
+    load_depth = depth_loader(depth if depth.is_file() else None, depth_scale)
+    return Entry(image.stem, read_pose(pose), partial(read_color, image), load_depth)
+
+
+def _intrinsics(given: IntrinsicsLike | None, file: Path, native: Size, size: Size) -> np.ndarray:
+    if given is not None:
+        return read_intrinsics(given)
+    K = read_intrinsics(file)
+    if not fits(K, size) and fits(K, native):
+        return scale_intrinsics(K, native, size)
+    return K

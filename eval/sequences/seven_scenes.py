@@ -1,0 +1,121 @@
+"""7-Scenes: ``frame-NNNNNN.{color.png|color.jpg, depth.png, pose.txt}``, depth in mm, 0 and 65535 invalid.
+
+What its authors publish is the depth camera's K = 585, 585, 320, 240 and that colour and depth were never
+calibrated to each other; the poses are the depth camera's (KinectFusion tracks with it). The colour camera
+is a Kinect's: K = 525, 525, 320, 240 and a baseline of 2.5 cm along x are the values customary in the
+literature, good to a few pixels. Pass ``intrinsics`` and ``T_color_depth`` where better ones are known.
+https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.images import common_size, first_image_size, natural_key, read_color, read_map
+from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import read_pose
+from ufmstar_torch.eval.sequences.register import register_depth
+
+LOOKED_FOR = "frame-NNNNNN.pose.txt files"
+_NATIVE_SIZE = (480, 640)
+_K_COLOR = (525.0, 525.0, 320.0, 240.0)
+_K_DEPTH = (585.0, 585.0, 320.0, 240.0)
+_MILLIMETRE = 1e-3
+_NO_DEPTH = 65535
+_BASELINE = 0.025  # [m] the colour camera sits to the right of the depth camera
+_FRAME = re.compile(r"(frame-\d+)\.(color\.png|color\.jpg|depth\.png|pose\.txt)")
+
+
+def detect(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return path.is_dir() and any(path.glob("frame-*.pose.txt"))
+
+
+def approximate_T_color_depth() -> np.ndarray:
+    """[4, 4] from the depth into the colour camera: -2.5 cm along x, no rotation (an approximation)."""
+    T = np.eye(4)
+    T[0, 3] = -_BASELINE
+    return T
+
+
+def open_seven_scenes(path: Path, options: Options) -> Sequence:
+    """Opens a 7-Scenes sequence folder (``seq-NN``).
+
+    With ``register`` (the default) depth is warped into the colour camera, and ``T_world_cam`` is the
+    colour camera's: the file's pose, which is the depth camera's, times ``T_color_depth``'s inverse.
+    Without it, depth and pose are the depth camera's as on disk, with ``depth_intrinsics``, and the
+    2.5 cm to the colour camera are ignored.
+
+    Raises:
+        ValueError: no usable frame, or a malformed pose file.
+    """
+    options.reject("7scenes", "trajectory", "images", "depth", "fps")
+    files: dict[str, dict[str, Path]] = {}
+    for file in sorted(path.iterdir(), key=natural_key):
+        found = _FRAME.fullmatch(file.name)
+        if found:
+            files.setdefault(found[1], {})[found[2].split(".")[0]] = file
+    color_size = first_image_size(kinds["color"] for kinds in files.values() if "color" in kinds) or _NATIVE_SIZE
+    depth_size = common_size(partial(read_kinect, kinds["depth"]) for kinds in files.values() if "depth" in kinds)
+    K_color = _intrinsics(options.intrinsics, _K_COLOR, color_size)
+    K_depth = _intrinsics(options.depth_intrinsics, _K_DEPTH, depth_size or _NATIVE_SIZE)
+    T_color_depth = approximate_T_color_depth() if options.T_color_depth is None else options.T_color_depth
+    scale = options.depth_scale or _MILLIMETRE
+    frames = []
+    for name, kinds in files.items():
+        frame = _frame(name, kinds, scale)
+        if isinstance(frame, Entry) and options.register:
+            frame = _registered(frame, K_depth, K_color, T_color_depth, color_size)
+        frames.append(frame)
+    return make_sequence(
+        path.resolve().name,
+        "7scenes",
+        frames,
+        K_color,
+        image_size=color_size,
+        depth_intrinsics=None if options.register else K_depth,
+        depth_size=color_size if options.register else depth_size,
+    )
+
+
+def read_kinect(path: Path, scale: float = _MILLIMETRE) -> np.ndarray:
+    """A depth PNG [H, W] float32 [m] in which 65535 as well as 0 is invalid; errors as ``read_depth``."""
+    values, _ = read_map(path, key="depth")
+    if values.dtype != np.uint16:
+        raise FrameError(path, f"expected 16-bit depth, got {values.dtype}")
+    return np.where(values == _NO_DEPTH, 0, values * scale).astype(np.float32)
+
+
+def _frame(name: str, kinds: dict[str, Path], scale: float) -> Entry | Skipped:
+    if "pose" not in kinds:
+        return Skipped(name, "missing pose file")
+    if "color" not in kinds:
+        return Skipped(name, "missing image file")
+    load_depth = partial(read_kinect, kinds["depth"], scale) if "depth" in kinds else None
+    return Entry(name, read_pose(kinds["pose"]), partial(read_color, kinds["color"]), load_depth)
+
+
+def _registered(entry: Entry, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size) -> Entry:
+    T_world_color = entry.T_world_cam @ np.linalg.inv(T_color_depth)
+    load = entry.load_depth
+    if load is not None:
+        load = partial(_load_registered, load, K_depth, K_color, T_color_depth, size)
+    return Entry(entry.name, T_world_color, entry.load_image, load)
+
+
+def _load_registered(
+    load: Loader, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size
+) -> np.ndarray:
+    return register_depth(load(), K_depth, K_color, T_color_depth, size)
+
+
+def _intrinsics(given: IntrinsicsLike | None, default: tuple[float, float, float, float], size: Size) -> np.ndarray:
+    if given is not None:
+        return read_intrinsics(given)
+    return scale_intrinsics(pinhole(*default), _NATIVE_SIZE, size)

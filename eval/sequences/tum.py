@@ -1,0 +1,114 @@
+"""TUM RGB-D: ``rgb/ depth/ rgb.txt depth.txt groundtruth.txt``, 16-bit depth in 1/5000 m.
+
+Depth is registered to colour. Colour and depth have their own timestamps and are paired one-to-one; the
+pose is interpolated at the colour image's time. https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import Entry, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.images import common_size, depth_loader, first_image_size, read_color
+from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import Trajectory, associate, interpolate, read_trajectory
+
+LOOKED_FOR = "rgb.txt and groundtruth.txt"
+_SCALE = 1 / 5000
+_NATIVE_SIZE = (480, 640)
+# The colour cameras' published calibration, by robot; their distortion is left in the images.
+_INTRINSICS = {
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
+}
+
+
+def detect(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
+
+
+def open_tum(path: Path, options: Options) -> Sequence:
+    """Opens a TUM RGB-D sequence.
+
+    A colour image is skipped where it is missing on disk or no pose is known at its time (the samples
+    around it lie more than ``max_pose_gap`` apart, or it is outside the trajectory). One without a depth
+    map within ``max_time_difference`` stays, with ``depth`` None.
+
+    Raises:
+        ValueError: no usable frame; the camera is not named by the folder or the files (``freiburgN``) and
+            ``intrinsics`` is not given; a malformed line (named by file and number).
+    """
+    options.reject("tum", "images", "depth", "depth_intrinsics", "fps", "T_color_depth")
+    color_times, color_files = read_file_list(path / "rgb.txt")
+    trajectory = read_trajectory(options.trajectory or path / "groundtruth.txt")
+    depth_files = _paired_depth(path, color_times, options.max_time_difference)
+    frames: list[Entry | Skipped] = []
+    for i, (time, file) in enumerate(zip(color_times, color_files, strict=True)):
+        load_depth = depth_loader(depth_files.get(i), options.depth_scale, _SCALE)
+        frames.append(_frame(path / file, float(time) + options.time_offset, trajectory, load_depth, options))
+    size = first_image_size(path / file for file in color_files)
+    K = _default_intrinsics(path, size) if options.intrinsics is None else read_intrinsics(options.intrinsics)
+    depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
+    return make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size)
+
+
+def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Timestamps [N] [s] and file names of lines ``timestamp filename``; ``#`` starts a comment line.
+
+    Raises:
+        ValueError: a line (named by file and number) has another form.
+    """
+    times, files = [], []
+    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        words = text.split(maxsplit=1)
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            times.append(float(words[0]))
+            files.append(words[1].strip())
+        except (ValueError, IndexError):
+            raise ValueError(f"{path}:{number}: expected 'timestamp filename', got {text!r}") from None
+    return np.array(times, dtype=np.float64), files
+
+
+def _frame(
+    file: Path, time: float, trajectory: Trajectory, load_depth: Loader | None, options: Options
+) -> Entry | Skipped:
+    if not file.is_file():
+        return Skipped(file.stem, "missing image file")
+    if trajectory.timestamps is None:
+        raise ValueError("trajectory must have timestamps for layout 'tum' (8 numbers in a line)")
+    T = interpolate(trajectory, time, options.max_pose_gap)
+    if T is None:
+        return Skipped(file.stem, f"no pose within {options.max_pose_gap:g} s around the image")
+    return Entry(file.stem, T, partial(read_color, file), load_depth, time)
+
+
+def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) -> dict[int, Path]:
+    """The depth files by index of the colour image, those that exist."""
+    if not (path / "depth.txt").is_file():
+        return {}
+    depth_times, depth_files = read_file_list(path / "depth.txt")
+    pairs = associate(color_times, depth_times, max_difference)
+    files = {i: path / depth_files[j] for i, j in pairs.items()}
+    return {i: file for i, file in files.items() if file.is_file()}
+
+
+def _default_intrinsics(path: Path, size: Size | None) -> np.ndarray:
+    """The camera's K, known from ``freiburgN`` in the folder's name or in the header of rgb.txt."""
+    header = (path / "rgb.txt").read_text(encoding="utf-8")[:500]
+    for text in (path.resolve().name, header):
+        found = re.search(r"freiburg([123])", text)
+        if found:
+            return scale_intrinsics(pinhole(*_INTRINSICS[found[1]]), _NATIVE_SIZE, size or _NATIVE_SIZE)
+    raise ValueError(
+        f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt says which camera it is "
+        "(freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"
+    )

@@ -1,0 +1,89 @@
+"""Frames of a video file, decoded in order (OpenCV)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import FrameError, Size
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+
+
+class Video:
+    """A video file; frames are exact by index, and cheap when read in increasing order.
+
+    Seeking in compressed video is inexact in most containers, so that an earlier frame is reached by
+    decoding again from the start.
+
+    Attributes:
+        path: the file.
+        fps: frames per second that the file names.
+        size: (H, W).
+
+    Raises:
+        FileNotFoundError: no such file.
+        FrameError: the file cannot be opened as a video.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        import cv2
+
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise FileNotFoundError(f"no such video: {self.path}")
+        capture = self._open()
+        self._capture: Any = capture
+        self._next = 0
+        self.fps = float(capture.get(cv2.CAP_PROP_FPS))
+        self.size: Size = (
+            int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
+            int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
+        )
+        named = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self._length = named if named > 0 else self._count()
+
+    def __len__(self) -> int:
+        """Frames that the file says it has; a truncated one ends earlier, with :class:`FrameError`."""
+        return self._length
+
+    def read(self, index: int) -> np.ndarray:
+        """Frame ``index`` as [H, W, 3] uint8 RGB.
+
+        Raises:
+            FrameError: the file ends, or cannot be decoded, before that frame.
+        """
+        if self._capture is None or index < self._next:
+            self._capture = self._open()
+            self._next = 0
+        while self._next < index:
+            self._advance(self._capture.grab(), index)
+        found, image = self._capture.read()
+        self._advance(found, index)
+        return np.ascontiguousarray(image[..., ::-1])
+
+    def _advance(self, found: bool, index: int) -> None:
+        if not found:
+            raise FrameError(self.path, f"frame {index} cannot be read, decoding stops at frame {self._next}")
+        self._next += 1
+
+    def _count(self) -> int:
+        """Frames of a file that does not say how many it has (a browser's recording), by decoding it."""
+        capture, count = self._open(), 0
+        while capture.grab():
+            count += 1
+        return count
+
+    def _open(self) -> Any:
+        import cv2
+
+        capture = cv2.VideoCapture(str(self.path))
+        if not capture.isOpened():
+            raise FrameError(self.path, "cannot be opened as a video")
+        return capture
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A decoder cannot be pickled: a worker process opens its own."""
+        return {**self.__dict__, "_capture": None, "_next": 0}

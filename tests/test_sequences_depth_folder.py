@@ -1,0 +1,122 @@
+"""Predicted depth of any other program: formats, scales, variance, pairing with frames."""
+
+from __future__ import annotations
+
+import layouts
+import numpy as np
+import pytest
+from layouts import truncate, write_depth_png
+
+from ufmstar_torch.eval.sequences import DepthFolder, FrameError, open_sequence
+
+NAMES = ("000000_left", "000001_left", "000002_left")
+DEPTHS = [np.full((3, 4), value) for value in (1.0, 2.0, 3.0)]
+
+
+def write_pngs(folder, names, units=1000, scale_text=None):
+    for name, depth in zip(names, DEPTHS, strict=True):
+        write_depth_png(folder / f"{name}.png", depth, units, scale_text)
+
+
+def values(maps):
+    return [float(maps[i][0][0, 0]) for i in range(len(maps))]
+
+
+def test_png_scale_is_given_or_in_the_file(tmp_path):
+    write_pngs(tmp_path / "a", NAMES, units=4000)
+    with pytest.raises(ValueError, match="holds integers and no text 'depth_scale': pass metres per unit"):
+        DepthFolder(tmp_path / "a")
+    assert values(DepthFolder(tmp_path / "a", scale=1 / 4000).for_frames(NAMES)) == [1, 2, 3]
+    write_pngs(tmp_path / "b", NAMES, units=4000, scale_text="0.00025")
+    assert values(DepthFolder(tmp_path / "b").for_frames(NAMES)) == [1, 2, 3]
+    with pytest.raises(ValueError, match="depth_scale is in metres per unit"):
+        DepthFolder(tmp_path / "b", scale=4000)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        NAMES,
+        [f"{name}_depth" for name in NAMES],
+        ["pred_0", "pred_1", "pred_2"],
+        ["first", "second", "third"],  # nothing in common: sorted order, there are as many
+    ],
+)
+def test_maps_pair_by_stem_by_number_or_in_order(tmp_path, names):
+    write_pngs(tmp_path, names)
+    assert values(DepthFolder(tmp_path, scale=1e-3).for_frames(NAMES)) == [1, 2, 3]
+
+
+def test_sorted_order_counts_skipped_frames(tmp_path):
+    write_pngs(tmp_path, ["x", "y", "z"])
+    folder = DepthFolder(tmp_path, scale=1e-3)
+    assert values(folder.for_frames(NAMES[1:], names_on_disk=NAMES)) == [2, 3]
+    with pytest.raises(ValueError, match=r"no map for 2 of 2 frames \(000001_left, 000002_left\); its 3 files"):
+        folder.for_frames(NAMES[1:])
+
+
+def test_missing_maps_are_listed(tmp_path):
+    write_pngs(tmp_path, NAMES)
+    (tmp_path / f"{NAMES[1]}.png").unlink()
+    with pytest.raises(ValueError, match=r"no map for 1 of 3 frames \(000001_left\)"):
+        DepthFolder(tmp_path, scale=1e-3).for_frames(NAMES)
+
+
+def test_more_maps_than_frames_are_fine_when_names_agree(tmp_path):
+    write_pngs(tmp_path, NAMES)
+    assert values(DepthFolder(tmp_path, scale=1e-3).for_frames(NAMES[:2])) == [1, 2]
+
+
+def test_variance_beside_depth_in_one_npz(tmp_path):
+    for name, depth in zip(NAMES, DEPTHS, strict=True):
+        variance = 0.01 * depth
+        variance[0, 1], variance[0, 2] = -1, np.nan
+        np.savez(tmp_path / f"{name}.npz", depth=depth, variance=variance, other=depth)
+    maps = DepthFolder(tmp_path, variance=tmp_path).for_frames(NAMES)
+    depth, variance = maps[1]
+    np.testing.assert_allclose(variance[0], [0.02, 0, 0, 0.02])
+    np.testing.assert_allclose(depth[0], [2, 0, 0, 2])  # no variance, no prediction
+    assert (depth.dtype, variance.dtype) == (np.float32, np.float32)
+    assert DepthFolder(tmp_path).for_frames(NAMES)[1][1] is None
+
+
+def test_variance_in_a_folder_of_its_own(tmp_path):
+    write_pngs(tmp_path / "depth", NAMES)
+    (tmp_path / "variance").mkdir()
+    for name, depth in zip(NAMES, DEPTHS, strict=True):
+        np.save(tmp_path / "variance" / f"{name}.npy", depth**2)
+    maps = DepthFolder(tmp_path / "depth", scale=1e-3, variance=tmp_path / "variance").for_frames(NAMES)
+    # the scale is the depth's, variance stays in m^2
+    assert [float(maps[i][1][0, 0]) for i in range(3)] == [1, 4, 9]
+    np.save(tmp_path / "variance" / f"{NAMES[0]}.npy", np.ones((2, 2)))
+    with pytest.raises(FrameError, match=r"the variance is \[2, 2\], its depth \[3, 4\]"):
+        maps[0]
+
+
+def test_broken_maps_and_folders(tmp_path):
+    write_pngs(tmp_path / "a", NAMES)
+    maps = DepthFolder(tmp_path / "a", scale=1e-3).for_frames(NAMES)
+    truncate(tmp_path / "a" / f"{NAMES[2]}.png")
+    assert values([maps[0]]) == [1]
+    with pytest.raises(FrameError):
+        maps[2]
+    with pytest.raises(NotADirectoryError, match="no such folder"):
+        DepthFolder(tmp_path / "absent")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="holds no map"):
+        DepthFolder(tmp_path / "empty")
+    np.save(tmp_path / "a" / "x.npy", DEPTHS[0])
+    with pytest.raises(ValueError, match=r"holds several formats, \.npy, \.png"):
+        DepthFolder(tmp_path / "a")
+
+
+def test_a_datasets_own_depth_as_prediction(tmp_path):
+    path, truth = layouts.write_tartanair(tmp_path)
+    sequence = open_sequence(path)
+    maps = DepthFolder(path / "depth_left").for_frames(sequence.names, sequence.names_on_disk)
+    assert len(maps) == 6
+    np.testing.assert_allclose(maps[4][0], truth.depths[4], rtol=1e-6)
+    tum, truth = layouts.write_tum(tmp_path)
+    sequence = open_sequence(tum)
+    maps = DepthFolder(tum / "depth", scale=1 / 5000).for_frames(sequence.names)  # other stamps: in order
+    np.testing.assert_allclose(maps[4][0], truth.depths[4], atol=1.1e-4)

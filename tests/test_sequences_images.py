@@ -1,0 +1,198 @@
+"""Decoding of images and depth maps."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+from layouts import truncate, write_depth_png, write_image
+from PIL import Image
+
+from ufmstar_torch.eval.sequences.exr import read_exr
+from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.images import list_files, read_color, read_depth
+
+RNG = np.random.default_rng(0)
+
+
+def test_sixteen_bits_stay_positive(tmp_path):
+    values = np.array([[0, 1, 32767], [32768, 40000, 65535]], dtype=np.uint16)
+    Image.fromarray(values).save(tmp_path / "d.png")
+    depth = read_depth(tmp_path / "d.png", scale=1 / 5000)
+    assert depth.dtype == np.float32
+    np.testing.assert_allclose(depth, values / 5000.0, rtol=1e-7)
+    np.testing.assert_allclose(read_depth(tmp_path / "d.png"), values / 1000.0, rtol=1e-7)
+
+
+def test_scale_from_the_png_text_is_second_to_the_argument(tmp_path):
+    write_depth_png(tmp_path / "d.png", np.full((2, 3), 2.0), 4000, scale_text="0.00025")
+    assert (read_depth(tmp_path / "d.png") == 2.0).all()
+    assert (read_depth(tmp_path / "d.png", default_scale=1 / 5000) == 2.0).all()
+    np.testing.assert_allclose(read_depth(tmp_path / "d.png", scale=0.001), 8.0)
+
+
+@pytest.mark.parametrize("suffix", ["npy", "npz", "tif"])
+def test_float_maps_are_metres_and_invalid_values_zero(tmp_path, suffix):
+    stored = np.array([[1.5, -1.0, np.nan], [np.inf, 0.0, 70.25]], dtype=np.float32)
+    path = tmp_path / f"d.{suffix}"
+    if suffix == "npy":
+        np.save(path, stored)
+    elif suffix == "npz":
+        np.savez(path, depth=stored, variance=-stored)
+    else:
+        Image.fromarray(stored).save(path)
+    np.testing.assert_array_equal(read_depth(path), np.array([[1.5, 0, 0], [0, 0, 70.25]], dtype=np.float32))
+    np.testing.assert_array_equal(read_depth(path, scale=0.5)[1], np.array([0, 0, 35.125], dtype=np.float32))
+
+
+def test_integer_arrays_are_millimetres_and_one_channel_is_dropped(tmp_path):
+    np.save(tmp_path / "d.npy", np.full((1, 4, 5), 1500, dtype=np.uint16))
+    depth = read_depth(tmp_path / "d.npy")
+    assert depth.shape == (4, 5)
+    assert (depth == np.float32(1.5)).all()
+
+
+def test_color_is_rgb_whatever_the_file(tmp_path):
+    image = RNG.integers(0, 255, (6, 5, 3), dtype=np.uint8)
+    write_image(tmp_path / "a.png", image)
+    np.testing.assert_array_equal(read_color(tmp_path / "a.png"), image)
+    alpha = np.dstack([image, np.full((6, 5), 7, np.uint8)])
+    write_image(tmp_path / "b.png", alpha)
+    np.testing.assert_array_equal(read_color(tmp_path / "b.png"), image)
+    write_image(tmp_path / "c.png", image[..., 0])
+    np.testing.assert_array_equal(read_color(tmp_path / "c.png"), np.repeat(image[..., :1], 3, axis=2))
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.95])
+def test_truncated_images_raise(tmp_path, name, share):
+    write_image(tmp_path / name, RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    truncate(tmp_path / name, share)
+    with pytest.raises(FrameError, match="cannot be decoded") as caught:
+        read_color(tmp_path / name)
+    assert caught.value.path == tmp_path / name
+
+
+@pytest.mark.parametrize("suffix", ["png", "npy", "npz", "exr"])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 0.95])
+def test_truncated_depth_raises(tmp_path, suffix, share):
+    path = tmp_path / f"d.{suffix}"
+    depth = RNG.uniform(1, 5, (48, 64)).astype(np.float32)
+    if suffix == "png":
+        write_depth_png(path, depth, 1000)
+    elif suffix == "npy":
+        np.save(path, depth)
+    elif suffix == "npz":
+        np.savez_compressed(path, depth)
+    else:
+        encode_exr(path, depth, "zip16")
+    truncate(path, share)
+    with pytest.raises(FrameError):
+        read_depth(path)
+
+
+def test_a_damaged_png_raises(tmp_path):
+    write_depth_png(tmp_path / "d.png", RNG.uniform(1, 5, (48, 64)), 1000)
+    data = bytearray((tmp_path / "d.png").read_bytes())
+    data[200] ^= 0xFF
+    (tmp_path / "d.png").write_bytes(bytes(data))
+    with pytest.raises(FrameError):
+        read_depth(tmp_path / "d.png")
+
+
+def test_what_is_no_depth_map_is_named(tmp_path):
+    write_image(tmp_path / "grey.png", np.zeros((4, 5), np.uint8))
+    with pytest.raises(FrameError, match="expected a 16-bit or float depth image"):
+        read_depth(tmp_path / "grey.png")
+    np.savez(tmp_path / "two.npz", a=np.zeros((2, 2)), b=np.zeros((2, 2)))
+    with pytest.raises(FrameError, match="expected the key 'depth' or a single array"):
+        read_depth(tmp_path / "two.npz")
+    np.save(tmp_path / "rgb.npy", np.zeros((4, 5, 3)))
+    with pytest.raises(FrameError, match="expected a map"):
+        read_depth(tmp_path / "rgb.npy")
+    np.save(tmp_path / "object.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(FrameError):
+        read_depth(tmp_path / "object.npy")
+    with pytest.raises(FrameError):
+        read_depth(tmp_path / "absent.png")
+    write_depth_png(tmp_path / "depth.png", np.ones((4, 5)), 1000)
+    with pytest.raises(FrameError, match="expected an 8-bit colour or grey image"):
+        read_color(tmp_path / "depth.png")
+
+
+def test_numbers_in_names_sort_by_value(tmp_path):
+    for name in ("10.png", "2.png", "b1.png", "a03.png", "a2.png", "1.txt"):
+        (tmp_path / name).touch()
+    assert [p.name for p in list_files(tmp_path, (".png",))] == ["2.png", "10.png", "a2.png", "a03.png", "b1.png"]
+
+
+def encode_exr(path, values, compression, pixel_type="float"):
+    """FFmpeg's encoder, an implementation of the format that is not ours (channel Y)."""
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    height, width = values.shape
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", "-f", "rawvideo", "-pix_fmt", "grayf32le"]
+    command += ["-s", f"{width}x{height}", "-i", "-", "-c:v", "exr", "-compression", compression]
+    command += ["-format", pixel_type, "-frames:v", "1", str(path)]
+    subprocess.run(command, input=values.astype("<f4").tobytes(), check=True)
+
+
+@pytest.mark.parametrize("pixel_type", ["float", "half"])
+@pytest.mark.parametrize("compression", ["none", "rle", "zip1", "zip16"])
+@pytest.mark.parametrize("smooth", [True, False])  # noise does not shrink: its chunks are stored as they are
+def test_exr_equals_what_ffmpeg_wrote(tmp_path, compression, pixel_type, smooth):
+    noise = RNG.uniform(0.1, 60, (37, 53))
+    values = (np.linspace(1, 9, 37)[:, None] + np.linspace(0, 2, 53).round(1) if smooth else noise).astype(np.float32)
+    if pixel_type == "half":
+        values = values.astype(np.float16).astype(np.float32)  # exact in half, so that rounding plays no part
+    encode_exr(tmp_path / "d.exr", values, compression, pixel_type)
+    np.testing.assert_array_equal(read_exr(tmp_path / "d.exr"), values)
+
+
+def handmade_exr(path, channels, compression=0, flags=0):
+    """Uncompressed scan lines; ``channels`` maps names to [H, W] float32, data window starting at (3, 5)."""
+    names = sorted(channels)
+    height, width = channels[names[0]].shape
+    chlist = b"".join(n.encode() + b"\0" + struct.pack("<iIii", 2, 0, 1, 1) for n in names) + b"\0"
+    window = struct.pack("<4i", 3, 5, 3 + width - 1, 5 + height - 1)
+    attributes = [
+        ("channels", "chlist", chlist),
+        ("compression", "compression", bytes([compression])),
+        ("dataWindow", "box2i", window),
+    ]
+    header = struct.pack("<II", 20000630, 2 | flags)
+    for name, kind, value in attributes:
+        header += name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+    header += b"\0"
+    lines = []
+    for y in range(height):
+        data = b"".join(channels[n][y].astype("<f4").tobytes() for n in names)
+        lines.append(struct.pack("<ii", 5 + y, len(data)) + data)
+    first = len(header) + 8 * height
+    offsets = [first + y * len(lines[0]) for y in range(height)]
+    path.write_bytes(header + struct.pack(f"<{height}Q", *offsets) + b"".join(lines))
+
+
+@pytest.mark.parametrize("names", [("B", "G", "R", "Z"), ("A", "View.Depth.Z"), ("A", "B", "R"), ("whatever",)])
+def test_the_depth_channel_is_found(tmp_path, names):
+    wanted = next((n for n in names if n.endswith("Z")), "R" if "R" in names else names[0])
+    channels = {name: RNG.uniform(1, 2, (4, 6)).astype(np.float32) for name in names}
+    handmade_exr(tmp_path / "d.exr", channels)
+    np.testing.assert_array_equal(read_exr(tmp_path / "d.exr"), channels[wanted])
+
+
+def test_exr_variants_that_are_not_read_say_so(tmp_path):
+    channels = {"Z": np.ones((4, 6), np.float32)}
+    handmade_exr(tmp_path / "d.exr", channels, compression=4)
+    with pytest.raises(FrameError, match="PIZ compression is not supported, save with ZIP"):
+        read_depth(tmp_path / "d.exr")
+    handmade_exr(tmp_path / "d.exr", channels, flags=0x200)
+    with pytest.raises(FrameError, match="tiled"):
+        read_depth(tmp_path / "d.exr")
+    handmade_exr(tmp_path / "d.exr", {"B": channels["Z"], "U": channels["Z"]})
+    with pytest.raises(FrameError, match="no channel is the depth"):
+        read_depth(tmp_path / "d.exr")
+    (tmp_path / "d.exr").write_bytes(b"not an EXR file")
+    with pytest.raises(FrameError, match="wrong magic number"):
+        read_depth(tmp_path / "d.exr")

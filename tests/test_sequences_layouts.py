@@ -1,0 +1,427 @@
+"""Every dataset layout: what is read equals what was rendered, and what is broken is counted or named."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+
+import layouts
+import numpy as np
+import pytest
+from layouts import truncate, write_depth_png, write_image
+
+from ufmstar_torch.eval import sequences
+from ufmstar_torch.eval.sequences import FrameError, open_sequence
+from ufmstar_torch.eval.sequences.register import register_depth
+
+K_TUM_FR3 = [[535.4, 0, 320.1], [0, 539.2, 247.6], [0, 0, 1]]
+
+
+def reasons(sequence):
+    return {frame.name: frame.reason for frame in sequence.skipped}
+
+
+def assert_frames_equal(sequence, truth, quantum):
+    """Names aside, all frames carry the truth; ``quantum`` is the depth files' unit [m]."""
+    assert len(sequence) == len(truth.depths)
+    np.testing.assert_allclose(sequence.intrinsics, truth.K, rtol=1e-12)
+    for i, frame in enumerate(sequence):
+        assert frame.index == i
+        np.testing.assert_allclose(frame.T_world_cam, truth.T_world_cam[i], atol=1e-9)
+        np.testing.assert_array_equal(frame.image, truth.images[i])
+        np.testing.assert_allclose(frame.depth, truth.depths[i], atol=quantum / 2 + 1e-6)
+        assert (frame.image.dtype, frame.depth.dtype) == (np.uint8, np.float32)
+        assert (frame.T_world_cam.dtype, frame.intrinsics.dtype) == (np.float64, np.float64)
+
+
+# ---- TUM RGB-D
+
+
+def test_tum(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    sequence = open_sequence(path)
+    assert (sequence.layout, sequence.name) == ("tum", "rgbd_dataset_freiburg2_desk")
+    assert_frames_equal(sequence, truth, 1 / 5000)
+    assert sequence.names[1] == "10.033333"
+    assert sequence[1].timestamp == pytest.approx(10 + 1 / 30, abs=1e-6)
+    assert sequence.skipped == sequence.without_depth == ()
+
+
+def test_tum_pose_is_interpolated_at_the_images_time(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    lines = (path / "groundtruth.txt").read_text().splitlines()
+    del lines[3]  # the sample of image 2; its neighbours lie 67 ms apart
+    (path / "groundtruth.txt").write_text("\n".join(lines))
+    frame = open_sequence(path)[2]
+    middle = (truth.T_world_cam[1][:3, 3] + truth.T_world_cam[3][:3, 3]) / 2
+    np.testing.assert_allclose(frame.T_world_cam[:3, 3], middle, atol=1e-5)
+    # the walk turns evenly, so that half way by slerp is the true rotation
+    np.testing.assert_allclose(frame.T_world_cam[:3, :3], truth.T_world_cam[2][:3, :3], atol=1e-5)
+    skipping = open_sequence(path, max_pose_gap=0.05)
+    assert reasons(skipping) == {"10.066667": "no pose within 0.05 s around the image"}
+
+
+def test_tum_mocap_that_starts_late_is_counted(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    lines = (path / "groundtruth.txt").read_text().splitlines()
+    (path / "groundtruth.txt").write_text("\n".join(lines[:1] + lines[3:]))
+    sequence = open_sequence(path)
+    assert list(reasons(sequence)) == ["10.000000", "10.033333"]
+    assert len(sequence) == 4
+    assert sequence.names_on_disk[:3] == ("10.000000", "10.033333", "10.066667")
+    np.testing.assert_allclose(sequence[0].T_world_cam, truth.T_world_cam[2], atol=1e-9)
+
+
+def test_tum_depth_beyond_the_time_difference_is_missing(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    text = (path / "depth.txt").read_text().replace("10.071667 depth", "10.087667 depth")  # 21 ms after its image
+    (path / "depth.txt").write_text(text)
+    sequence = open_sequence(path)
+    # image 3 (10.1) is 12 ms from it, but its own depth is nearer
+    assert sequence.without_depth == ("10.066667",)
+    assert sequence[2].depth is None
+    np.testing.assert_allclose(sequence[3].depth, truth.depths[3], atol=1e-4)
+    assert open_sequence(path, max_time_difference=0.022).without_depth == ()
+
+
+def test_tum_missing_files_and_nan_poses(tmp_path):
+    path, _ = layouts.write_tum(tmp_path)
+    (path / "rgb" / "10.033333.png").unlink()
+    (path / "depth" / "10.071667.png").unlink()
+    text = (path / "groundtruth.txt").read_text().splitlines()
+    text[4] = "10.100000 nan nan nan 0 0 0 1"
+    (path / "groundtruth.txt").write_text("\n".join(text))
+    sequence = open_sequence(path)
+    assert reasons(sequence) == {"10.033333": "missing image file", "10.100000": "non-finite pose"}
+    assert sequence.without_depth == ("10.066667",)
+    assert sequence.names == ("10.000000", "10.066667", "10.133333", "10.166667")
+    assert all(np.isfinite(frame.T_world_cam).all() for frame in sequence)
+
+
+def test_tum_intrinsics_follow_the_camera_or_the_user(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    renamed = path.rename(tmp_path / "desk")
+    with pytest.raises(ValueError, match="pass intrinsics as fx fy cx cy"):
+        open_sequence(renamed)
+    np.testing.assert_array_equal(
+        open_sequence(renamed, intrinsics=(50, 51, 32, 24)).intrinsics, [[50, 0, 32], [0, 51, 24], [0, 0, 1]]
+    )
+    listing = (renamed / "rgb.txt").read_text()
+    (renamed / "rgb.txt").write_text("# file: 'rgbd_dataset_freiburg2_desk.bag'\n" + listing)
+    np.testing.assert_allclose(open_sequence(renamed).intrinsics, truth.K, rtol=1e-12)
+    # of the dataset's own size
+    path = renamed.rename(tmp_path / "rgbd_dataset_freiburg3_x")
+    for file in (path / "rgb").iterdir():
+        write_image(file, np.zeros((480, 640, 3), np.uint8))
+    np.testing.assert_array_equal(open_sequence(path).intrinsics, K_TUM_FR3)
+
+
+def test_tum_other_trajectory_and_bad_lines(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    moved = [line.split() for line in (path / "groundtruth.txt").read_text().splitlines()[1:]]
+    slam = "\n".join(" ".join([w[0], str(float(w[1]) + 5), *w[2:]]) for w in moved)
+    (tmp_path / "slam.txt").write_text(slam)
+    sequence = open_sequence(path, trajectory=tmp_path / "slam.txt")
+    np.testing.assert_allclose(sequence[0].T_world_cam[0, 3], truth.T_world_cam[0][0, 3] + 5)
+    (path / "rgb.txt").write_text("# x\n10.0 rgb/a.png\nten rgb/b.png\n")
+    with pytest.raises(ValueError, match=r"rgb\.txt:3: expected 'timestamp filename'"):
+        open_sequence(path)
+
+
+# ---- 7-Scenes
+
+
+def test_seven_scenes_registers_depth_to_colour(tmp_path):
+    path, of_color, _ = layouts.write_seven_scenes(tmp_path)
+    sequence = open_sequence(path)
+    assert (sequence.layout, sequence.depth_intrinsics) == ("7scenes", None)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
+    for i, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.T_world_cam, of_color.T_world_cam[i], atol=1e-9)
+        np.testing.assert_array_equal(frame.image, of_color.images[i])
+        valid = frame.depth > 0
+        error = np.abs(frame.depth - of_color.depths[i])[valid] / of_color.depths[i][valid]
+        # forward warping moves a sample by up to half a pixel; the wall beside the pillar is the rest
+        assert np.median(error) < 0.002
+        assert np.mean(error > 0.05) < 0.03
+        assert 0.65 < valid.mean() < 0.9  # the colour camera sees further to all sides: (525 / 585)^2 = 0.8
+
+
+def test_seven_scenes_unregistered(tmp_path):
+    path, of_color, of_depth = layouts.write_seven_scenes(tmp_path)
+    sequence = open_sequence(path, register=False)
+    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
+    for i, frame in enumerate(sequence):
+        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i])
+        np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
+        np.testing.assert_allclose(frame.depth_intrinsics, of_depth.K)
+
+
+def test_seven_scenes_own_calibration(tmp_path):
+    path, _, of_depth = layouts.write_seven_scenes(tmp_path)
+    sequence = open_sequence(path, T_color_depth=np.eye(4), intrinsics=of_depth.K, depth_intrinsics=of_depth.K)
+    np.testing.assert_allclose(sequence[0].depth, of_depth.depths[0], atol=5e-4 + 1e-6)
+    np.testing.assert_allclose(sequence[0].T_world_cam, of_depth.T_world_cam[0])
+
+
+def test_seven_scenes_invalid_and_missing(tmp_path):
+    path, _, _ = layouts.write_seven_scenes(tmp_path)
+    values = np.full(layouts.SIZE, 1500.0)
+    values[:, :20], values[:, 20:40] = 65535, 0
+    write_depth_png(path / "frame-000000.depth.png", values, 1)
+    (path / "frame-000001.color.png").unlink()
+    (path / "frame-000002.pose.txt").unlink()
+    (path / "frame-000003.depth.png").unlink()
+    np.savetxt(path / "frame-000004.pose.txt", np.full((4, 4), np.nan))
+    sequence = open_sequence(path, register=False)
+    assert reasons(sequence) == {
+        "frame-000001": "missing image file",
+        "frame-000002": "missing pose file",
+        "frame-000004": "non-finite pose",
+    }
+    assert sequence.without_depth == ("frame-000003",)
+    assert (sequence[0].depth > 0).mean(axis=0).tolist() == [0] * 40 + [1] * 24
+    assert (open_sequence(path)[0].depth <= 1.501).all()
+
+
+def test_register_depth_closed_form():
+    K = np.array([[10.0, 0, 2], [0, 10.0, 1], [0, 0, 1]])
+    T = np.eye(4)
+    T[0, 3] = 0.1
+    depth = np.zeros((3, 5), np.float32)
+    depth[1, 1] = 1.0  # moves by fx 0.1 / 1 = 1 px
+    depth[1, 0] = 0.5  # by 2 px, onto the same pixel, and is nearer
+    depth[0, 4] = 1.0  # leaves the image
+    out = register_depth(depth, K, K, T, (3, 5))
+    expected = np.zeros((3, 5), np.float32)
+    expected[1, 2] = 0.5
+    np.testing.assert_array_equal(out, expected)
+    np.testing.assert_array_equal(register_depth(np.zeros((3, 5)), K, K, T, (2, 2)), np.zeros((2, 2)))
+
+
+# ---- ScanNet
+
+
+def test_scannet(tmp_path):
+    path, of_color, of_depth = layouts.write_scannet(tmp_path, frames=11)
+    sequence = open_sequence(path)
+    assert sequence.layout == "scannet"
+    assert sequence.names == tuple(str(i) for i in range(11))  # 10 after 9
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
+    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K)
+    for i in (0, 5, 10):
+        frame = sequence[i]
+        assert (frame.image.shape, frame.depth.shape) == ((121, 162, 3), (48, 64))
+        np.testing.assert_allclose(frame.depth, of_depth.depths[i], atol=5e-4 + 1e-6)
+        np.testing.assert_allclose(frame.T_world_cam, of_depth.T_world_cam[i])
+        # JPEG keeps a smoothed image of the cells, with its noise
+        difference = np.abs(frame.image.astype(int) - of_color.images[i]).mean()
+        other = np.abs(frame.image.astype(int) - of_color.images[(i + 5) % 11]).mean()
+        assert difference < 0.5 * other
+
+
+def test_scannet_counts_lost_and_missing_poses(tmp_path):
+    path, _, _ = layouts.write_scannet(tmp_path)
+    (path / "pose" / "1.txt").write_text("-inf -inf -inf -inf\n" * 4)
+    (path / "pose" / "2.txt").unlink()
+    (path / "depth" / "3.png").unlink()
+    sequence = open_sequence(path)
+    assert reasons(sequence) == {"1": "non-finite pose", "2": "missing pose file"}
+    assert sequence.without_depth == ("3",)
+    assert sequence.names_on_disk == ("0", "1", "2", "3", "4", "5")
+
+
+def test_scannet_resized_export_keeps_the_original_intrinsics_file(tmp_path):
+    path, of_color, of_depth = layouts.write_scannet(tmp_path)
+    for name, K in (("color", (1170, 1171, 648, 484)), ("depth", (578, 578, 320, 240))):
+        fx, fy, cx, cy = K
+        np.savetxt(path / "intrinsic" / f"intrinsic_{name}.txt", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    sequence = open_sequence(path)
+    np.testing.assert_allclose(sequence.intrinsics, of_color.K)
+    np.testing.assert_allclose(sequence.depth_intrinsics, of_depth.K)
+
+
+# ---- TartanAir
+
+
+@pytest.mark.parametrize("below", [True, False])
+def test_tartanair(tmp_path, below):
+    path, truth = layouts.write_tartanair(tmp_path)
+    sequence = open_sequence(path.parent if below else path)
+    assert sequence.layout == "tartanair"
+    assert sequence.name == ("office_P000" if below else "P000")
+    assert_frames_equal(sequence, truth, 0)
+    assert sequence.names[3] == "000003_left"
+
+
+def test_tartanair_missing_image_shifts_nothing(tmp_path):
+    path, truth = layouts.write_tartanair(tmp_path)
+    (path / "image_left" / "000002_left.png").unlink()
+    (path / "depth_left" / "000004_left_depth.npy").unlink()
+    sequence = open_sequence(path)
+    assert reasons(sequence) == {"000002_left": "missing image file"}
+    assert sequence.without_depth == ("000004_left",)
+    np.testing.assert_allclose(sequence[2].T_world_cam, truth.T_world_cam[3], atol=1e-9)
+    write_image(path / "image_left" / "000009_left.png", truth.images[0])
+    with pytest.raises(ValueError, match="expected a name NNNNNN_left below the 6 poses"):
+        open_sequence(path)
+
+
+def test_tartanair_several_trajectories(tmp_path):
+    path, _ = layouts.write_tartanair(tmp_path)
+    shutil.copytree(path, path.parent / "P001")
+    with pytest.raises(ValueError, match=r"\['P000', 'P001'\]: open one of them"):
+        open_sequence(path.parent)
+
+
+# ---- all of them: broken files, detection
+
+WRITERS = {
+    "tum": layouts.write_tum,
+    "7scenes": layouts.write_seven_scenes,
+    "scannet": layouts.write_scannet,
+    "tartanair": layouts.write_tartanair,
+    "generic": layouts.write_generic,
+}
+IMAGES = {
+    "tum": "rgb/10.066667.png",
+    "7scenes": "frame-000002.color.png",
+    "scannet": "color/2.jpg",
+    "tartanair": "image_left/000002_left.png",
+    "generic": "images/9.png",
+}
+DEPTHS = {
+    "tum": "depth/10.071667.png",
+    "7scenes": "frame-000002.depth.png",
+    "scannet": "depth/2.png",
+    "tartanair": "depth_left/000002_left_depth.npy",
+    "generic": "depth/9.png",
+}
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+@pytest.mark.parametrize("files", [IMAGES, DEPTHS], ids=["image", "depth"])
+def test_truncated_files_are_found_when_decoding(tmp_path, layout, files):
+    path = WRITERS[layout](tmp_path)[0]
+    truncate(path / files[layout])
+    sequence = open_sequence(path)
+    assert len(sequence) == 6
+    with pytest.raises(FrameError) as caught:
+        sequence[2]
+    assert caught.value.path.name == (path / files[layout]).name
+    errors = []
+    readable = list(sequence.readable(errors.append))
+    assert [frame.index for frame in readable] == [0, 1, 3, 4, 5]
+    assert [error.path for error in errors] == [caught.value.path]
+    with pytest.raises(FrameError):
+        list(sequence)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_an_image_of_another_size_is_refused(tmp_path, layout):
+    path = WRITERS[layout](tmp_path)[0]
+    write_image(path / IMAGES[layout], np.zeros((30, 40, 3), np.uint8))
+    sequence = open_sequence(path)
+    with pytest.raises(FrameError, match="the image is 40x30, the sequence's are"):
+        sequence[2]
+
+
+@pytest.mark.parametrize("layout", ["tum", "scannet", "tartanair", "generic"])
+def test_a_depth_map_of_another_size_is_refused(tmp_path, layout):
+    path = WRITERS[layout](tmp_path)[0]
+    file = path / DEPTHS[layout]
+    if file.suffix == ".npy":
+        np.save(file, np.ones((30, 40), np.float32))
+    else:
+        write_depth_png(file, np.ones((30, 40)), 1000)
+    with pytest.raises(FrameError, match="the depth map is 40x30, the sequence's are 64x48"):
+        open_sequence(path)[2]
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_named_layout_equals_the_detected_one(tmp_path, layout):
+    path = WRITERS[layout](tmp_path)[0]
+    assert open_sequence(path).layout == open_sequence(path, layout).layout == layout
+
+
+def test_unknown_and_ambiguous_layouts(tmp_path):
+    path, _ = layouts.write_tum(tmp_path)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(ValueError, match=r"no known layout(.|\n)*tum: rgb\.txt(.|\n)*scannet: color/(.|\n)*generic"):
+        open_sequence(empty)
+    with pytest.raises(ValueError, match=r"has not the layout 'tartanair': looked for pose_left\.txt"):
+        open_sequence(path, "tartanair")
+    with pytest.raises(ValueError, match="layout must be one of auto, tum"):
+        open_sequence(path, "kitti")
+    with pytest.raises(FileNotFoundError, match="no such file or folder"):
+        open_sequence(tmp_path / "absent")
+    scannet, _, _ = layouts.write_scannet(tmp_path)
+    shutil.copytree(path, scannet, dirs_exist_ok=True)
+    with pytest.raises(ValueError, match="fits the layouts tum, scannet: pass layout"):
+        open_sequence(scannet)
+    assert open_sequence(scannet, "scannet").layout == "scannet"
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_no_frames_at_all(tmp_path, layout):
+    path = WRITERS[layout](tmp_path)[0]
+    for file in path.rglob("*"):
+        if file.suffix in (".png", ".jpg"):
+            file.unlink()
+    with pytest.raises(ValueError, match=r"no usable frame|holds no image"):
+        open_sequence(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"depth_scale": 1000}, "depth_scale is in metres per unit"),
+        ({"depth_scale": 0}, "depth_scale is in metres per unit"),
+        ({"fps": 0}, "fps must be positive"),
+        ({"max_pose_gap": -1}, "max_pose_gap must be a time"),
+        ({"max_time_difference": float("nan")}, "max_time_difference must be a time"),
+        ({"images": "rgb"}, "layout 'tum' takes no images"),
+        ({"intrinsics": (500, 500, 320, 240)}, r"do not fit images of 64x48: were they given for another"),
+        ({"intrinsics": (500, 500, 320)}, "expected a 3x3 matrix or fx fy cx cy"),
+        ({"intrinsics": np.diag([1.0, -1, 1])}, "positive focal lengths"),
+        ({"intrinsics": np.array([[50.0, 0, 32], [0, 50, 24], [0, 1, 1]])}, "must have rows"),
+    ],
+)
+def test_options_out_of_range(tmp_path, options, message):
+    path, _ = layouts.write_tum(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        open_sequence(path, **options)
+
+
+def test_depth_scale_of_the_user(tmp_path):
+    path, truth = layouts.write_tum(tmp_path)
+    frame = open_sequence(path, depth_scale=1e-3)[0]
+    np.testing.assert_allclose(frame.depth, 5 * truth.depths[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_frames_are_copies_and_sequences_can_be_sent_to_workers(tmp_path, layout):
+    sequence = open_sequence(WRITERS[layout](tmp_path)[0])
+    frame = sequence[0]
+    frame.T_world_cam[:] = 0
+    frame.intrinsics[:] = 0
+    again = pickle.loads(pickle.dumps(sequence))[-6]
+    assert again.index == 0
+    np.testing.assert_array_equal(again.T_world_cam[3], [0, 0, 0, 1])
+    assert again.intrinsics[2, 2] == 1
+    with pytest.raises(IndexError):
+        sequence[6]
+
+
+def test_the_package_names_what_it_has():
+    assert sequences.open_sequence is open_sequence
+    with pytest.raises(AttributeError, match="has no attribute 'open_everything'"):
+        getattr(sequences, "open_" + "everything")
+
+
+def test_frame_errors_survive_pickling():
+
+    error = pickle.loads(pickle.dumps(FrameError("a/b.png", "truncated")))
+    assert (str(error), error.path.name, error.reason) == ("a/b.png: truncated", "b.png", "truncated")

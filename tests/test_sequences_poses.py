@@ -1,0 +1,157 @@
+"""Trajectories: formats, interpolation, association."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.eval.sequences.poses import associate, interpolate, read_pose, read_trajectory
+
+QUARTER = np.sqrt(0.5)
+# 90 degrees about z: x -> y, y -> -x.
+R_QUARTER_Z = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def write(tmp_path, text):
+    path = tmp_path / "trajectory.txt"
+    path.write_text(text)
+    return path
+
+
+def expected(R, t):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+@pytest.mark.parametrize(
+    ("line", "timestamp"),
+    [
+        (f"1 2 3 0 0 {QUARTER} {QUARTER}", None),
+        (f"0.5 1 2 3 0 0 {QUARTER} {QUARTER}", 0.5),
+        ("0 -1 0 1  1 0 0 2  0 0 1 3", None),
+        ("7 0 -1 0 1  1 0 0 2  0 0 1 3", 7.0),
+        ("0 -1 0 1  1 0 0 2  0 0 1 3  0 0 0 1", None),
+        ("7 0 -1 0 1  1 0 0 2  0 0 1 3  0 0 0 1", 7.0),
+    ],
+)
+def test_every_format_gives_the_same_pose(tmp_path, line, timestamp):
+    trajectory = read_trajectory(write(tmp_path, f"# a comment\n\n{line}  # and another\n"))
+    np.testing.assert_allclose(trajectory.T_world_cam, [expected(R_QUARTER_Z, [1, 2, 3])], atol=1e-15)
+    if timestamp is None:
+        assert trajectory.timestamps is None
+    else:
+        assert trajectory.timestamps.tolist() == [timestamp]
+
+
+def test_rounded_quaternions_are_normalised(tmp_path):
+    trajectory = read_trajectory(write(tmp_path, "0 0 0 0 0 0 0.7071 0.7071\n"))
+    R = trajectory.T_world_cam[0, :3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(R, R_QUARTER_Z, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0.5 0.5\n", r"txt:2: the quaternion's norm is 0\.7071"),
+        ("0 0 0 0 0 0 0 1\n# x\n1 0 0 0 0 0 zero 1\n", r"txt:3: expected a number, got 'zero'"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 1\n", r"txt:2: expected 8 numbers as in the first pose, got 7"),
+        ("1 2 3\n", r"txt:1: expected a pose of .* got 3"),
+        ("0,0,0,0,0,0,0,1\n", r"txt:1: expected a number"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2\n", r"txt:1: a pose's bottom row must be 0 0 0 1"),
+        ("nan 0 0 0 0 0 0 1\n", r"txt:1: the timestamp must be finite"),
+        ("# nothing\n", r"no pose found"),
+    ],
+)
+def test_a_bad_line_is_named(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        read_trajectory(write(tmp_path, text))
+
+
+def test_samples_are_sorted_and_repeated_times_dropped(tmp_path):
+    text = "2 20 0 0 0 0 0 1\n1 10 0 0 0 0 0 1\n2 99 0 0 0 0 0 1\n"
+    trajectory = read_trajectory(write(tmp_path, text))
+    assert trajectory.timestamps.tolist() == [1, 2]
+    assert trajectory.T_world_cam[:, 0, 3].tolist() == [10, 20]
+
+
+@pytest.mark.parametrize("token", ["nan", "-inf", "-1.#IND", "1.#QNAN00", "-1.#INF"])
+def test_non_finite_poses_stay_as_nan(tmp_path, token):
+    text = f"0 0 0 0 0 0 0 1\n1 {token} 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n"
+    trajectory = read_trajectory(write(tmp_path, text))
+    assert np.isfinite(trajectory.T_world_cam).all(axis=(1, 2)).tolist() == [True, False, True]
+    assert np.isnan(interpolate(trajectory, 0.5, max_gap=2)).all()
+    assert np.isnan(interpolate(trajectory, 1.0, max_gap=2)).all()
+    assert np.isfinite(interpolate(trajectory, 2.0, max_gap=2)).all()
+
+
+def test_scannet_writes_minus_infinity_everywhere(tmp_path):
+    path = write(tmp_path, "-inf -inf -inf -inf\n" * 4)
+    assert np.isnan(read_pose(path)).all()
+
+
+def test_pose_file_of_another_shape(tmp_path):
+    with pytest.raises(ValueError, match="expected a 4x4 matrix, got 3 x 4"):
+        read_pose(write(tmp_path, "1 0 0 0\n0 1 0 0\n0 0 1 0\n"))
+    with pytest.raises(ValueError, match=r"txt:2: expected 4 numbers"):
+        read_pose(write(tmp_path, "1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n"))
+
+
+def test_interpolation_is_linear_and_turns_evenly(tmp_path):
+    trajectory = read_trajectory(write(tmp_path, f"0 0 0 0 0 0 0 1\n0.1 1 2 4 0 0 {QUARTER} {QUARTER}\n"))
+    T = interpolate(trajectory, 0.025, max_gap=0.1)
+    np.testing.assert_allclose(T[:3, 3], [0.25, 0.5, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("z", 22.5, degrees=True).as_matrix(), atol=1e-12)
+    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_interpolation_needs_samples_around(tmp_path):
+    trajectory = read_trajectory(write(tmp_path, "0 0 0 0 0 0 0 1\n0.2 1 0 0 0 0 0 1\n"))
+    assert interpolate(trajectory, 0.1, max_gap=0.1) is None
+    assert interpolate(trajectory, 0.1, max_gap=0.2)[0, 3] == pytest.approx(0.5)
+    assert interpolate(trajectory, -0.002, max_gap=0.2) is None
+    assert interpolate(trajectory, 0.202, max_gap=0.2) is None
+    # a sample at the image's own time needs no neighbour
+    assert interpolate(trajectory, 0.2005, max_gap=0.1)[0, 3] == 1
+    without_times = read_trajectory(write(tmp_path, "0 0 0 0 0 0 1\n"))
+    with pytest.raises(ValueError, match="no timestamps"):
+        interpolate(without_times, 0.0, 1.0)
+
+
+def test_a_returned_pose_is_a_copy(tmp_path):
+    trajectory = read_trajectory(write(tmp_path, "0 0 0 0 0 0 0 1\n"))
+    interpolate(trajectory, 0.0, 0.1)[:] = 5
+    np.testing.assert_array_equal(trajectory.T_world_cam[0], np.eye(4))
+
+
+def test_association_prefers_the_closest_and_uses_each_once():
+    first, second = np.array([0.00, 0.03]), np.array([0.02, 0.021])
+    # 0.03 takes 0.021 (9 ms); 0.02 is left for 0.00, exactly at the limit
+    assert associate(first, second, 0.02) == {1: 1, 0: 0}
+    assert associate(first, second, 0.019) == {1: 1}
+    assert associate(np.array([0.0, 0.01]), np.array([0.009]), 0.02) == {1: 0}
+
+
+def brute_force_association(first, second, limit):
+    """All pairs within the limit, closest first, each index used once."""
+    pairs, used = {}, set()
+    for _, i, j in sorted((abs(a - b), i, j) for i, a in enumerate(first) for j, b in enumerate(second)):
+        if abs(first[i] - second[j]) <= limit and i not in pairs and j not in used:
+            pairs[i] = j
+            used.add(j)
+    return pairs
+
+
+@given(
+    st.lists(st.integers(0, 60), max_size=12),
+    st.lists(st.integers(0, 60), max_size=12),
+    st.integers(0, 9),
+)
+def test_association_equals_brute_force(first, second, limit):
+    # integers: no difference lies within rounding of the limit
+    a, b = np.array(first, dtype=float), np.array(second, dtype=float)
+    assert associate(a, b, limit) == brute_force_association(a, b, limit)
