@@ -18,17 +18,15 @@ _ZERO: Any = np.int64(0)
 
 # Columns of a finished segment. Within a row y = z (v - cy)/fy, so x and z say everything.
 _MX, _MZ, _CXX, _CXZ, _CZZ, _LX, _LZ = range(7)
-_SEGMENT = 7
 # Its whole numbers: N, smallest bin, interval.
 _N, _NEAREST, _UL, _UR = range(4)
-_SEGMENT_INT = 4
+_SEGMENT, _SEGMENT_INT = 7, 4
 
 # Columns of a Gaussian: mean, scatter (upper triangle), line vector, first mean, plane vector, its pi2 ...
 _M, _C, _L, _M0, _PI, _PI2 = 0, 3, 9, 12, 15, 18
-_GAUSSIAN = 19
 # ... and its whole numbers: those of a segment, n, the row that extended it last, its place in the output.
 _MERGED, _ROW, _ORDER = range(4, 7)
-_GAUSSIAN_INT = 7
+_GAUSSIAN, _GAUSSIAN_INT = 19, 7
 
 
 class _Open(NamedTuple):
@@ -249,8 +247,7 @@ def _join_row(
 
     Fills ``member``, appends new Gaussians; returns the length of the active list and the number created.
     """
-    n = before
-    h = np.empty(_GAUSSIAN)
+    n, h = before, np.empty(_GAUSSIAN)
     for j in range(done):
         _lift(segments[j], ry, h)
         o = _best_overlap(segments_int[j], active, before, whole)
@@ -346,11 +343,8 @@ def _merge(o, o_int, h, h_int):
     o[_C + 3] += h[_C + 3] + factor * (dy * dy)
     o[_C + 4] += h[_C + 4] + factor * (dy * dz)
     o[_C + 5] += h[_C + 5] + factor * (dz * dz)
-    o[_M] += share * dx
-    o[_M + 1] += share * dy
-    o[_M + 2] += share * dz
-    first = o_int[_MERGED] == 1
-    pi2 = 0.0
+    o[_M], o[_M + 1], o[_M + 2] = o[_M] + share * dx, o[_M + 1] + share * dy, o[_M + 2] + share * dz
+    first, pi2 = o_int[_MERGED] == 1, 0.0
     for i in range(3):
         o[_L + i] += h[_L + i]
         if first:
