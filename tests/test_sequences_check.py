@@ -159,3 +159,9 @@ def test_unregistered_depth_is_flagged():
     assert bad.quality < 0.25
     assert bad.zoom == pytest.approx(525 / 585, abs=0.03)
     assert bad.shift_x < 0
+    moved = [np.roll(depth, (6, -8), axis=(0, 1)) for depth in truth.depths]  # what undoes it is found
+    found = alignment(zip(truth.images, moved, strict=True))
+    assert found.quality < 0.25
+    assert found.zoom == pytest.approx(1, abs=0.03)
+    assert found.shift_x - good.shift_x == pytest.approx(8, abs=2)  # steps of 2 px
+    assert found.shift_y - good.shift_y == pytest.approx(-6, abs=2)

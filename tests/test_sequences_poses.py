@@ -102,9 +102,9 @@ def test_pose_file_of_another_shape(tmp_path):
 
 
 def test_interpolation_is_linear_and_turns_evenly(tmp_path):
-    trajectory = read_trajectory(write(tmp_path, f"0 0 0 0 0 0 0 1\n0.1 1 2 4 0 0 {QUARTER} {QUARTER}\n"))
+    trajectory = read_trajectory(write(tmp_path, f"0 8 0 -4 0 0 0 1\n0.1 0 2 4 0 0 {QUARTER} {QUARTER}\n"))
     T = interpolate(trajectory, 0.025, max_gap=0.1)
-    np.testing.assert_allclose(T[:3, 3], [0.25, 0.5, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(T[:3, 3], [6.0, 0.5, -2.0], rtol=1e-12)
     np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("z", 22.5, degrees=True).as_matrix(), atol=1e-12)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
 

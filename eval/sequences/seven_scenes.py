@@ -87,7 +87,7 @@ def open_seven_scenes(path: Path, options: Options) -> Sequence:
 def read_kinect(path: Path, scale: float = _MILLIMETRE) -> np.ndarray:
     """A depth PNG [H, W] float32 [m] in which 65535 as well as 0 is invalid; errors as ``read_depth``."""
     values, _ = read_map(path, key="depth")
-    if values.dtype != np.uint16:
+    if not np.issubdtype(values.dtype, np.integer):
         raise FrameError(path, f"expected 16-bit depth, got {values.dtype}")
     return np.where(values == _NO_DEPTH, 0, values * scale).astype(np.float32)
 
