@@ -1,0 +1,1 @@
+"""Sequences, metrics, runs and pictures around the core (imported lazily, module by module)."""

@@ -75,12 +75,16 @@ class Segmentation:
     prune: str  # "both": drop if both are small, "either": drop if one is, "none"
 
     def keeps(self, piece):
-        few_pixels, few_rows = piece.N < self.min_pixels, piece.n < self.min_rows
-        return not {"both": few_pixels and few_rows, "either": few_pixels or few_rows, "none": False}[self.prune]
+        few_pixels, few_rows = self.min_pixels > piece.N, piece.n < self.min_rows
+        drops = {"both": few_pixels and few_rows, "either": few_pixels or few_rows, "none": False}
+        return not drops[self.prune]
 
 
 def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
-    """C_i with the footprint of a pixel (at the near plane, if nearer) and the thickness of a slab as floor; features [F, H, W] are averaged over the pixels of a component."""
+    """C_i; floors: the footprint of a pixel (at the near plane, if nearer) and the thickness of a slab.
+
+    features [F, H, W] are averaged over the pixels of a component.
+    """
     camera = oracle_spgf.Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     pieces, _ = oracle_spgf.segment(depth, camera, segmentation.settings, valid=valid)
     components = []
@@ -226,13 +230,9 @@ class Oracle:
         to_cam = relative(self.T_first, T_world_cam)
         to_first = relative(T_world_cam, self.T_first)
         previous_cam = [transform(g, *to_cam) for g in self.mixture]
-        self.matches, overlaps = correspond(
-            previous_cam, current, K, depth.shape, self.eta, self.eta_occl, self.near
-        )
+        self.matches, overlaps = correspond(previous_cam, current, K, depth.shape, self.eta, self.eta_occl, self.near)
         current_first = [transform(g, *to_first) for g in current]
-        self.mixture = fuse(
-            self.mixture, current_first, self.matches, overlaps, overlap_weighted=self.overlap_weighted
-        )
+        self.mixture = fuse(self.mixture, current_first, self.matches, overlaps, overlap_weighted=self.overlap_weighted)
         mixture_cam = [transform(g, *to_cam) for g in self.mixture]
         M = dense(mixture_cam, depth, valid, K, **self.prior)
         if self.smoothed is not None:

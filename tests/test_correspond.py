@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import oracle
 import pytest
-import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_gaussians import mixture
 
+import oracle
+import scenes
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import correspond
 from ufmstar_torch.mixture import GaussianMixture
@@ -99,7 +99,13 @@ def test_the_border_pixel_still_counts():
         return ((u - K[0, 2].item()) / K[0, 0].item() * 2, (v - K[1, 2].item()) / K[1, 1].item() * 2, 2.0, 0.2)
 
     config = UfMStarConfig(eta=0.1)
-    for u, v, inside in [(-0.49, 0, True), (-0.51, 0, False), (63.49, 47.49, True), (63.51, 0, False), (0, 47.51, False)]:
+    for u, v, inside in [
+        (-0.49, 0, True),
+        (-0.51, 0, False),
+        (63.49, 47.49, True),
+        (63.51, 0, False),
+        (0, 47.51, False),
+    ]:
         pairs = correspond(blob(at(u, v)), blob(at(u, v)), K[None], SIZE, config)
         assert pairs.match.item() == inside
 

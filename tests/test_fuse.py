@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
 import pytest
 import torch
 from hypothesis import given, settings
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from random_gaussians import mixture
 from test_correspond import as_lists
 
+import oracle
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.fuse import append, fuse
@@ -33,9 +33,7 @@ def test_agrees_with_the_oracle(weighted, seed):
     pairs = random_pairs(2, previous, current, seed)
     config = UfMStarConfig(overlap_weighted=weighted, features=2)
     room = previous.padded(12)
-    wide = Correspondence(
-        torch.nn.functional.pad(pairs.match, (0, 6)), torch.nn.functional.pad(pairs.overlap, (0, 6))
-    )
+    wide = Correspondence(torch.nn.functional.pad(pairs.match, (0, 6)), torch.nn.functional.pad(pairs.overlap, (0, 6)))
     fused = fuse(room, current, wide, config)
     new = current.valid & ~pairs.match.any(2)
     fused, dropped = append(fused, current, new)

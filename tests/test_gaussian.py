@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
 import ot
 import pytest
 import torch
@@ -11,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_gaussians import covariances, means
 
+import oracle
 from ufmstar_torch import gaussian
 
 seeds = st.integers(0, 2**20)

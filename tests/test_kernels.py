@@ -7,17 +7,17 @@ import threading
 import warnings
 
 import pytest
-import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_gaussians import covariances, mixture
 from test_fuse import random_pairs
 
+import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig, backend, gaussian
 from ufmstar_torch.correspond import correspond
 from ufmstar_torch.fuse import fuse
-from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, gaussian_cpu
+from ufmstar_torch.kernels import correspond_cpu, fuse_cpu
 
 SIZE = (48, 64)
 K = torch.tensor(scenes.intrinsics(*SIZE))
@@ -55,10 +55,10 @@ def test_floor_covariance():
     cov = covariances(60, 4, decades=6).view(3, 20, 3, 3)
     floor = torch.linspace(1e-8, 1e-2, 20, dtype=torch.float64).expand(3, 20)
     torch.testing.assert_close(
-        gaussian_cpu.floor_covariance(cov, floor), gaussian.floor_covariance(cov, floor), rtol=0, atol=1e-15
+        fuse_cpu.floor_covariance(cov, floor), gaussian.floor_covariance(cov, floor), rtol=0, atol=1e-15
     )
     zero = torch.zeros(1, 3, 3, dtype=torch.float64)
-    lifted = gaussian_cpu.floor_covariance(zero, torch.tensor([1e-6], dtype=torch.float64))
+    lifted = fuse_cpu.floor_covariance(zero, torch.tensor([1e-6], dtype=torch.float64))
     torch.testing.assert_close(lifted[0], 1e-6 * torch.eye(3, dtype=torch.float64), rtol=1e-12, atol=0)
 
 
@@ -66,15 +66,15 @@ def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
     for name in [n for n in sys.modules if n.startswith("ufmstar_torch.kernels.") or n == "numba"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delattr("ufmstar_torch.kernels.regress_cpu")
-    for name in ("correspond_cpu", "fuse_cpu", "gaussian_cpu", "segment_cpu"):
+    for name in ("correspond_cpu", "fuse_cpu", "segment_cpu", "segment_image_cpu"):
         monkeypatch.delattr(f"ufmstar_torch.kernels.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)
     backend._numba_or_none.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba cannot be imported .* torch reference serves") as caught:
-            assert backend.select("auto", "cpu") is backend.TORCH
-            assert backend.select("auto", "cpu") is backend.TORCH
+            chosen = [backend.select("auto", "cpu") for _ in range(2)]
         assert len(caught) == 1
+        assert chosen == [backend.TORCH] * 2
         with pytest.raises(ImportError):
             backend.select("numba", "cpu")
     finally:
@@ -107,7 +107,9 @@ def test_whole_sequence_fast_and_slow():
 def test_several_threads_at_once():
     """Two streams in two Python threads give what they give alone."""
     depths, poses, K = scenes.sequence(4, 48, 64, 0.05)
-    frames = [(torch.tensor(d)[None].float(), torch.tensor(T), torch.tensor(K)) for d, T in zip(depths, poses, strict=True)]
+    frames = [
+        (torch.tensor(d)[None].float(), torch.tensor(T), torch.tensor(K)) for d, T in zip(depths, poses, strict=True)
+    ]
 
     def run(out: list) -> None:
         ufm = UfMStar()

@@ -89,7 +89,8 @@ def test_folders_on_disk_are_the_packages():
 
 
 @pytest.mark.parametrize(
-    "module", ["ufmstar_torch", "ufmstar_torch.models", "ufmstar_torch.eval", "ufmstar_torch.train", "ufmstar_torch.cli"]
+    "module",
+    ["ufmstar_torch", "ufmstar_torch.models", "ufmstar_torch.eval", "ufmstar_torch.train", "ufmstar_torch.cli"],
 )
 def test_a_bare_import_is_light(module):
     code = f"import sys, {module}; print([m for m in {HEAVY!r} if m in sys.modules])"

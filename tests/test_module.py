@@ -8,12 +8,12 @@ import json
 
 import numpy as np
 import pytest
-import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_ufmstar import SPGF, run
 
+import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.frame import FRAME_FAULTS
 
@@ -247,8 +247,14 @@ def test_mean_uncertainty_is_seeded_and_checked():
 
     assert torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=3))
     assert not torch.equal(mean(pixels=50, seed=3), mean(pixels=50, seed=4))
-    for bad in ({"pixels": 0}, {"pixels": H * W + 1}, {"fraction": 0.0}, {"fraction": 1.5}, {"pixels": 5, "fraction": 0.5}):
-        with pytest.raises(ValueError, match="pixels|fraction"):
+    for bad in (
+        {"pixels": 0},
+        {"pixels": H * W + 1},
+        {"fraction": 0.0},
+        {"fraction": 1.5},
+        {"pixels": 5, "fraction": 0.5},
+    ):
+        with pytest.raises(ValueError, match=r"pixels|fraction"):
             mean(**bad)
 
 
@@ -270,7 +276,9 @@ def test_query_is_the_dense_map_at_its_own_points():
     points = unproject(depth, intrinsics).flatten(1, 2) @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
     before = snapshot(ufm)
     result = ufm.query(points)
-    torch.testing.assert_close(result.disagreement.view(1, H, W), out.disagreement, rtol=1e-6, atol=1e-9, equal_nan=True)
+    torch.testing.assert_close(
+        result.disagreement.view(1, H, W), out.disagreement, rtol=1e-6, atol=1e-9, equal_nan=True
+    )
     assert unchanged(ufm, before)
     for bad in (torch.zeros(2, 5, 3), torch.zeros(5, 3), torch.zeros(1, 5, 2)):
         with pytest.raises(ValueError, match="points"):
@@ -283,9 +291,7 @@ def test_query_is_the_dense_map_at_its_own_points():
 
 def test_no_host_synchronisation():
     """On the meta device every read of a value raises: with a fixed capacity nothing is read at all."""
-    config = UfMStarConfig(
-        segment=SPGF, backend="torch", initial_capacity=16, max_components=16, on_bad_frame="skip"
-    )
+    config = UfMStarConfig(segment=SPGF, backend="torch", initial_capacity=16, max_components=16, on_bad_frame="skip")
     ufm = UfMStar(config, device="meta")
     for _ in range(2):
         out = ufm(
@@ -507,7 +513,7 @@ def test_config_rejects_unknown_keys_and_impossible_values():
         UfMStarConfig.from_dict({"segment": {"min_pixel": 7}})
     with pytest.raises(ValueError, match="noise_floor"):
         SPGFConfig(noise_floor=0.5)
-    with pytest.raises(Exception, match="frozen|assign"):
+    with pytest.raises(Exception, match=r"frozen|assign"):
         UfMStarConfig().eta = 0.3
     with pytest.raises(TypeError, match="UfMStarConfig"):
         UfMStar({"eta": 0.5})

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-import scenes
 import torch
 from test_ufmstar import SPGF
 from torch import nn
 
+import scenes
 from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.pipeline import combine
 
@@ -157,7 +157,7 @@ def test_what_cannot_be_meant_is_refused():
         {"networks": Scaled(1.0), "samples": 10},
         {"networks": [Scaled(1.0), Scaled(1.1)], "mode": "full", "samples": 10},
     ):
-        with pytest.raises(ValueError, match="networks|mode|samples"):
+        with pytest.raises(ValueError, match=r"networks|mode|samples"):
             UncertainDepth(**arguments)
     with pytest.raises(ValueError, match=r"image must be \[B, 3, H, W\]"):
         UncertainDepth(Scaled(1.0), CONFIG)(image(0)[0], POSES[0], K)

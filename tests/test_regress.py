@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
 import pytest
-import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_gaussians import mixture
 from test_correspond import as_lists
 
+import oracle
+import scenes
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
@@ -41,7 +41,11 @@ def test_agrees_with_the_oracle(config, seed):
     for b in range(2):
         for p in range(20):
             value, features = oracle.regress_point(
-                points[b, p].numpy(), oracle.prepared(as_lists(m, b)), prior_weight=2.0, prior_mean=0.3, neighbourhood=neighbourhood
+                points[b, p].numpy(),
+                oracle.prepared(as_lists(m, b)),
+                prior_weight=2.0,
+                prior_mean=0.3,
+                neighbourhood=neighbourhood,
             )
             assert result.disagreement[b, p].item() == pytest.approx(value, rel=1e-9)
             np.testing.assert_allclose(result.features[b, p].numpy(), features, rtol=1e-9, atol=1e-300)
@@ -58,7 +62,9 @@ def test_the_kernel_agrees_with_the_reference(config, dtype, tolerance):
     assert torch.equal(fast.disagreement.isnan(), reference.disagreement.isnan())
     assert fast.disagreement.isnan().sum() == 2
     # float32: what the exponent's argument, up to some 100, loses to rounding.
-    torch.testing.assert_close(fast.disagreement.double(), reference.disagreement, rtol=0, atol=tolerance, equal_nan=True)
+    torch.testing.assert_close(
+        fast.disagreement.double(), reference.disagreement, rtol=0, atol=tolerance, equal_nan=True
+    )
     torch.testing.assert_close(fast.features.double(), reference.features, rtol=0, atol=tolerance, equal_nan=True)
 
 
@@ -120,9 +126,7 @@ def test_weights_average_between_components():
 def test_smooth():
     nan = float("nan")
     before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]])
-    torch.testing.assert_close(
-        smooth(before, now, 0.25), torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True
-    )
+    torch.testing.assert_close(smooth(before, now, 0.25), torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
     assert smooth(None, now, 0.5) is now
     assert smooth(before, now, 1.0) is now
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
 import oracle_spgf
 import pytest
-import scenes
 import torch
 
+import oracle
+import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
 
 HEIGHT, WIDTH = 30, 40
@@ -75,9 +75,7 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
         strict, _ = oracle.correspond(previous, current, K, depths[i].shape, 0.5, 0.7, 0.05)
         hidden += sum(len(a) - len(b) for a, b in zip(loose, strict, strict=True))
         to_first = oracle.relative(poses[i], judge.T_first)
-        judge.mixture = oracle.fuse(
-            judge.mixture, [oracle.transform(g, *to_first) for g in current], strict, overlaps
-        )
+        judge.mixture = oracle.fuse(judge.mixture, [oracle.transform(g, *to_first) for g in current], strict, overlaps)
     assert hidden > 0
 
 
@@ -85,9 +83,7 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
 @pytest.mark.parametrize("streams", [1, 4])
 def test_thirty_frames_agree_with_the_oracle(truth, backend, streams):
     depths, poses, K, aleatoric, maps, matches, mixture, sizes, thick = truth
-    config = UfMStarConfig(
-        segment=SPGF, backend=backend, features=2, initial_capacity=8, thickness_floor=thick
-    )
+    config = UfMStarConfig(segment=SPGF, backend=backend, features=2, initial_capacity=8, thickness_floor=thick)
     ufm = UfMStar(config, dtype=torch.float64)
 
     def batch(x):
@@ -235,7 +231,10 @@ def test_total_variance(which):
     a, e = torch.full((1, HEIGHT, WIDTH), 0.25).double(), torch.full((1, HEIGHT, WIDTH), 0.5).double()
     config = UfMStarConfig(segment=SPGF, add_aleatoric=which != "off", add_epistemic=which != "off")
     ufm = UfMStar(config, dtype=torch.float64)
-    given = {"aleatoric": a if which in ("a", "both", "off") else None, "epistemic": e if which in ("e", "both", "off") else None}
+    given = {
+        "aleatoric": a if which in ("a", "both", "off") else None,
+        "epistemic": e if which in ("e", "both", "off") else None,
+    }
     for depth, T in zip(depths, poses, strict=True):
         out = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K), **given)
     added = {"none": 0.0, "a": 0.25, "e": 0.5, "both": 0.75, "off": 0.0}[which]

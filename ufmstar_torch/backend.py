@@ -66,12 +66,12 @@ def select(name: str, device_type: str) -> Backend:
 
 
 def _numba_backend() -> Backend:
-    from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, gaussian_cpu, regress_cpu, segment_cpu
+    from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu, segment_cpu
 
     return Backend(
         "numba",
         segment_cpu.spgf,
-        gaussian_cpu.floor_covariance,
+        fuse_cpu.floor_covariance,
         correspond_cpu.correspond,
         fuse_cpu.fuse,
         regress_cpu.regress_image,

@@ -86,9 +86,7 @@ def project_gaussian(mean_cam: Tensor, covariance_cam: Tensor, intrinsics: Tenso
     x, y, z = mean_cam.unbind(-1)
     mean = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
     zero = torch.zeros_like(z)
-    A = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], dim=-1).unflatten(
-        -1, (2, 3)
-    )
+    A = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], dim=-1).unflatten(-1, (2, 3))
     return mean, A @ covariance_cam @ A.mT
 
 

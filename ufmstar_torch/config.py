@@ -31,9 +31,7 @@ def _check_number(owner: str, name: str, value: object, range_: tuple[float, flo
     if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
         raise ValueError(f"{owner}.{name} must be a number, got {value!r}")
     if value < low or value > high or (open_low and value == low):
-        raise ValueError(
-            f"{owner}.{name} must lie in {'(' if open_low else '['}{low}, {high}], got {value!r}"
-        )
+        raise ValueError(f"{owner}.{name} must lie in {'(' if open_low else '['}{low}, {high}], got {value!r}")
 
 
 class _Checked:
@@ -197,9 +195,7 @@ class UfMStarConfig(_Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not isinstance(self.segment, SPGFConfig):
-            raise ValueError(
-                f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}"
-            )
+            raise ValueError(f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}")
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"

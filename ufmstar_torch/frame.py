@@ -132,11 +132,7 @@ def _mask(valid: object, depth: Tensor) -> Tensor:
         kind = valid.dtype if isinstance(valid, Tensor) else type(valid).__name__
         raise TypeError(f"valid must be a torch.bool tensor (True = use), got {kind}")
     _on_device("valid", valid, depth)
-    if (
-        valid.numel() != depth.numel()
-        or valid.shape[0] != depth.shape[0]
-        or valid.shape[-2:] != depth.shape[-2:]
-    ):
+    if valid.numel() != depth.numel() or valid.shape[0] != depth.shape[0] or valid.shape[-2:] != depth.shape[-2:]:
         raise ValueError(f"valid must have the depth's shape {tuple(depth.shape)}, got {tuple(valid.shape)}")
     return valid
 

@@ -83,9 +83,7 @@ def _fuse_one_each(
         "count": mixture.count + 1,
         "features": average(mixture.features, of_c(current.features), lam[..., None]),
     }
-    return mixture.replace(
-        **{name: _where(used, value, getattr(mixture, name)) for name, value in updated.items()}
-    )
+    return mixture.replace(**{name: _where(used, value, getattr(mixture, name)) for name, value in updated.items()})
 
 
 def _where(used: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -228,9 +228,7 @@ def barycenter(
         S = updated
         if float(moved) <= max(tolerance, 8 * torch.finfo(S.dtype).eps):
             return centre, S
-    raise RuntimeError(
-        f"the barycenter moved by {float(moved):.1e} of its trace after {iterations} iterations"
-    )
+    raise RuntimeError(f"the barycenter moved by {float(moved):.1e} of its trace after {iterations} iterations")
 
 
 def wasserstein_variance(mean: Tensor, covariance: Tensor, weight: Tensor) -> Tensor:

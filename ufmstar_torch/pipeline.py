@@ -129,9 +129,7 @@ class UncertainDepth(nn.Module):
             x, K = (image, K) if self.preprocess is None else self.preprocess(image, K)
             member = None if self.mode == "full" else self._next % len(self.networks)
             prediction = self._all(x) if member is None else self._one(member, x)
-        ufm = self.ufm(
-            prediction.depth, pose, K, prediction.aleatoric_variance, prediction.epistemic_variance, valid
-        )
+        ufm = self.ufm(prediction.depth, pose, K, prediction.aleatoric_variance, prediction.epistemic_variance, valid)
         self._next += 1
         self.image_index = torch.full_like(self.image_index, self._next)
         return UncertainPrediction(prediction, ufm, K, member)
@@ -139,9 +137,7 @@ class UncertainDepth(nn.Module):
     def _one(self, member: int, x: Tensor) -> DepthPrediction:
         prediction = self.networks[member](x)
         if not isinstance(prediction, DepthPrediction):
-            raise TypeError(
-                f"network {member} must return a DepthPrediction, got {type(prediction).__name__}"
-            )
+            raise TypeError(f"network {member} must return a DepthPrediction, got {type(prediction).__name__}")
         return prediction
 
     def _all(self, x: Tensor) -> DepthPrediction:

@@ -57,14 +57,10 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
     parts = [_chunk(mixture, whitening, log_peak, x, config) for x in points.split(per_chunk, dim=1)]
     if not parts:
         parts = [_chunk(mixture, whitening, log_peak, points, config)]
-    return Regression(
-        torch.cat([p.disagreement for p in parts], 1), torch.cat([p.features for p in parts], 1)
-    )
+    return Regression(torch.cat([p.disagreement for p in parts], 1), torch.cat([p.features for p in parts], 1))
 
 
-def regress_image(
-    mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig
-) -> Regression:
+def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig) -> Regression:
     """:func:`regress` at every pixel of a depth map: disagreement [B, H, W], features [B, H, W, F].
 
     Args:

@@ -50,9 +50,7 @@ class UfMStarState:
         capacity = min(config.initial_capacity, config.max_components or config.initial_capacity)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
         return cls(
-            mixture=GaussianMixture.empty(
-                streams, capacity, features=config.features, dtype=dtype, device=device
-            ),
+            mixture=GaussianMixture.empty(streams, capacity, features=config.features, dtype=dtype, device=device),
             T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
             started=counter.bool(),
             frames=counter,
@@ -164,9 +162,7 @@ def step(
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
     )
-    updated = UfMStarState(
-        mixture, first, state.started | fine, state.frames + fine, state.skipped + ~fine, smoothed
-    )
+    updated = UfMStarState(mixture, first, state.started | fine, state.frames + fine, state.skipped + ~fine, smoothed)
     return updated, StepOutput(disagreement, result.features, labels, current_cam, statistics)
 
 

@@ -264,9 +264,7 @@ class UfMStar(nn.Module):
     def state(self) -> UfMStarState:
         """The state as the pure function :func:`ufmstar_torch.step.step` takes it."""
         smoothed = self.smoothed if self.smoothed.shape[-1] else None
-        return UfMStarState(
-            self.mixture, self.T_world_first, self.started, self.frames, self.skipped, smoothed
-        )
+        return UfMStarState(self.mixture, self.T_world_first, self.started, self.frames, self.skipped, smoothed)
 
     def reset(self, streams: Sequence[int] | Tensor | None = None) -> None:
         """Forget everything, or only some streams.
@@ -306,9 +304,7 @@ class UfMStar(nn.Module):
             _full_precision(frame.depth.device),
         ):
             backend = select(self.config.backend, frame.depth.device.type)
-            state, out = step(
-                self._state_for(frame), frame, self.config, backend, pixels=pixels, average=average
-            )
+            state, out = step(self._state_for(frame), frame, self.config, backend, pixels=pixels, average=average)
         self._store(state)
         return out
 
@@ -321,9 +317,7 @@ class UfMStar(nn.Module):
                 f"depth has {streams} streams but the state holds {self.mean.shape[0]}: call reset() first"
             )
         if self.mean.device != device:
-            raise ValueError(
-                f"depth lies on {device} but the state on {self.mean.device}: move one with .to()"
-            )
+            raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
         return self.state
 
     def _store(self, state: UfMStarState) -> None:
@@ -370,9 +364,7 @@ class UfMStar(nn.Module):
         ours = self.config.to_dict()
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
-            warnings.warn(
-                f"the loaded state was made with another config: {', '.join(changed)} differ", stacklevel=2
-            )
+            warnings.warn(f"the loaded state was made with another config: {', '.join(changed)} differ", stacklevel=2)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         """Take the shapes of a saved state (streams, capacity, image size) before its values are copied."""

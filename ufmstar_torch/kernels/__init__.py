@@ -1,0 +1,1 @@
+"""The steps of the algorithm again, faster: same signatures as the torch reference (see ``ufmstar_torch.backend``)."""

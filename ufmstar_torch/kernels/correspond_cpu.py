@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.mixture import GaussianMixture
+
+compiled: Any = njit(cache=True, nogil=True)
 
 
 def correspond(
@@ -33,16 +36,14 @@ def correspond(
 
     camera = intrinsics.detach().double().contiguous().numpy()
     thresholds = (config.eta, config.eta_occlusion, config.near_plane)
-    for stream in range(b):
-        previous, current = arrays(previous_cam), arrays(current_cam)
-        _stream(
-            *(value[stream] for value in previous), *(value[stream] for value in current),
-            camera[stream], size[0], size[1], *thresholds, match[stream], overlap[stream],
-        )  # fmt: skip
+    previous, current = arrays(previous_cam), arrays(current_cam)
+    for s in range(b):
+        streams = (*(value[s] for value in previous), *(value[s] for value in current), camera[s])
+        _stream(*streams, *size, *thresholds, match[s], overlap[s])
     return Correspondence(torch.from_numpy(match), torch.from_numpy(overlap))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _project(mean, covariance, weight, K, height, width, near):
     """Indices of the candidates, and per candidate u, v, the covariance's xx, xy, yy, and the depth."""
     index = np.empty(weight.size, np.int64)
@@ -67,7 +68,7 @@ def _project(mean, covariance, weight, K, height, width, near):
     return index[:n], image[:n]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _bhattacharyya(p, q):
     """Overlap of two projected Gaussians."""
     xx, xy, yy = 0.5 * (p[2] + q[2]), 0.5 * (p[3] + q[3]), 0.5 * (p[4] + q[4])
@@ -78,10 +79,8 @@ def _bhattacharyya(p, q):
     return math.exp(-squared / 8) * min(1.0, math.sqrt(math.sqrt(product) / det))
 
 
-@njit(cache=True, nogil=True)
-def _stream(
-    mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, match, overlap
-):
+@compiled
+def _stream(mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, match, overlap):
     """One stream: overlaps of all candidate pairs, then the occlusion filter within each set."""
     index_k, image_k = _project(mean_k, cov_k, weight_k, K, height, width, near)
     index_c, image_c = _project(mean_c, cov_c, weight_c, K, height, width, near)

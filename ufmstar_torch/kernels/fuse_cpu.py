@@ -1,15 +1,27 @@
-"""Fusion on the CPU (numba): one pass over the matched pairs."""
+"""Fusion on the CPU (numba): the floor of covariances, and one pass over the matched pairs.
+
+The scalar twins of ``ufmstar_torch.gaussian`` stand here and not in a file of their own: numba's cache of a compiled
+function notices edits in its own file only.
+"""
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
+from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.kernels.gaussian_cpu import geodesic
 from ufmstar_torch.mixture import GaussianMixture
+
+compiled: Any = njit(cache=True, nogil=True)
+
+_SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
+_NEGLIGIBLE = 16 * np.finfo(np.float64).eps
 
 
 def fuse(
@@ -34,7 +46,130 @@ def fuse(
     return fused
 
 
-@njit(cache=True, nogil=True)
+def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
+    """As :func:`ufmstar_torch.gaussian.floor_covariance` for positive semidefinite float64 CPU tensors."""
+    lifted = covariance.detach().to(torch.float64, copy=True).contiguous()
+    limits = floor.detach().double().expand(lifted.shape[:-2]).contiguous()
+    _floor(lifted.view(-1, 3, 3).numpy(), limits.view(-1).numpy())
+    return lifted
+
+
+@compiled
+def cholesky3(S, L):
+    """Lower Cholesky factor of positive semidefinite S, written to L (upper part zero)."""
+    negligible = _NEGLIGIBLE * max(S[0, 0], S[1, 1], S[2, 2])
+    L[:] = 0.0
+    for j in range(3):
+        pivot = S[j, j]
+        for i in range(j):
+            pivot -= L[j, i] * L[j, i]
+        if pivot <= negligible:
+            continue
+        root = math.sqrt(pivot)
+        L[j, j] = root
+        for r in range(j + 1, 3):
+            value = S[r, j]
+            for i in range(j):
+                value -= L[r, i] * L[j, i]
+            L[r, j] = value / root
+
+
+@compiled
+def _angle(alpha, beta, gamma):
+    """Cosine and sine of the smaller rotation that annihilates gamma in [[alpha, gamma], [gamma, beta]]."""
+    zeta = (beta - alpha) / (2 * gamma)
+    t = (-1.0 if zeta < 0 else 1.0) / (abs(zeta) + math.sqrt(1 + zeta * zeta))
+    c = 1 / math.sqrt(1 + t * t)
+    return c, c * t
+
+
+@compiled
+def right_singular(M, V, s):
+    """Singular values s and right singular vectors V of M by one-sided Jacobi; M is overwritten with U diag(s)."""
+    V[:] = 0.0
+    for i in range(3):
+        V[i, i] = 1.0
+    for _ in range(_SWEEPS):
+        rotated = False
+        for p in range(2):
+            for q in range(p + 1, 3):
+                alpha = M[0, p] ** 2 + M[1, p] ** 2 + M[2, p] ** 2
+                beta = M[0, q] ** 2 + M[1, q] ** 2 + M[2, q] ** 2
+                gamma = M[0, p] * M[0, q] + M[1, p] * M[1, q] + M[2, p] * M[2, q]
+                if gamma * gamma <= 1e-34 * alpha * beta:
+                    continue
+                rotated = True
+                c, sn = _angle(alpha, beta, gamma)
+                for i in range(3):
+                    M[i, p], M[i, q] = c * M[i, p] - sn * M[i, q], sn * M[i, p] + c * M[i, q]
+                    V[i, p], V[i, q] = c * V[i, p] - sn * V[i, q], sn * V[i, p] + c * V[i, q]
+        if not rotated:
+            break
+    for j in range(3):
+        s[j] = math.sqrt(M[0, j] ** 2 + M[1, j] ** 2 + M[2, j] ** 2)
+
+
+@compiled
+def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
+    """Move (mean_a, cov_a) by ``lam`` towards b in place; return W2^2 between the two as they were.
+
+    work: [6, 3, 3] scratch.
+    """
+    L_a, L_b, M, V, half, T = work[0], work[1], work[2], work[3], work[4], work[5]
+    cholesky3(cov_a, L_a)
+    cholesky3(cov_b, L_b)
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = L_b[0, i] * L_a[0, j] + L_b[1, i] * L_a[1, j] + L_b[2, i] * L_a[2, j]
+    s = np.empty(3)
+    right_singular(M, V, s)
+    distance, shift = -2 * (s[0] + s[1] + s[2]), 0.0
+    for i in range(3):
+        distance += cov_a[i, i] + cov_b[i, i]
+        shift += (mean_a[i] - mean_b[i]) ** 2
+    distance = shift + max(distance, 0.0)
+    for j in range(3):  # half = L_a^-T V by back substitution
+        for i in range(2, -1, -1):
+            value = V[i, j]
+            for r in range(i + 1, 3):
+                value -= L_a[r, i] * half[r, j]
+            half[i, j] = value / L_a[i, i]
+    for i in range(3):
+        for j in range(3):
+            Z = half[i, 0] * s[0] * half[j, 0] + half[i, 1] * s[1] * half[j, 1] + half[i, 2] * s[2] * half[j, 2]
+            T[i, j] = lam * Z + ((1 - lam) if i == j else 0.0)
+    for i in range(3):  # M = T L_a, so that T Sigma T^T = M M^T is symmetric by construction
+        for j in range(3):
+            M[i, j] = T[i, 0] * L_a[0, j] + T[i, 1] * L_a[1, j] + T[i, 2] * L_a[2, j]
+    for i in range(3):
+        mean_a[i] = (1 - lam) * mean_a[i] + lam * mean_b[i]
+        for j in range(i + 1):
+            value = M[i, 0] * M[j, 0] + M[i, 1] * M[j, 1] + M[i, 2] * M[j, 2]
+            cov_a[i, j] = value
+            cov_a[j, i] = value
+    return distance
+
+
+@compiled
+def _floor(covariance, floor):
+    """Lift the eigenvalues of every covariance [N, 3, 3] to floor [N], in place."""
+    M, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    for n in range(covariance.shape[0]):
+        S = covariance[n]
+        M[:] = S
+        right_singular(M, V, s)  # of a positive semidefinite matrix: its eigenvalues and eigenvectors
+        if min(s[0], s[1], s[2]) >= floor[n]:
+            continue
+        for i in range(3):
+            for j in range(i + 1):
+                value = 0.0
+                for k in range(3):
+                    value += V[i, k] * max(s[k], floor[n]) * V[j, k]
+                S[i, j] = value
+                S[j, i] = value
+
+
+@compiled
 def _fuse(
     mean, covariance, weight, disagreement, count, features,
     mean_c, cov_c, weight_c, features_c, match, overlap, overlap_weighted,

@@ -16,6 +16,7 @@ from the camera, and nothing to a far outlier among its pixels either.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,9 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
 
+compiled: Any = njit(cache=True, nogil=True)
+compiled_parallel: Any = njit(cache=True, nogil=True, parallel=True)
+
 # Share of the denominator that culling may leave out at each of the two levels: about the rounding of a
 # sum in the dtype, so that culling is no coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
@@ -36,9 +40,7 @@ _BLOCK = 4  # tiles; a block of 64 x 64 pixels is culled first
 _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 
 
-def regress_image(
-    mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig
-) -> Regression:
+def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig) -> Regression:
     """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors."""
     dtype = np.float64 if depth.dtype == torch.float64 else np.float32
     b, height, width = depth.shape
@@ -61,7 +63,7 @@ def regress_image(
     return Regression(torch.from_numpy(maps), torch.from_numpy(features))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _prepare(mean, covariance, weight):
     """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
     index = np.flatnonzero(weight > 0)
@@ -82,7 +84,7 @@ def _prepare(mean, covariance, weight):
     return index, whitening, log_peak
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _squares(centre, radius):
     """Least and greatest square of a value that lies within ``radius`` of ``centre``."""
     low = max(abs(centre) - radius, 0.0)
@@ -90,7 +92,7 @@ def _squares(centre, radius):
     return low * low, high * high
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _cull(candidates, count, centre, half, mean, whitening, log_peak, prior, epsilon, kept):
     """Write the components that matter inside the box centre +- half to ``kept``; return how many."""
     least = prior
@@ -101,8 +103,8 @@ def _cull(candidates, count, centre, half, mean, whitening, log_peak, prior, eps
         dx, dy, dz = centre[0] - mean[k, 0], centre[1] - mean[k, 1], centre[2] - mean[k, 2]
         low0, high0 = _squares(W[0] * dx, W[0] * half[0])
         low1, high1 = _squares(W[1] * dx + W[2] * dy, abs(W[1]) * half[0] + W[2] * half[1])
-        low2, high2 = _squares(W[3] * dx + W[4] * dy + W[5] * dz, abs(W[3]) * half[0] + abs(W[4]) * half[1] + W[5] * half[2]
-        )
+        reach = abs(W[3]) * half[0] + abs(W[4]) * half[1] + W[5] * half[2]
+        low2, high2 = _squares(W[3] * dx + W[4] * dy + W[5] * dz, reach)
         least += math.exp(log_peak[k] - 0.5 * (high0 + high1 + high2))
         high[j] = log_peak[k] - 0.5 * (low0 + low1 + low2)
     threshold = math.log(epsilon * least / max(count, 1))
@@ -114,7 +116,7 @@ def _cull(candidates, count, centre, half, mean, whitening, log_peak, prior, eps
     return n
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _box(depth, K, v0, v1, u0, u1, centre, half, origin):
     """Bounding box of the points of a patch of pixels, and its nearest point; False without a positive depth."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -171,16 +173,15 @@ def _exp_overload(t):
     return exp32
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _points(depth, K, v0, v1, u0, u1, origin, x, y, z):
     """Points of a patch relative to ``origin``, in the arrays' precision; pixels without depth give NaN."""
     i = 0
     for v in range(v0, v1):
         ry = (v - K[1, 2]) / K[1, 1]
         for u in range(u0, u1):
-            d = np.float64(depth[v, u])
-            if not (d > 0 and d < np.inf):
-                d = np.nan
+            value = np.float64(depth[v, u])
+            d = value if value > 0 and value < np.inf else np.nan
             x[i] = (u - K[0, 2]) / K[0, 0] * d - origin[0]
             y[i] = ry * d - origin[1]
             z[i] = d - origin[2]
@@ -188,7 +189,7 @@ def _points(depth, K, v0, v1, u0, u1, origin, x, y, z):
     return i
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _accumulate(coefficient, x, y, z, evidence, total, density):
     """Add one component to n points: its density to ``evidence``, times m to ``total``.
 
@@ -207,8 +208,10 @@ def _accumulate(coefficient, x, y, z, evidence, total, density):
         total[i] += w * m
 
 
-@njit(cache=True, nogil=True)
-def _tile(depth, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features, prior, prior_mean, out, out_f):
+@compiled
+def _tile(
+    depth, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features, prior, prior_mean, out, out_f
+):
     """Regress one tile; ``local`` holds mean and whitening of the occupied components."""
     count = (v1 - v0) * (u1 - u0)
     x, y, z = np.empty(count, out.dtype), np.empty(count, out.dtype), np.empty(count, out.dtype)
@@ -239,7 +242,7 @@ def _tile(depth, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, 
             i += 1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _block(depth, K, v_low, u_low, components, index, local, log_peak, m, features, prior, epsilon, out, out_f):
     """Regress a block of tiles with the components that matter to it."""
     height, width = depth.shape
@@ -263,7 +266,7 @@ def _block(depth, K, v_low, u_low, components, index, local, log_peak, m, featur
             )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_parallel
 def _exact(depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
     """All streams; blocks of tiles in parallel."""
     height, width = depth.shape[1:]
@@ -280,7 +283,7 @@ def _exact(depth, K, mean, covariance, weight, m, features, prior_weight, prior_
             )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _pixel(x, y, z, count, gaps, kept, radius, index, local, log_peak, m, features, evidence, total, sums):
     """Sum over the kept components whose gap is at most ``radius``; returns evidence and total."""
     for j in range(count):
@@ -299,7 +302,7 @@ def _pixel(x, y, z, count, gaps, kept, radius, index, local, log_peak, m, featur
     return evidence, total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _near_row(depth, K, v, components, extent, index, local, log_peak, m, features, prior, radii, out, out_f):
     """One row of pixels with the paper's neighbourhood."""
     near, far = radii
@@ -329,7 +332,7 @@ def _near_row(depth, K, v, components, extent, index, local, log_peak, m, featur
         out_f[v, u] = sums / evidence
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@compiled_parallel
 def _neighbourhood(
     depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f
 ):

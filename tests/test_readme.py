@@ -1,0 +1,61 @@
+"""The README: its code runs, its commands are the ones CI uses, its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import torch
+
+import scenes
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+def test_the_example_runs(tmp_path, monkeypatch, capsys):
+    (code,) = blocks("python")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+    depths, poses, K = scenes.sequence(3, 48, 64, 0.05)
+    frames = [
+        (torch.tensor(d)[None].float(), torch.tensor(T), torch.tensor(K)) for d, T in zip(depths, poses, strict=True)
+    ]
+    monkeypatch.chdir(tmp_path)
+    scope = {"frames": frames}
+    exec(compile(code, "README.md", "exec"), scope)
+    assert scope["trust"].shape == (1, 48, 64)
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert (tmp_path / "state.pt").exists()
+
+
+def test_both_commands_are_one_line_each():
+    main, tests = blocks("bash")
+    assert len(main.strip().splitlines()) == len(tests.strip().splitlines()) == 1
+    assert "ufmstar run" in main
+    assert tests.strip().endswith("pytest")
+    between = README.split("<!-- test-command -->")[1].split("<!-- end -->")[0]
+    assert tests in between, "CI runs what stands between the markers"
+
+
+def test_links_and_pictures_exist():
+    for document in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
+            if not target.startswith("http"):
+                assert (document.parent / target).exists(), f"{document.name}: {target}"
+
+
+def test_nothing_names_a_machine():
+    """No absolute path of a workplace and no placeholder left in what a reader sees."""
+    for document in [
+        ROOT / "README.md",
+        ROOT / "CHANGELOG.md",
+        ROOT / "CONTRIBUTING.md",
+        *(ROOT / "docs").glob("*.md"),
+    ]:
+        text = document.read_text()
+        assert not re.search(r"(?<![\w.])/(work|opt|tmp|home|root)/", text), document
+        assert not re.search(r"[A-Z]+_TABLE|TODO|FIXME", text), document
