@@ -24,7 +24,7 @@ _TARGETS = {
     "long_run_ratio": 1.2,
 }
 _TARGET_SIZE = 224
-_HISTORY, _WARM_UP = 100, 3
+_WARM_UP, _TORCH_ROUNDS = 3, 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--backends", nargs="+", choices=["numba", "torch"], default=["numba", "torch"], help="kernels to time"
     )
     parser.add_argument("--frames", type=int, default=40, help="timed frames (the torch backend: at most 5)")
-    parser.add_argument("--history", type=int, default=_HISTORY, help="frames that build the mixture, not timed")
+    parser.add_argument("--in-view", type=int, default=100, help="components in view from which on frames are timed")
+    parser.add_argument("--history", type=int, default=400, help="frames that may pass before that at most")
     parser.add_argument("--boxes", type=int, default=40, help="things in the rendered room")
     parser.add_argument("--threads", type=int, help="of torch and numba (default: the cores of this process)")
     parser.add_argument("--seed", type=int, default=0, help="of the rendered room")
@@ -92,9 +93,9 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
     from ufmstar_torch.eval.benchmark_compile import measure_compilation
     from ufmstar_torch.eval.benchmark_long import measure_long_run
 
-    for name in ("frames", "boxes", "history"):
+    for name in ("frames", "boxes", "history", "in_view"):
         if getattr(options, name) < 1:
-            raise ValueError(f"--{name} must be at least 1, got {getattr(options, name)}")
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
     if min(options.sizes) < 16:
         raise ValueError(f"--sizes must be at least 16 pixels, got {options.sizes}")
     config = UfMStarConfig()
@@ -147,17 +148,22 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, Any]:
 def _results(
     options: argparse.Namespace, config: Any, fastdepth: Any, source: Any, progress: Callable[[str], object]
 ) -> list[dict[str, Any]]:
-    from ufmstar_torch.eval.benchmark_step import Plan, measure_step, reference_networks
+    from ufmstar_torch.eval.benchmark_step import Plan, build_up, measure_step, reference_networks
 
     results = []
     for size in options.sizes:
+        progress(f"{size} x {size}, building up the mixture")
         networks, about = reference_networks(size, fastdepth)
+        rounds = _WARM_UP + options.frames
+        built, frames, history = build_up(
+            source, config, size=size, in_view=options.in_view, history=options.history, rounds=rounds
+        )
         for backend in options.backends:
             progress(f"{size} x {size}, {backend}")
-            rounds = options.frames if backend == "numba" else min(options.frames, 5)
-            plan = Plan(size, backend, options.history, _WARM_UP if backend == "numba" else 1, rounds)
-            result = measure_step(plan, source, config, networks)
-            results.append({**result, "networks_about": about})
+            timed = options.frames if backend == "numba" else min(options.frames, _TORCH_ROUNDS)
+            plan = Plan(size, backend, _WARM_UP if backend == "numba" else 1, timed)
+            result = measure_step(plan, built, frames, networks)
+            results.append({**result, "history": history, "networks_about": about})
     return results
 
 
@@ -176,13 +182,8 @@ def targets(report: dict[str, Any]) -> list[dict[str, Any]]:
         values["long_run_ratio"] = long_run["ratio"]
         values["components_bytes"] = long_run["memory"]["in_use"]
     return [
-        {
-            "name": name,
-            "value": value,
-            "target": _TARGETS[name],
-            "met": None if value is None else value <= _TARGETS[name],
-        }
-        for name, value in values.items()
+        {"name": name, "value": value, "target": target, "met": None if value is None else value <= target}
+        for (name, value), target in zip(values.items(), _TARGETS.values(), strict=True)
     ]
 
 

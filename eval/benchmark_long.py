@@ -33,8 +33,7 @@ def measure_long_run(
     ufm, watch = UfMStar(config), Stopwatch()
     counts: dict[str, list[int]] = {"components": [], "in_view": [], "segments": [], "matched": [], "new": []}
     for frame in source.frames(size, frames):
-        call = lambda frame=frame: ufm(frame.depth, frame.T_world_cam, frame.intrinsics)  # noqa: E731
-        statistics = watch.time("step", call).statistics
+        statistics = watch.time("step", ufm, frame.depth, frame.T_world_cam, frame.intrinsics).statistics
         for name in ("components", "segments", "matched", "new"):
             counts[name].append(int(getattr(statistics, name)))
         counts["in_view"].append(components_in_view(ufm, frame))
@@ -42,14 +41,13 @@ def measure_long_run(
 
     def at(low: int) -> dict[str, Any]:
         part = slice(low, low + window)
+        means = {name: float(np.mean(counts[name][part])) for name in ("in_view", "segments", "matched", "new")}
         return {
             "frames": [low + 1, low + window],
             "step_median_ms": float(np.median(wall[part])),
             "step_cpu_median_ms": float(np.median(cpu[part])),
             "components": counts["components"][min(low + window, frames) - 1],
-            **{
-                f"{name}_mean": float(np.mean(counts[name][part])) for name in ("in_view", "segments", "matched", "new")
-            },
+            **{f"{name}_mean": value for name, value in means.items()},
         }
 
     first, last = at(start), at(frames - window)

@@ -48,8 +48,11 @@ def _result(result: Mapping[str, Any]) -> list[str]:
         _row(f"mean of {result['mean_uncertainty']['pixels']} pixels", result["mean_uncertainty"]),
         *(_row(f"{name} forward", times) for name, times in result["networks"].items()),
     ]
-    ratios = (f"{name} {r['median']:.3f} ({r['q1']:.3f} to {r['q3']:.3f})" for name, r in result["ratios"].items())
-    lines.append("  ratios, median and quartiles: " + ", ".join(ratios))
+    ratios = (
+        f"{name} {r['median']:.3f} ({r['q1']:.3f} to {r['q3']:.3f}; CPU {r['cpu_median']:.3f})"
+        for name, r in result["ratios"].items()
+    )
+    lines.append("  ratios, median and quartiles: " + "; ".join(ratios))
     lines.append(
         f"  memory: {memory['components']} components of {memory['bytes_per_component']} B = "
         f"{memory['in_use'] / 1e3:.1f} kB in use, {memory['allocated'] / 1e3:.1f} kB allocated, "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -41,7 +42,6 @@ class Plan:
     Attributes:
         size: image height and width [px].
         backend: "numba" or "torch".
-        history: frames that build up the mixture before anything is timed.
         warm_up: rounds of every contestant that are not counted.
         rounds: rounds that are.
         pixels: of the image average.
@@ -49,49 +49,69 @@ class Plan:
 
     size: int
     backend: str
-    history: int
     warm_up: int
     rounds: int
     pixels: int = 1000
 
 
-def measure_step(plan: Plan, source: FrameSource, config: UfMStarConfig, networks: dict[str, Call]) -> dict[str, Any]:
+def build_up(
+    source: FrameSource, config: UfMStarConfig, *, size: int, in_view: int, history: int, rounds: int
+) -> tuple[UfMStar, list[PosedDepth], int]:
+    """Run until ``in_view`` components are in view (mean of the last 20 frames), at most ``history`` frames.
+
+    Compiled kernels serve where there are any, also for a state that the torch reference is then timed on:
+    the two agree to rounding.
+
+    Returns:
+        The module, the ``rounds`` frames that follow, and how many it has seen.
+    """
+    ufm = UfMStar(config.replace(backend="auto"))
+    frames = source.frames(size, history + rounds)
+    recent: deque[int] = deque(maxlen=20)
+    seen = 0
+    for frame in itertools.islice(frames, history):
+        ufm(frame.depth, frame.T_world_cam, frame.intrinsics)
+        recent.append(components_in_view(ufm, frame))
+        seen += 1
+        if len(recent) == recent.maxlen and sum(recent) >= in_view * len(recent):
+            break
+    return ufm, list(itertools.islice(frames, rounds)), seen
+
+
+def measure_step(plan: Plan, built: UfMStar, frames: Sequence[PosedDepth], networks: dict[str, Call]) -> dict[str, Any]:
     """Time the whole step, its stages, the image average and the networks, one after the other per frame.
 
-    The total, the stages and the average run on separate copies of one state, so timing the stages cannot
-    slow the total. All of them see the same frames, and each follows a network as it does in use (caches and
-    threads are as the network left them).
+    The total, the stages and the average run on copies of one state, so timing the stages cannot slow the
+    total. All of them see the same frames, and each follows a network as it does in use (caches and threads
+    are as the network left them).
 
     Args:
+        built: the state to start from; not modified.
+        frames: at least ``plan.warm_up + plan.rounds``.
         networks: forward passes by name; may be empty.
     """
-    frames = list(source.frames(plan.size, plan.history + plan.warm_up + plan.rounds))
-    # The mixture is built with the compiled kernels where there are any: the two agree to rounding.
-    built = UfMStar(config.replace(backend="auto"))
-    for frame in frames[: plan.history]:
-        built(frame.depth, frame.T_world_cam, frame.intrinsics)
-    built.config = config.replace(backend=plan.backend)
-    whole, staged, average = built, _Staged(copy.deepcopy(built)), copy.deepcopy(built)
+    start = copy.deepcopy(built)
+    start.config = built.config.replace(backend=plan.backend)
+    whole, staged, average = copy.deepcopy(start), _Staged(start), copy.deepcopy(start)
+    pixels = min(plan.pixels, plan.size**2)
     ufm: dict[str, Call] = {
         "step": lambda f: whole(f.depth, f.T_world_cam, f.intrinsics),
         "staged": staged,
-        "mean_uncertainty": lambda f: average.mean_uncertainty(
-            f.depth, f.T_world_cam, f.intrinsics, pixels=min(plan.pixels, plan.size**2)
-        ),
+        "mean_uncertainty": lambda f: average.mean_uncertainty(f.depth, f.T_world_cam, f.intrinsics, pixels=pixels),
     }
     watch = Stopwatch()
-    counts = _take_turns(frames[plan.history :], ufm, networks, watch, whole)
+    counts = _take_turns(frames[: plan.warm_up + plan.rounds], ufm, networks, watch, whole)
     watch.drop(plan.warm_up)
     staged.clock.drop(plan.warm_up)
     result: dict[str, Any] = {
         "size": plan.size,
         "backend": plan.backend,
-        "frames": {"history": plan.history, "warm_up": plan.warm_up, "timed": plan.rounds},
+        "frames": {"warm_up": plan.warm_up, "timed": plan.rounds},
         "counts": {name: _range(values[plan.warm_up :]) for name, values in counts.items()},
         "step": watch.spread("step"),
         "staged_step": watch.spread("staged"),
         **staged.clock.summary(),
-        "mean_uncertainty": {"pixels": min(plan.pixels, plan.size**2), **watch.spread("mean_uncertainty")},
+        "mean_uncertainty": {"pixels": pixels, **watch.spread("mean_uncertainty")},
         "networks": {name: watch.spread(name) for name in networks},
         "memory": memory(whole),
     }
