@@ -23,7 +23,7 @@ from ufmstar_torch.eval.pictures import Finished, common_scales, draw_sheet, dra
 from ufmstar_torch.eval.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.run_source import Source
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
-from ufmstar_torch.eval.summary import FAILED, FINISHED, INTERRUPTED, Ending, summarise
+from ufmstar_torch.eval.summary import FAILED, FINISHED, INTERRUPTED, NEAR_ZERO, Ending, summarise
 from ufmstar_torch.eval.writers import WrittenFrame
 from ufmstar_torch.frame import FRAME_FAULTS
 from ufmstar_torch.pipeline import UncertainPrediction
@@ -247,6 +247,7 @@ def _record(
         "mean_disagreement": _mean(result.disagreement, result.ufm.valid),
         "mean_sigma": _mean(result.std, result.ufm.valid),
         "mean_network_sigma": None if own is None else _mean(own.sqrt(), result.ufm.valid),
+        "near_zero": int((result.std < NEAR_ZERO).sum()),
         "ground_truth": judged,
         "saturated": {"depth": written.depth_saturated, "sigma": written.sigma_saturated},
         "ms": ms,

@@ -4,6 +4,7 @@
 OUT/frames.jsonl       one line per frame, in order: counts, means, times; or why it was skipped
 OUT/resume/run.json    what the run was started with
 OUT/resume/state.pt    UfM*'s state, the metrics' sums and the position, after the last finished frame
+OUT/resume/lock        held while a run is going on
 OUT/resume/reserve     space that is given back when the disk is full, so that the summary can be written
 ```
 state.pt is replaced after every frame, last of all: a frame counts as finished once it is there. What a
@@ -68,8 +69,9 @@ class RunFolder:
         records: the lines of frames.jsonl up to there.
     """
 
-    def __init__(self, path: Path, checkpoint: Checkpoint, records: list[dict[str, Any]]) -> None:
+    def __init__(self, path: Path, lock: BinaryIO, checkpoint: Checkpoint, records: list[dict[str, Any]]) -> None:
         self.path = path
+        self._lock = lock
         self.writer = FrameWriter(path)
         self.checkpoint = checkpoint
         self.records = records
@@ -87,7 +89,7 @@ class RunFolder:
 
         Raises:
             FolderError: the folder holds an earlier run and neither was asked for; other files; a run that was
-                started with other values (they are named); or its state cannot be read.
+                started with other values (they are named), is still going on, or whose state cannot be read.
             OSError: the folder cannot be made.
         """
         out, identity = Path(path), to_json(identity)
@@ -99,14 +101,19 @@ class RunFolder:
                 raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
         elif resume:
             _require_same(out, identity, _read_manifest(manifest))
-            return cls(out, *_load(out))
+            lock = _lock(out)
+            try:
+                return cls(out, lock, *_load(out))
+            except FolderError:
+                lock.close()
+                raise
         elif not overwrite:
             raise FolderError(f"--out {out} holds an earlier run: --resume goes on with it, --overwrite replaces it")
-        else:
-            _clear(out)
         (out / "resume").mkdir(parents=True, exist_ok=True)
+        lock = _lock(out)
+        _clear(out)
         write_json_atomic(manifest, {"program": PROGRAM, "format": FORMAT, "identity": identity})
-        return cls(out, Checkpoint(), [])
+        return cls(out, lock, Checkpoint(), [])
 
     def __enter__(self) -> RunFolder:
         """Make the journal end at the last finished frame, and set space aside for the summary."""
@@ -121,6 +128,7 @@ class RunFolder:
         if self._journal is not None:
             self._journal.truncate(self.checkpoint.journal_bytes)
             self._journal.close()
+        self._lock.close()
 
     def commit(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
         """Note a frame as handled, once its files are written.
@@ -198,6 +206,25 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
         )
     sums = {name: {key: _unpacked(v) for key, v in values.items()} for name, values in stored.pop("metrics").items()}
     return Checkpoint(metrics=sums, **stored), records
+
+
+def _lock(out: Path) -> BinaryIO:
+    """Hold the folder; the lock goes with the process, however it ends.
+
+    Raises:
+        FolderError: another process holds it.
+    """
+    file = (out / "resume" / "lock").open("wb")
+    try:
+        import fcntl
+    except ImportError:  # not a POSIX system: no lock
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        file.close()
+        raise FolderError(f"--out {out}: another run is writing there now") from error
+    return file
 
 
 def _clear(out: Path) -> None:

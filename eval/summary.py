@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,10 @@ from ufmstar_torch.eval.sequences import Sequence as Frames
 from ufmstar_torch.mixture import GaussianMixture
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
+# [m] A sigma below it claims more than any depth network knows.
+NEAR_ZERO = 1e-3
+# [nats] Above it, the mean NLL tells of a few pixels with almost no variance, and of nothing else.
+_NLL_DOMINATED = 100.0
 STAGES = ("read", "prepare", "network", "ufm", "metrics", "write")
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 _COLUMNS = {
@@ -135,9 +140,17 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "mean_sigma": _pixel_mean(done, "mean_sigma"),
         "mean_network_sigma": _pixel_mean(done, "mean_network_sigma"),
         "units": "disagreement m^2, sigma m",
+        "near_zero_share": _near_zero_share(done),
         "valid_pixels": sum(record["valid_pixels"] for record in done),
         "saturated_png_pixels": saturated,
     }
+
+
+def _near_zero_share(done: Sequence[Mapping[str, Any]]) -> float | None:
+    """Of the valid pixels those with a sigma below ``NEAR_ZERO``: all of the first frame, where nothing has been
+    compared yet, and points near no component, where the prior says 0."""
+    pixels = sum(record["valid_pixels"] for record in done)
+    return sum(record["near_zero"] for record in done) / pixels if pixels else None
 
 
 def _pixel_mean(done: Sequence[Mapping[str, Any]], key: str) -> float | None:
@@ -187,6 +200,11 @@ def table(summary: Mapping[str, Any]) -> str:
         lines += _aligned([head, *body])
         if summary["network_alone"] is None:
             lines.append(f"network alone: no row, {summary['network_alone_reason']}")
+        if (summary["metrics"]["nll"] or 0) > _NLL_DOMINATED:
+            lines.append(
+                f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma below "
+                f"{1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
+            )
     else:
         sigma = _number(uncertainty["mean_sigma"])
         lines.append(f"no metrics: {summary['metrics_reason']}; mean sigma {sigma} m")
@@ -205,7 +223,7 @@ def table(summary: Mapping[str, Any]) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None or value != value else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+    return "-" if value is None or math.isnan(value) else f"{value:.3g}"
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:

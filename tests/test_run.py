@@ -1,0 +1,547 @@
+"""The runner: what it writes equals a loop by hand, and no interruption changes it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from layouts import truncate, write_depth_png, write_generic, write_scannet
+from runs import CONFIG, Brightness, job_of, network_job, outputs, own_depth_job, read_summary
+
+from scenes import render
+from ufmstar_torch import UfMStar, UncertainDepth
+from ufmstar_torch.eval import run_folder, writers
+from ufmstar_torch.eval.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.pictures import field_of_view, square_pixels
+from ufmstar_torch.eval.run import Progress, run
+from ufmstar_torch.eval.run_folder import FolderError
+from ufmstar_torch.eval.run_source import folder_source
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.writers import read_frame
+from ufmstar_torch.models import Preprocess
+
+TESTS = Path(__file__).parent
+
+
+class Crash(BaseException):
+    """An end that nothing in the program knows of."""
+
+
+def crash():
+    raise Crash
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A generic sequence of 6 frames, 48x64, and what it was rendered from. Nobody may change it."""
+    return write_generic(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture
+def path(scene):
+    return scene[0]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(scene, tmp_path_factory):
+    """The outputs of an undisturbed run of two networks in turn."""
+    out = tmp_path_factory.mktemp("uninterrupted") / "out"
+    assert run(network_job(scene[0], *pair()), out)["state"] == "finished"
+    return outputs(out)
+
+
+def pair(**trouble):
+    """Two members that disagree; trouble happens in the second one."""
+    return Brightness(1.0, spread=0.02), Brightness(1.1, spread=0.02, **trouble)
+
+
+# ---- ground truth at the prediction's pixels ----
+
+
+@pytest.mark.parametrize("size", [(480, 640), (360, 540), (640, 480), (229, 305)])
+@pytest.mark.parametrize("preprocess", [Preprocess.nyu(), Preprocess(size=(128, 128)), Preprocess(size=(120, 128))])
+def test_resampling_by_rays_equals_the_preprocessing_of_depth(size, preprocess):
+    labels = torch.arange(size[0] * size[1]).reshape(size)
+    K = torch.tensor([[500.3, 0, 310.7], [0, 497.9, 244.1], [0, 0, 1]], dtype=torch.float64)
+    K_net = preprocess.apply_intrinsics(K, *size).numpy()
+    expected = preprocess.apply_depth(labels).numpy()
+    found = resample_nearest(labels.numpy(), K.numpy(), K_net, expected.shape)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_outside_of_the_other_camera_there_is_nothing():
+    K = np.diag([10.0, 10.0, 1.0])
+    shifted = K + np.array([[0, 0, 2.0], [0, 0, 1.0], [0, 0, 0]])
+    found = resample_nearest(np.ones((2, 3)), K, shifted, (4, 6))
+    expected = np.zeros((4, 6))
+    expected[1:3, 2:5] = 1
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_scannet_depth_is_brought_to_the_colour_camera(tmp_path):
+    path, of_color, _ = write_scannet(tmp_path, frames=2)
+    sequence = open_sequence(path)
+    frame = sequence[1]
+    assert frame.depth.shape != frame.image.shape[:2]
+    size, K = (
+        (40, 54),
+        Preprocess(size=(40, 54)).apply_intrinsics(torch.from_numpy(frame.intrinsics), *frame.image.shape[:2]),
+    )
+    found = truth_at(frame, K.numpy(), size)
+    expected = render(of_color.T_world_cam[1], K.numpy(), *size)
+    both = found > 0
+    assert both.mean() > 0.85  # the depth camera sees a little less than the colour camera
+    # Nearest pixels: exact but for the slant of the surfaces within a pixel, and a few pixels at edges.
+    off = np.abs(found - expected)[both] / expected[both]
+    assert np.quantile(off, 0.9) < 0.02
+    assert np.median(off) < 0.006
+
+
+def test_square_pixels_keep_the_view():
+    K = np.array([[198.3, 0, 111.5], [0, 264.3, 119.6], [0, 0, 1]])
+    K_square, size = square_pixels(K, (224, 224))
+    assert size == (224, 299)
+    assert abs(K_square[0, 0] / K_square[1, 1] - 1) < 0.002
+    for corner in ([-0.5, -0.5], [223.5, 223.5]):
+        ray = (np.array(corner) - K[:2, 2]) / np.diag(K)[:2]
+        seen = np.diag(K_square)[:2] * ray + K_square[:2, 2]
+        edge = [-0.5, -0.5] if corner[0] < 0 else [size[1] - 0.5, size[0] - 0.5]
+        np.testing.assert_allclose(seen, edge, atol=1e-9)
+
+
+def test_the_shown_image_is_what_the_network_saw():
+    image = np.dstack([np.mgrid[0:480, 0:640][0] // 2, np.mgrid[0:480, 0:640][1] // 3, np.zeros((480, 640))])
+    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+    nyu = Preprocess.nyu()
+    part = field_of_view(image.astype(np.uint8), K.numpy(), nyu.apply_intrinsics(K, 480, 640).numpy(), (224, 224))
+    # 228 x 304 of 250 x 333 pixels, in those of the image.
+    assert abs(part.shape[0] - 480 * 228 / 250) <= 1
+    assert abs(part.shape[1] - 640 * 304 / 333) <= 1
+    assert abs(int(part[0, 0, 0]) - 240 * 11 / 250) <= 1
+
+
+# ---- what a run writes ----
+
+
+def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
+    path, truth = scene
+    summary = run(network_job(path, Brightness(spread=0.02)), tmp_path / "out")
+    sequence, preprocess = open_sequence(path), Preprocess(size=(24, 32))
+    pipeline = UncertainDepth(Brightness(spread=0.02), CONFIG, preprocess=preprocess)
+    ours, alone = SequenceMetrics(), SequenceMetrics()
+    disagreements = []
+    for frame, depth in zip(sequence, truth.depths, strict=True):
+        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+        result = pipeline(image, torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None])
+        stored = read_frame(tmp_path / "out" / "frames" / f"{frame.name}.npz")
+        np.testing.assert_array_equal(stored["depth"], result.depth[0].numpy())
+        np.testing.assert_array_equal(stored["variance"], result.variance[0].numpy())
+        np.testing.assert_array_equal(stored["disagreement"], result.disagreement[0].numpy())
+        target = preprocess.apply_depth(torch.from_numpy(frame.depth))
+        assert np.abs(target.numpy() - preprocess.apply_depth(torch.from_numpy(depth)).numpy()).max() < 1e-3
+        ours.update(result.depth[0], result.variance[0], target)
+        alone.update(result.depth[0], 0.02 * result.depth[0], target)
+        disagreements.append(result.disagreement.double().mean().item())
+    expected = json.loads(json.dumps(ours.compute()))
+    assert summary["metrics"] == pytest.approx(expected, rel=1e-12, nan_ok=True)
+    assert summary["network_alone"]["nll"] == pytest.approx(alone.compute()["nll"], rel=1e-6)
+    assert summary["uncertainty"]["mean_disagreement"] == pytest.approx(np.mean(disagreements), rel=1e-12)
+    assert summary["mixture"]["components"] == int(pipeline.ufm.mixture.components)
+    assert summary["mixture"]["components_over_time"][-1] == summary["mixture"]["components"]
+    counts = summary["mixture"]
+    assert counts["matched"] + counts["new"] + counts["dropped"] == counts["segments"] > 0
+    assert summary["frames"]["done"] == summary["frames"]["with_ground_truth"] == 6
+
+
+def test_the_summary_says_what_it_came_from(path, tmp_path):
+    said = run(network_job(path, frames=slice(0, 4, 2)), tmp_path / "out")
+    assert said == read_summary(tmp_path / "out")
+    assert (said["state"], said["reason"]) == ("finished", "2 of 2 frames")
+    assert said["sequence"]["name"] == "walk"
+    assert said["sequence"]["layout"] == "generic"
+    assert said["settings"] == {"note": "a test"}
+    assert {"ufmstar-torch", "torch", "numpy", "numba", "python", "platform"} <= said["versions"].keys()
+    assert said["network_alone"] is None
+    assert "without a variance" in said["network_alone_reason"]
+    assert all(said["time"]["median_ms"][stage] > 0 for stage in ("read", "network", "ufm", "metrics", "write"))
+    assert said["time"]["frames_per_second"] > 0
+    assert said["mixture"]["bytes_allocated"] >= said["mixture"]["bytes_in_use"] > 0
+    lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
+    assert [line["name"] for line in lines] == ["7", "9"]
+    # The intrinsics of the written maps: those of 24x32 images, from 48x64 ones.
+    K = np.array([500 / 20, 510 / 20, (310 + 0.5) / 20 - 0.5, (245 + 0.5) / 20 - 0.5])
+    np.testing.assert_allclose(lines[0]["intrinsics"], K, rtol=1e-9)
+
+
+def test_pictures_and_mixture(path, tmp_path):
+    import cv2
+
+    out = tmp_path / "out"
+    summary = run(network_job(path, video=True, sheet=True, frames=slice(0, 4)), out)
+    made = {"mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json", "contact_sheet.png", "preview.mp4"}
+    assert summary["outputs"] == dict.fromkeys(made)
+    video = cv2.VideoCapture(str(out / "preview.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 4
+    sheet = cv2.imread(str(out / "contact_sheet.png"))
+    run(own_depth_job(path, sheet=True, frames=slice(0, 4)), tmp_path / "own")
+    own = cv2.imread(str(tmp_path / "own" / "contact_sheet.png"))
+    assert own.shape[1] < 0.8 * sheet.shape[1]  # no column for an error that is zero by construction
+
+
+def test_own_depth_has_no_error_and_shows_the_floor(path, tmp_path):
+    summary = run(own_depth_job(path), tmp_path / "out")
+    assert summary["metrics"]["delta1"] == 1
+    assert summary["metrics"]["rmse"] == 0
+    assert 0 < summary["uncertainty"]["mean_disagreement"] < 0.2
+    assert summary["time"]["median_ms"]["network"] is None
+
+
+def test_without_ground_truth(tmp_path):
+    path, _ = write_generic(tmp_path, frames=3)
+    for file in (path / "depth").iterdir():
+        file.unlink()
+    (path / "depth").rmdir()
+    summary = run(network_job(path, Brightness(spread=0.02), sheet=True), tmp_path / "out")
+    assert (summary["state"], summary["frames"]["with_ground_truth"]) == ("finished", 0)
+    assert summary["metrics"] is summary["network_alone"] is None
+    assert summary["metrics_reason"] == summary["network_alone_reason"] == "no ground truth"
+
+
+def test_frames_that_cannot_be_used_are_skipped_and_counted(tmp_path):
+    path, _ = write_generic(tmp_path)
+    truncate(path / "images" / "8.png")
+    poses = np.loadtxt(path / "poses.txt")
+    poses[3, :3] *= 1.3  # no rotation any more
+    np.savetxt(path / "poses.txt", poses)
+    summary = run(network_job(path), tmp_path / "out")
+    assert (summary["state"], summary["frames"]["done"]) == ("finished", 4)
+    assert [frame["name"] for frame in summary["frames"]["skipped_frames"]] == ["8", "10"]
+    reasons = list(summary["frames"]["skipped"])
+    assert "cannot be decoded" in reasons[0]
+    assert "not orthonormal" in reasons[1]
+    assert sorted(file.stem for file in (tmp_path / "out" / "frames").iterdir()) == ["11", "12", "7", "9"]
+
+
+def test_a_run_without_a_usable_frame_has_failed(tmp_path):
+    path, _ = write_generic(tmp_path, frames=2)
+    for name in ("7.png", "8.png"):
+        truncate(path / "images" / name, share=0.9)
+    summary = run(network_job(path), tmp_path / "out")
+    assert summary["state"] == "failed"
+    assert "no frame could be used" in summary["reason"]
+
+
+def test_nothing_is_written_outside(path, tmp_path):
+    before = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
+    run(network_job(path, sheet=True, video=True, frames=slice(0, 2)), tmp_path / "deep" / "out")
+    assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == before
+    assert [file.name for file in tmp_path.iterdir()] == ["deep"]
+    hidden = list((tmp_path / "deep" / "out").rglob(".*"))
+    assert not hidden, "temporary files are left"
+
+
+# ---- depth from elsewhere ----
+
+
+def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):
+    path, truth = scene
+    for i, depth in enumerate(truth.depths):
+        half = depth[1::2, 1::2]
+        write_depth_png(tmp_path / "maps" / f"{i + 7}.png", half, 1000, scale_text="0.001")
+        (tmp_path / "spread").mkdir(exist_ok=True)
+        np.save(tmp_path / "spread" / f"{i + 7}.npy", np.full(half.shape, 0.04, np.float32))
+    sequence = open_sequence(path)
+    source = folder_source(sequence, tmp_path / "maps", CONFIG, variance=tmp_path / "spread")
+    summary = run(job_of(sequence, source), tmp_path / "out")
+    K = [truth.K[0, 0] / 2, truth.K[1, 1] / 2, (truth.K[0, 2] - 0.5) / 2, (truth.K[1, 2] - 0.5) / 2]
+    np.testing.assert_allclose(summary["prediction"]["intrinsics"], K)
+    assert summary["prediction"]["size"] == [24, 32]
+    assert summary["metrics"]["delta1"] > 0.999
+    assert summary["metrics"]["rmse"] < 1e-6, "the truth is looked up at the maps' own pixels"
+    assert summary["uncertainty"]["mean_network_sigma"] == pytest.approx(0.2)
+    assert summary["uncertainty"]["mean_sigma"] > 0.2
+    alone = summary["network_alone"]
+    assert alone["nll"] == pytest.approx(0.5 * np.log(2 * np.pi * 0.04), abs=1e-6)
+
+
+def test_maps_are_brought_to_a_size(path, tmp_path):
+    from ufmstar_torch.eval.run_source import own_depth_source
+
+    summary = run(job_of(open_sequence(path), own_depth_source(CONFIG, size=(12, 16))), tmp_path / "out")
+    assert summary["prediction"]["size"] == [12, 16]
+    assert summary["metrics"]["rmse"] == 0
+    frame = open_sequence(path)[5]
+    stored = read_frame(tmp_path / "out" / "frames" / "12.npz")
+    np.testing.assert_array_equal(stored["depth"], frame.depth[2::4, 2::4])
+    ufm = UfMStar(CONFIG)
+    fx, fy, cx, cy = summary["prediction"]["intrinsics"]
+    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    for frame in open_sequence(path):
+        out = ufm(torch.from_numpy(frame.depth[2::4, 2::4])[None], torch.from_numpy(frame.T_world_cam)[None], K)
+    np.testing.assert_array_equal(stored["variance"], out.variance[0].numpy())
+
+
+def test_maps_that_were_cropped_are_refused(path, tmp_path):
+    for name in range(7, 13):
+        write_depth_png(tmp_path / "maps" / f"{name}.png", np.ones((48, 48)), 1000, scale_text="0.001")
+    sequence = open_sequence(path)
+    summary = run(job_of(sequence, folder_source(sequence, tmp_path / "maps", CONFIG)), tmp_path / "out")
+    assert summary["state"] == "failed"
+    assert "does not show the whole image" in summary["reason"]
+
+
+def test_an_ensemble_alternates(path, tmp_path):
+    run(network_job(path, *pair()), tmp_path / "out")
+    lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
+    assert [line["member"] for line in lines] == [0, 1, 0, 1, 0, 1]
+    full = run(network_job(path, *pair(), mode="full", frames=slice(0, 2)), tmp_path / "full")
+    assert full["uncertainty"]["mean_network_sigma"] > 0
+
+
+# ---- interruptions ----
+
+
+def at_state(count):
+    """Crash when the state is to be replaced for the ``count``-th time."""
+
+    def break_(monkeypatch):
+        calls = []
+        write = run_folder.write_atomic
+
+        def broken(file, *rest, **options):
+            calls.extend([1] * (file.name == "state.pt"))
+            if len(calls) == count:
+                raise Crash
+            write(file, *rest, **options)
+
+        monkeypatch.setattr(run_folder, "write_atomic", broken)
+
+    return break_
+
+
+def between_files(count):
+    """Crash when the ``count``-th frame has been written, but nothing notes it yet."""
+
+    def break_(monkeypatch):
+        calls = []
+        write = writers.write_together
+
+        def broken(files, **options):
+            write(files, **options)
+            calls.append(1)
+            if len(calls) == count:
+                raise Crash
+
+        monkeypatch.setattr(writers, "write_together", broken)
+
+    return break_
+
+
+@pytest.mark.parametrize("break_", [at_state(1), at_state(4), between_files(1), between_files(4)])
+def test_a_crash_anywhere_is_made_good(path, tmp_path, uninterrupted, break_):
+    with pytest.MonkeyPatch.context() as patch:
+        break_(patch)
+        with pytest.raises(Crash):
+            run(network_job(path, *pair()), tmp_path / "out")
+    assert read_summary(tmp_path / "out")["state"] == "failed"
+    assert run(network_job(path, *pair()), tmp_path / "out", resume=True)["state"] == "finished"
+    assert outputs(tmp_path / "out") == uninterrupted
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("at", [0, 2])
+def test_ctrl_c_leaves_what_is_finished_and_resume_goes_on(path, tmp_path, uninterrupted, at):
+    out = tmp_path / "out"
+    summary = run(network_job(path, *pair(at=at, then=interrupt)), out)
+    done = 2 * at + 1
+    assert (summary["state"], summary["frames"]["done"]) == ("interrupted", done)
+    assert f"{done} of 6 frames" in summary["reason"]
+    assert len(list((out / "frames").iterdir())) == done
+    # The summary speaks of finished frames only, though the next one was in hand.
+    assert len(summary["mixture"]["components_over_time"]) == done
+    assert summary["metrics"]["pixels"] == done * 24 * 32
+    assert run(network_job(path, *pair()), out, resume=True)["state"] == "finished"
+    assert outputs(out) == uninterrupted
+    sessions = read_summary(out)["time"]["sessions"]
+    assert [(s["first"], s["frames"]) for s in sessions] == [(0, done), (done, 6 - done)]
+
+
+def test_asked_to_stop_it_stops_between_frames(path, tmp_path, uninterrupted):
+    seen: list[Progress] = []
+    out = tmp_path / "out"
+    summary = run(network_job(path, *pair()), out, progress=seen.append, stop=lambda: len(seen) > 3)
+    assert (summary["state"], summary["frames"]["done"]) == ("interrupted", 3)
+    assert [p.done for p in seen] == [0, 1, 2, 3]
+    run(network_job(path, *pair()), out, resume=True)
+    assert outputs(out) == uninterrupted
+
+
+def test_a_finished_run_resumes_to_itself(path, tmp_path, uninterrupted):
+    out = tmp_path / "out"
+    run(network_job(path, *pair()), out)
+    never = Brightness(1.0, at=0, then=crash), Brightness(1.1, at=0, then=crash)
+    assert run(network_job(path, *never), out, resume=True)["state"] == "finished"
+    assert outputs(out) == uninterrupted
+
+
+def test_an_error_of_the_network_is_in_the_summary(path, tmp_path):
+    def fail():
+        raise RuntimeError("out of memory")
+
+    with pytest.raises(RuntimeError, match="out of memory"):
+        run(network_job(path, *pair(at=1, then=fail)), tmp_path / "out")
+    summary = read_summary(tmp_path / "out")
+    assert (summary["state"], summary["frames"]["done"]) == ("failed", 3)
+    assert summary["reason"] == "RuntimeError: out of memory"
+
+
+def test_a_full_disk_leaves_finished_frames_and_a_summary(path, tmp_path, uninterrupted, monkeypatch):
+    out, reserve = tmp_path / "out", tmp_path / "out" / "resume" / "reserve"
+    calls = []
+    write, write_json = writers.write_together, writers.write_json_atomic
+
+    def full(files, **options):
+        calls.append(1)
+        if len(calls) > 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(files, **options)
+
+    def full_json(file, data):
+        if len(calls) > 4 and reserve.exists():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_json(file, data)
+
+    monkeypatch.setattr(writers, "write_together", full)
+    monkeypatch.setattr(writers, "write_json_atomic", full_json)
+    summary = run(network_job(path, *pair()), out)
+    assert (summary["state"], summary["frames"]["done"]) == ("failed", 4)
+    assert "No space left on device" in summary["reason"]
+    assert read_summary(out)["reason"] == summary["reason"]
+    monkeypatch.undo()
+    run(network_job(path, *pair()), out, resume=True)
+    assert outputs(out) == uninterrupted
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from runs import Brightness, network_job
+from ufmstar_torch.eval.run import run
+
+def kill():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+networks = Brightness(1.0, spread=0.02), Brightness(1.1, spread=0.02, at=1, then=kill)
+run(network_job(Path(sys.argv[1]), *networks), sys.argv[2])
+"""
+
+
+def test_sigkill_loses_the_frame_in_hand_only(path, tmp_path, uninterrupted):
+    out = tmp_path / "out"
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(out)], cwd=TESTS, check=False)
+    assert ended.returncode == -9
+    summary = read_summary(out)
+    assert summary["state"] == "interrupted"
+    assert "killed" in summary["reason"]
+    assert len(list((out / "frames").iterdir())) == 3
+    resumed = run(network_job(path, *pair()), out, resume=True)
+    assert [(s["first"], s["frames"]) for s in resumed["time"]["sessions"]] == [(0, 3), (3, 3)]
+    assert outputs(out) == uninterrupted
+
+
+# ---- the output folder ----
+
+
+def test_only_the_same_run_goes_on(path, tmp_path):
+    out = tmp_path / "out"
+    run(network_job(path, *pair(at=1, then=interrupt)), out)
+    before = outputs(out)
+    with pytest.raises(FolderError, match=r"ufm\.eta was 0\.5, now 0\.4"):
+        run(network_job(path, *pair(), config=CONFIG.replace(eta=0.4)), out, resume=True)
+    with pytest.raises(FolderError, match=r"source\.networks was .*1\.1.*, now .*1\.2"):
+        run(network_job(path, Brightness(1.0), Brightness(1.2)), out, resume=True)
+    with pytest.raises(FolderError, match=r"sequence\.frames was 6, now 3"):
+        run(network_job(path, *pair(), frames=slice(None, None, 2)), out, resume=True)
+    assert outputs(out) == before
+
+
+def test_other_pixels_or_poses_under_the_same_names_are_noticed(tmp_path):
+    path, _ = write_generic(tmp_path, frames=2)
+    out = tmp_path / "out"
+    run(network_job(path), out)
+    poses = np.loadtxt(path / "poses.txt")
+    np.savetxt(path / "poses.txt", poses + [0, 0, 0, 1e-6] * 4)
+    with pytest.raises(FolderError, match=r"sequence\.names_and_poses"):
+        run(network_job(path), out, resume=True)
+    np.savetxt(path / "poses.txt", poses)
+    (path / "images" / "7.png").write_bytes((path / "images" / "8.png").read_bytes())
+    with pytest.raises(FolderError, match=r"sequence\.first_frame"):
+        run(network_job(path), out, resume=True)
+
+
+def test_an_earlier_run_is_replaced_only_when_asked(path, tmp_path, uninterrupted):
+    out = tmp_path / "out"
+    run(network_job(path, frames=slice(0, 2)), out)
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
+        run(network_job(path, *pair()), out)
+    run(network_job(path, *pair()), out, overwrite=True)
+    assert (out / "notes.txt").read_text() == "mine"
+    (out / "notes.txt").unlink()
+    assert outputs(out) == uninterrupted
+
+
+@pytest.mark.parametrize("options", [{}, {"overwrite": True}, {"resume": True}])
+def test_a_folder_of_someone_else_is_left_alone(path, tmp_path, options):
+    out = tmp_path / "dataset"
+    write_depth_png(out / "depth" / "7.png", np.ones((4, 4)), 1000)
+    before = outputs(out)
+    with pytest.raises(FolderError, match="someone else"):
+        run(network_job(path), out, **options)
+    assert outputs(out) == before
+
+
+def test_a_file_is_no_folder(path, tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(FolderError, match="is a file"):
+        run(network_job(path), tmp_path / "out")
+
+
+def test_an_empty_folder_will_do(path, tmp_path):
+    assert run(network_job(path, frames=slice(0, 1)), tmp_path, resume=True)["state"] == "finished"
+
+
+def test_two_runs_do_not_share_a_folder(path, tmp_path):
+    out = tmp_path / "out"
+    refused = []
+
+    def another():
+        with pytest.raises(FolderError, match="another run") as caught:
+            run(network_job(path, *pair()), out, resume=True)
+        refused.append(caught)
+
+    assert run(network_job(path, *pair(at=1, then=another)), out)["state"] == "finished"
+    assert len(refused) == 1
+
+
+@pytest.mark.parametrize("damage", ["state", "frame", "manifest"])
+def test_a_damaged_run_says_so(path, tmp_path, damage):
+    out = tmp_path / "out"
+    run(network_job(path, frames=slice(0, 3)), out)
+    if damage == "frame":
+        (out / "depth" / "8.png").unlink()
+    else:
+        truncate(out / "resume" / {"state": "state.pt", "manifest": "run.json"}[damage])
+    expected = {"state": "cannot be read", "frame": "1 finished frames are gone", "manifest": "is not a run's"}
+    with pytest.raises(FolderError, match=expected[damage]):
+        run(network_job(path, frames=slice(0, 3)), out, resume=True)
