@@ -20,39 +20,45 @@ _DESCRIPTION = """Depth with a variance for every pixel of a sequence of posed i
 The depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR), or
 from the sequence itself (--depth self)."""
 _TYPES = {"float": float, "int": int, "bool": bool, "str": str, "int | None": int | None}
-# (option, type, default, help): all of them may also stand in the file given as --config.
-_SEQUENCE = (
-    ("--layout", LAYOUTS, "auto", "of the sequence's folder"),
-    ("--frames", str, None, "START:STOP:STEP, which frames, counted from 0 as Python does"),
-    ("--trajectory", str, None, "trajectory file (TUM or KITTI format) instead of the layout's own"),
-    ("--images", str, None, "folder of images, or video file, in or beside a generic sequence"),
-    ("--fps", float, None, "frames per second of images without timestamps"),
-    ("--time-offset", float, 0.0, "added to the images' times [s]"),
-    ("--max-pose-gap", float, 0.1, "poses are interpolated between samples at most this far apart [s]"),
-    ("--truth", str, None, "folder of ground-truth depth of a generic sequence"),
-    ("--truth-scale", float, None, "metres per unit of the sequence's own depth, instead of the layout's"),
-)
-_DEPTH = (
-    ("--model", str, None, "network: fastdepth, onnx, torchscript or exported"),
-    ("--spec", str, None, "JSON file that declares an ONNX file's (or saved program's) inputs and outputs"),
-    ("--mode", ("alternate", "full"), "alternate", "several --weights: one per image in turn, or all on every image"),
-    ("--depth", str, None, "folder of predicted depth maps (16-bit PNG, EXR, npy), or 'self'"),
-    ("--variance", str, None, "folder of variance maps [m^2] that belong to --depth DIR"),
-    ("--depth-scale", float, None, "metres per unit of --depth DIR's maps"),
-    ("--size", str, None, "HxW, to which the maps of --depth are brought"),
-)
-_RUN = (
-    ("--device", str, "cpu", "cpu or cuda"),
-    ("--threads", int, None, "CPU threads; default: as many as there are"),
-    ("--preset", PRESETS, None, "upstream's segmentation thresholds; --ufm.segment.* go before them"),
-)
-_FLAGS = (
-    ("--resume", "go on with the run in --out"),
-    ("--overwrite", "replace the run in --out"),
-    ("--no-video", "leave preview.mp4 out"),
-    ("--no-sheet", "leave contact_sheet.png out"),
-    ("--debug", "show tracebacks"),
-)
+_USAGE = "ufmstar run SEQUENCE (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
+_WORDS = "several words"
+# (option, type, default, help) by group; all of them may also stand in the file given as --config.
+_GROUPS = {
+    "sequence": (
+        ("--layout", LAYOUTS, "auto", "of the sequence's folder"),
+        ("--frames", str, None, "START:STOP:STEP, which frames, counted from 0 as Python does"),
+        ("--intrinsics", _WORDS, [], "of the images: a file, or fx fy cx cy [px], instead of the layout's own"),
+        ("--trajectory", str, None, "trajectory file (TUM or KITTI format) instead of the layout's own"),
+        ("--images", str, None, "folder of images, or video file, of a generic sequence"),
+        ("--fps", float, None, "frames per second of images without timestamps"),
+        ("--time-offset", float, 0.0, "added to the images' times [s]"),
+        ("--max-pose-gap", float, 0.1, "poses are interpolated between samples at most this far apart [s]"),
+        ("--truth", str, None, "folder of ground-truth depth of a generic sequence"),
+        ("--truth-scale", float, None, "metres per unit of the sequence's own depth, instead of the layout's"),
+        ("--depth-intrinsics", _WORDS, [], "of the sequence's own depth: a file, or fx fy cx cy [px]"),
+    ),
+    "depth from networks": (
+        ("--model", str, None, "fastdepth, onnx, torchscript or exported"),
+        ("--weights", _WORDS, [], "file; several are the members of an ensemble"),
+        ("--mode", ("alternate", "full"), "alternate", "ensemble: one member per image in turn, or all on every image"),
+        ("--spec", str, None, "JSON file that declares an ONNX file's or a saved program's inputs and outputs"),
+    ),
+    "depth that is there": (
+        ("--depth", str, None, "folder of predicted maps (16-bit PNG, EXR, npy); 'self': the sequence's own depth"),
+        ("--variance", str, None, "folder of variance maps [m^2] that belong to them"),
+        ("--depth-scale", float, None, "metres per unit of the maps in the folder"),
+        ("--size", str, None, "HxW, to which the maps are brought"),
+    ),
+    "run": (
+        ("--resume", bool, False, "go on with the run in --out"),
+        ("--overwrite", bool, False, "replace the run in --out"),
+        ("--no-video", bool, False, "leave preview.mp4 out"),
+        ("--no-sheet", bool, False, "leave contact_sheet.png out"),
+        ("--device", str, "cpu", "cpu or cuda"),
+        ("--threads", int, None, "CPU threads; default: as many as there are"),
+        ("--debug", bool, False, "show tracebacks"),
+    ),
+}
 _OTHER_DEFAULTS = {"on_bad_frame": "skip"}
 
 
@@ -60,21 +66,28 @@ def run_parser() -> ArgumentParser:
     """The parser of ``ufmstar run``; it raises ``ArgumentError`` instead of ending the program."""
     from jsonargparse import ActionConfigFile, ArgumentParser
 
-    parser = ArgumentParser(prog="ufmstar run", description=_DESCRIPTION, exit_on_error=False)
+    parser = ArgumentParser(prog="ufmstar run", usage=_USAGE, description=_DESCRIPTION, exit_on_error=False)
     parser.add_argument("sequence", type=str, help="folder of the sequence, or a video file")
-    parser.add_argument("--config", action=ActionConfigFile, help="JSON or YAML file with any of these options")
     parser.add_argument("--out", type=str, required=True, help="folder for everything that is written")
-    for name, kind, default, text in (*_SEQUENCE, *_DEPTH, *_RUN):
-        choice = {"choices": kind} if isinstance(kind, tuple) else {"type": kind}
-        parser.add_argument(name, default=default, help=text, **choice)
-    parser.add_argument("--weights", nargs="+", default=[], help="file; several are the members of an ensemble")
-    for name in ("--intrinsics", "--depth-intrinsics"):
-        what = "the images" if name == "--intrinsics" else "the sequence's own depth"
-        parser.add_argument(name, nargs="+", default=[], help=f"of {what}: a file, or fx fy cx cy [px]")
-    for name, text in _FLAGS:
-        parser.add_argument(name, action="store_true", help=text)
-    _add_config(parser, UfMStarConfig, "ufm", _OTHER_DEFAULTS)
+    parser.add_argument("--config", action=ActionConfigFile, help="JSON or YAML file with any of these options")
+    for title, options in _GROUPS.items():
+        group = parser.add_argument_group(title)
+        for name, kind, default, text in options:
+            group.add_argument(name, default=default, help=text, **_kind(kind))
+    group = parser.add_argument_group("UfM*")
+    text = "upstream's segmentation thresholds; single --ufm.segment.* go before them"
+    group.add_argument("--preset", choices=PRESETS, default=None, help=text)
+    _add_config(group, UfMStarConfig, "ufm", _OTHER_DEFAULTS)
     return parser
+
+
+def _kind(kind: Any) -> dict[str, Any]:
+    """What argparse wants to know of an option's type."""
+    if kind is bool:
+        return {"action": "store_true"}
+    if kind == _WORDS:
+        return {"nargs": "+"}
+    return {"choices": kind} if isinstance(kind, tuple) else {"type": kind}
 
 
 def parse_run(parser: ArgumentParser, arguments: Sequence[str]) -> dict[str, Any]:
@@ -142,7 +155,7 @@ def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | N
     return numbers
 
 
-def _add_config(parser: ArgumentParser, config: type, prefix: str, changed: dict[str, Any]) -> None:
+def _add_config(parser: Any, config: type, prefix: str, changed: dict[str, Any]) -> None:
     """An option for every field of a config class, and of the config classes in it."""
     for f in fields(config):
         if f.default is MISSING:

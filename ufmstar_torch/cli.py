@@ -147,12 +147,14 @@ def _set_threads(count: int | None) -> None:
         raise ValueError(f"--threads must be at least 1, got {count}")
     import torch
 
-    torch.set_num_threads(count)
     try:
         import numba
     except ImportError:  # the torch reference serves then
-        return
-    numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+        pass
+    else:
+        # First: when numba starts its threads, OpenMP's number, which is torch's as well, becomes all there are.
+        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+    torch.set_num_threads(count)
 
 
 class _Bars:

@@ -1,0 +1,447 @@
+"""The command line: what users see, exit codes, options and configuration files, and the real command."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+from layouts import truncate, write_generic, write_tartanair, write_tum
+from runs import Brightness, outputs, read_summary
+from shared_data import require_shared
+
+from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
+from ufmstar_torch.eval import run_source, writers
+from ufmstar_torch.models import Preprocess
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    """A generic sequence of 6 frames, 48x64. Nobody may change it."""
+    return write_generic(tmp_path_factory.mktemp("scene"))[0]
+
+
+@pytest.fixture
+def ufmstar(capfd):
+    """Calls the program: (exit code, stdout, stderr)."""
+
+    def call(*words):
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return call
+
+
+@pytest.fixture
+def brightness(monkeypatch, tmp_path):
+    """Makes ``--model any --weights FILE`` load a network whose gain is the file's content; returns the files."""
+
+    def load(name, weights, **options):
+        assert (name, options) == ("any", {})
+        network = Brightness(float(weights.read_text()), spread=0.02)
+        network.preprocess = Preprocess(size=(24, 32))
+        loaded.append(network)
+        return network
+
+    loaded = []
+    monkeypatch.setattr(run_source, "load_network", load)
+    files = [tmp_path / "first.pt", tmp_path / "second.pt"]
+    for file, gain in zip(files, ("1.0", "1.1"), strict=True):
+        file.write_text(gain)
+    return types.SimpleNamespace(files=files, loaded=loaded)
+
+
+QUICK = ("--no-video", "--no-sheet", "--ufm.backend", "torch")
+
+
+# ---- help and mistakes ----
+
+
+def test_help_lists_the_commands(ufmstar):
+    code, out, err = ufmstar("--help")
+    assert (code, err) == (0, "")
+    assert "\n  run     " in out
+    assert "\n  bench   " in out
+    assert ufmstar()[0] == 2
+    assert ufmstar("--version")[:2] == (0, "0.1.0\n")
+
+
+def test_help_of_run_names_every_setting(ufmstar, capfd):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["run", "--help"])
+    assert ended.value.code == 0
+    text = capfd.readouterr().out
+    for name in [f"--ufm.{n}" for n in UfMStarConfig().to_dict() if n != "segment"]:
+        assert name in text
+    for name in SPGFConfig().to_dict():
+        assert f"--ufm.segment.{name}" in text
+    assert "(0, 1]" in text
+
+
+def test_help_loads_nothing_beyond_the_package():
+    code = (
+        "import sys, ufmstar_torch; before = set(sys.modules); from ufmstar_torch.cli import main; "
+        "main(['--help']); print(sorted(set(sys.modules) - before))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "['ufmstar_torch.cli']"
+
+
+MISTAKES = {
+    "unknown command": (["walk"], "no command 'walk', there are run, bench"),
+    "no sequence": (["run"], "sequence"),
+    "no out": (["run", "{path}", "--depth", "self"], "out"),
+    "no such sequence": (["run", "/nowhere", "--depth", "self", "--out", "{out}"], "no such file or folder: /nowhere"),
+    "no depth": (["run", "{path}", "--out", "{out}"], "--model NAME --weights FILE"),
+    "two depths": (["run", "{path}", "--depth", "self", "--model", "x", "--out", "{out}"], "not both"),
+    "no weights": (["run", "{path}", "--model", "fastdepth", "--out", "{out}"], "needs --weights FILE"),
+    "missing weights": (
+        ["run", "{path}", "--model", "fastdepth", "--weights", "/nowhere/w.onnx", "--out", "{out}"],
+        "no such file: /nowhere/w.onnx",
+    ),
+    "wrong model": (
+        ["run", "{path}", "--model", "fastdeth", "--weights", "{path}/K.txt", "--out", "{out}"],
+        "unknown network 'fastdeth', expected one of",
+    ),
+    "broken weights": (
+        ["run", "{path}", "--model", "onnx", "--weights", "{path}/K.txt", "--out", "{out}"],
+        "needs a spec",
+    ),
+    "spec for fastdepth": (
+        [
+            "run",
+            "{path}",
+            "--model",
+            "fastdepth",
+            "--weights",
+            "{path}/K.txt",
+            "--spec",
+            "{path}/K.txt",
+            "--out",
+            "{out}",
+        ],
+        "does not take ['spec']",
+    ),
+    "no maps": (["run", "{path}", "--depth", "/nowhere", "--out", "{out}"], "no such folder: /nowhere"),
+    "variance without maps": (
+        ["run", "{path}", "--depth", "self", "--variance", "x", "--out", "{out}"],
+        "--variance goes with --depth DIR only",
+    ),
+    "size without maps": (
+        ["run", "{path}", "--model", "x", "--weights", "y", "--size", "2x2", "--out", "{out}"],
+        "--size goes with --depth only",
+    ),
+    "full with one": (
+        ["run", "{path}", "--model", "x", "--weights", "y", "--mode", "full", "--out", "{out}"],
+        "--mode full needs several --weights",
+    ),
+    "unknown option": (["run", "{path}", "--depth", "self", "--eta", "1", "--out", "{out}"], "--eta"),
+    "unknown setting": (["run", "{path}", "--depth", "self", "--ufm.etaa", "1", "--out", "{out}"], "--ufm.etaa"),
+    "setting out of range": (
+        ["run", "{path}", "--depth", "self", "--ufm.eta", "3", "--out", "{out}"],
+        "UfMStarConfig.eta must lie in (0.0, 1.0], got 3.0",
+    ),
+    "nested setting out of range": (
+        ["run", "{path}", "--depth", "self", "--ufm.segment.min_pixels", "0", "--out", "{out}"],
+        "SPGFConfig.min_pixels must lie in [1, inf], got 0",
+    ),
+    "setting of the wrong kind": (["run", "{path}", "--depth", "self", "--ufm.eta", "x", "--out", "{out}"], "ufm.eta"),
+    "no such config": (["run", "{path}", "--config", "/nowhere.yaml", "--out", "{out}"], "/nowhere.yaml"),
+    "frames": (["run", "{path}", "--depth", "self", "--frames", "3", "--out", "{out}"], "START:STOP"),
+    "no frames": (["run", "{path}", "--depth", "self", "--frames", "9:", "--out", "{out}"], "selects none of the 6"),
+    "size": (["run", "{path}", "--depth", "self", "--size", "24", "--out", "{out}"], "--size must be HxW"),
+    "intrinsics": (["run", "{path}", "--depth", "self", "--intrinsics", "1", "2", "--out", "{out}"], "fx fy cx cy"),
+    "layout": (["run", "{path}", "--depth", "self", "--layout", "tum", "--out", "{out}"], "looked for rgb.txt"),
+    "device": (["run", "{path}", "--depth", "self", "--device", "abacus", "--out", "{out}"], "--device abacus"),
+    "threads": (["run", "{path}", "--depth", "self", "--threads", "0", "--out", "{out}"], "--threads"),
+    "someone else's folder": (["run", "{path}", "--depth", "self", "--out", "{path}"], "files of someone else"),
+    "contradiction": (
+        ["run", "{path}", "--depth", "self", "--resume", "--overwrite", "--out", "{out}"],
+        "--resume and --overwrite contradict",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_told_in_one_line(ufmstar, path, tmp_path, mistake):
+    words, expected = MISTAKES[mistake]
+    code, out, err = ufmstar(*[word.format(path=path, out=tmp_path / "out") for word in words])
+    assert (code, out) == (2, "")
+    assert err.startswith("ufmstar")
+    assert expected in err
+    assert err.count("\n") == 1, err
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_poses(ufmstar, tmp_path):
+    path, _ = write_generic(tmp_path, frames=2)
+    (path / "poses.txt").unlink()
+    code, _, err = ufmstar("run", path, "--depth", "self", "--out", tmp_path / "out")
+    assert code == 2
+    assert "trajectory" in err
+    assert err.count("\n") == 1
+    code, _, err = ufmstar("run", path, "--layout", "generic", "--depth", "self", "--out", tmp_path / "out")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "pass trajectory" in err
+
+
+def test_debug_shows_the_traceback(ufmstar, tmp_path):
+    code, _, err = ufmstar("run", "/nowhere", "--depth", "self", "--out", tmp_path / "out", "--debug")
+    assert code == 2
+    assert "Traceback" in err
+
+
+def test_an_unknown_key_in_a_file_is_told(ufmstar, path, tmp_path):
+    for text, expected in (('{"ufm": {"etaa": 0.3}}', "etaa"), ('{"modell": "fastdepth"}', "modell")):
+        (tmp_path / "c.json").write_text(text)
+        words = ("run", path, "--depth", "self", "--config", tmp_path / "c.json", "--out", tmp_path / "out")
+        code, _, err = ufmstar(*words)
+        assert (code, err.count("\n")) == (2, 1)
+        assert expected in err
+
+
+# ---- options ----
+
+
+def test_settings_from_file_and_words(ufmstar, path, tmp_path):
+    (tmp_path / "c.yaml").write_text("ufm:\n  eta: 0.4\n  ema_alpha: 1\n  segment:\n    min_rows: 2\nframes: '1:5:2'\n")
+    words = ("--config", tmp_path / "c.yaml", "--ufm.eta", "0.3", "--preset", "tartanair_indoor")
+    assert ufmstar("run", path, "--depth", "self", *words, *QUICK, "--out", tmp_path / "out")[0] == 0
+    settings = read_summary(tmp_path / "out")["settings"]
+    assert settings["ufm"]["eta"] == 0.3
+    assert settings["ufm"]["ema_alpha"] == 1
+    assert settings["ufm"]["on_bad_frame"] == "skip"
+    expected = {**SPGFConfig.preset("tartanair_indoor").to_dict(), "min_rows": 2}
+    assert settings["ufm"]["segment"] == expected
+    lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
+    assert [line["index"] for line in lines] == [1, 3]
+
+
+def test_the_settings_in_a_summary_are_a_configuration_file(ufmstar, path, tmp_path):
+    words = ("run", path, "--depth", "self", "--ufm.eta", "0.3", "--frames", ":2", *QUICK)
+    ufmstar(*words, "--out", tmp_path / "a")
+    (tmp_path / "c.json").write_text(json.dumps(read_summary(tmp_path / "a")["settings"]))
+    code, _, err = ufmstar("run", path, "--config", tmp_path / "c.json", "--out", tmp_path / "b")
+    assert code == 0, err
+    settings = read_summary(tmp_path / "b")["settings"]
+    assert settings["ufm"]["eta"] == 0.3
+    assert settings["frames"] == ":2"
+    assert (tmp_path / "a" / "frames" / "8.npz").read_bytes() == (tmp_path / "b" / "frames" / "8.npz").read_bytes()
+
+
+def test_options_of_the_sequence_arrive(ufmstar, tmp_path):
+    path, truth = write_generic(tmp_path, frames=3)
+    (path / "poses.txt").rename(tmp_path / "elsewhere.txt")
+    (path / "K.txt").unlink()
+    (path / "depth").rename(tmp_path / "measured")
+    K = [truth.K[0, 0], truth.K[1, 1], truth.K[0, 2], truth.K[1, 2]]
+    words = ("--trajectory", tmp_path / "elsewhere.txt", "--intrinsics", *K, "--truth", tmp_path / "measured")
+    code, _, err = ufmstar(
+        "run", path, *words, "--truth-scale", "0.002", "--depth", "self", "--size", "24x32", *QUICK,
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert code == 0, err
+    with np.load(tmp_path / "out" / "frames" / "7.npz") as stored:
+        np.testing.assert_allclose(stored["depth"], 2 * truth.depths[0][1::2, 1::2], atol=2e-3)
+    summary = read_summary(tmp_path / "out")
+    assert summary["prediction"]["intrinsics"][0] == pytest.approx(K[0] / 2)
+
+
+def test_threads(ufmstar, path, tmp_path):
+    before = torch.get_num_threads()
+    try:
+        words = ("--depth", "self", "--threads", "1", "--frames", ":1", *QUICK, "--out", tmp_path / "out")
+        assert ufmstar("run", path, *words)[0] == 0
+        assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("write", [write_tum, write_tartanair])
+def test_layouts_are_found(ufmstar, tmp_path, write):
+    path, _ = write(tmp_path, frames=2)
+    code, _, err = ufmstar("run", path, "--depth", "ground-truth", *QUICK, "--out", tmp_path / "out")
+    assert code == 0, err
+    assert read_summary(tmp_path / "out")["frames"]["done"] == 2
+
+
+def test_bench_is_handed_on(monkeypatch, ufmstar):
+    seen = []
+    module = types.ModuleType("ufmstar_torch.eval.benchmark")
+    module.main = lambda words: seen.append(words)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr("ufmstar_torch.eval.benchmark", module, raising=False)
+    assert ufmstar("bench", "--frames", "3")[0] == 0
+    assert seen == [["--frames", "3"]]
+
+
+# ---- runs ----
+
+
+def test_a_run_says_what_came_out(ufmstar, path, tmp_path, brightness):
+    code, out, err = ufmstar(
+        "run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out"
+    )
+    assert code == 0
+    summary = read_summary(tmp_path / "out")
+    lines = out.splitlines()
+    assert lines[0].split() == [
+        "delta1",
+        "AbsRel",
+        "RMSE",
+        "[m]",
+        "NLL",
+        "ECE_delta",
+        "ECE_q",
+        "Spearman",
+        "sigma",
+        "[m]",
+    ]
+    assert lines[1].startswith("UfM*")
+    assert lines[1].split()[1] == f"{summary['metrics']['delta1']:.3g}"
+    assert lines[2].startswith("network alone")
+    assert lines[2].split()[5] == f"{summary['network_alone']['nll']:.3g}"
+    assert f"K = {summary['mixture']['components']} " in out
+    assert str(tmp_path / "out") in out
+    assert "summary.json" in out
+    assert lines[-1] == "ufmstar run: finished: 6 of 6 frames"
+    assert "frames: 100%" in err
+    assert [file["name"] for file in summary["source"]["weights"]] == ["first.pt", "second.pt"]
+
+
+def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path, brightness):
+    words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out")
+    assert ufmstar(*words)[0] == 0
+    brightness.files[1].write_text("1.2")
+    code, _, err = ufmstar(*words, "--resume")
+    assert code == 2
+    assert "source.weights.1.sha256 was" in err
+    assert ufmstar(*words)[0] == 2
+    assert ufmstar(*words, "--overwrite")[0] == 0
+
+
+def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness, monkeypatch):
+    load = run_source.load_network
+
+    def other(name, weights, **options):
+        network = load(name, weights, **options)
+        network.preprocess = Preprocess(size=(24, 32 + len(brightness.loaded)))
+        return network
+
+    monkeypatch.setattr(run_source, "load_network", other)
+    code, _, err = ufmstar("run", path, "--model", "any", "--weights", *brightness.files, "--out", tmp_path / "out")
+    assert code == 2
+    assert "same input" in err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, brightness, monkeypatch, number):
+    words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK)
+    assert ufmstar(*words, "--out", tmp_path / "whole")[0] == 0
+    load = run_source.load_network
+
+    def loaded(name, weights, **options):
+        network = load(name, weights, **options)
+        network.at, network.then = 1, lambda: os.kill(os.getpid(), number)
+        return network
+
+    before = signal.getsignal(number)
+    monkeypatch.setattr(run_source, "load_network", loaded)
+    code, _, err = ufmstar(*words, "--out", tmp_path / "out")
+    assert code == 130
+    assert "stopping after this frame" in err
+    assert "interrupted: stopped by the user after 3 of 6 frames; --resume goes on" in err
+    assert signal.getsignal(number) is before
+    assert read_summary(tmp_path / "out")["state"] == "interrupted"
+    monkeypatch.setattr(run_source, "load_network", load)
+    assert ufmstar(*words, "--out", tmp_path / "out", "--resume")[0] == 0
+    whole, resumed = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
+    for found in (whole, resumed):
+        del found["summary.json"]["settings"]["out"]
+    assert whole == resumed
+
+
+def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness, monkeypatch):
+    def twice():
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def loaded(name, weights, **options):
+        network = load(name, weights, **options)
+        network.at, network.then = 1, twice
+        return network
+
+    load = run_source.load_network
+    monkeypatch.setattr(run_source, "load_network", loaded)
+    words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out")
+    assert ufmstar(*words)[0] == 130
+    assert read_summary(tmp_path / "out")["frames"]["done"] == 2
+
+
+def test_a_full_disk(ufmstar, path, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(writers, "write_together", full)
+    code, _, err = ufmstar("run", path, "--depth", "self", *QUICK, "--out", tmp_path / "out")
+    assert code == 1
+    assert "failed: [Errno 28] No space left on device" in err
+    assert read_summary(tmp_path / "out")["state"] == "failed"
+
+
+def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness, monkeypatch):
+    def fail():
+        raise RuntimeError("two\nlines")
+
+    def loaded(name, weights, **options):
+        network = load(name, weights, **options)
+        network.at, network.then = 0, fail
+        return network
+
+    load = run_source.load_network
+    monkeypatch.setattr(run_source, "load_network", loaded)
+    words = ("run", path, "--model", "any", "--weights", brightness.files[0], *QUICK, "--out", tmp_path / "out")
+    code, _, err = ufmstar(*words)
+    assert code == 1
+    assert err.splitlines()[-1] == "ufmstar run: failed: two lines"
+    assert "Traceback" not in err
+
+
+def test_skipped_frames_are_told(ufmstar, tmp_path):
+    path, _ = write_generic(tmp_path, frames=3)
+    truncate(path / "images" / "8.png")
+    code, out, _ = ufmstar("run", path, "--depth", "self", *QUICK, "--out", tmp_path / "out")
+    assert code == 0
+    assert "skipped 1: cannot be decoded" in out
+    assert "finished: 2 of 3 frames (1 skipped)" in out
+
+
+# ---- the real thing ----
+
+
+def test_fastdepth_on_a_real_sequence(tmp_path):
+    sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
+    weights = require_shared("weights/fastdepth_nyu.onnx")
+    command = [sys.executable, "-m", "ufmstar_torch.cli", "run", sequence, "--model", "fastdepth", "--weights", weights]
+    command += ["--frames", "0:3", "--threads", "1", "--out", tmp_path / "out"]
+    done = subprocess.run([str(word) for word in command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    summary = read_summary(tmp_path / "out")
+    assert summary["frames"]["done"] == summary["frames"]["with_ground_truth"] == 3
+    assert summary["prediction"]["size"] == [224, 224]
+    # As computed with ONNX Runtime, Pillow and NumPy alone, but for the pixel that stands for a ground truth.
+    assert summary["metrics"]["abs_rel"] == pytest.approx(0.3756, abs=0.003)
+    assert summary["metrics"]["delta1_ratio"] == pytest.approx(0.4987, abs=0.003)
+    assert 20 < summary["mixture"]["components"] < 100
+    assert 0 < summary["uncertainty"]["mean_sigma"] < 1
+    made = ["mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json", "contact_sheet.png", "preview.mp4"]
+    assert all((tmp_path / "out" / name).stat().st_size > 500 for name in made)
