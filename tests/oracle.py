@@ -81,7 +81,7 @@ class Segmentation:
 
 
 def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
-    """C_i; floors: the footprint of a pixel (at the near plane, if nearer) and the thickness of a slab.
+    """C_i; its floor is the footprint of a pixel (at the near plane, if nearer).
 
     features [F, H, W] are averaged over the pixels of a component.
     """
@@ -93,8 +93,6 @@ def segment(depth, K, segmentation, *, valid=None, features=None, near=0.05):
             continue
         rows, columns = np.array(piece.pixels).T
         floor = (max(piece.mu[2], near) / min(K[0, 0], K[1, 1])) ** 2 * PIXEL_VARIANCE
-        if segmentation.thickness_floor:
-            floor = max(floor, segmentation.settings.noise_floor**2 / 3)
         components.append({
             "mean": piece.mu,
             "cov": floor_eigenvalues(piece.covariance, floor),
@@ -140,7 +138,7 @@ def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
     return matches, overlaps
 
 
-def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False):
+def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False, remembered=None):
     """M_i from M_(i-1) and C_i, both in one frame; returns a new list."""
     fused = [dict(k) for k in mixture]
     for c, ks in enumerate(matches):  # increasing c for every k
@@ -155,7 +153,7 @@ def fuse(mixture, current, matches, overlaps, *, overlap_weighted=False):
             g["weight"] += pi_c
             g["count"] += 1
     for c, ks in enumerate(matches):
-        if not ks:
+        if not ks and (remembered is None or remembered[c]):
             fused.append({**current[c], "m": 0.0, "count": 1})
     return fused
 
@@ -232,8 +230,18 @@ class Oracle:
         previous_cam = [transform(g, *to_cam) for g in self.mixture]
         self.matches, overlaps = correspond(previous_cam, current, K, depth.shape, self.eta, self.eta_occl, self.near)
         current_first = [transform(g, *to_first) for g in current]
-        self.mixture = fuse(self.mixture, current_first, self.matches, overlaps, overlap_weighted=self.overlap_weighted)
+        self.mixture = fuse(
+            self.mixture,
+            current_first,
+            self.matches,
+            overlaps,
+            overlap_weighted=self.overlap_weighted,
+            remembered=[g["mean"][2] > self.near for g in current],
+        )
         mixture_cam = [transform(g, *to_cam) for g in self.mixture]
+        if self.spgf.thickness_floor:  # the slab that SPGF cannot resolve, in the regression only
+            slab = self.spgf.settings.noise_floor**2 / 3
+            mixture_cam = [{**g, "cov": floor_eigenvalues(g["cov"], slab)} for g in mixture_cam]
         M = dense(mixture_cam, depth, valid, K, **self.prior)
         if self.smoothed is not None:
             both = (1 - self.alpha) * self.smoothed + self.alpha * M

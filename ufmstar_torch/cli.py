@@ -153,7 +153,7 @@ def _set_threads(count: int | None) -> None:
         pass
     else:
         # First: when numba starts its threads, OpenMP's number, which is torch's as well, becomes all there are.
-        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))
+        numba.set_num_threads(min(count, numba.get_num_threads()))
     torch.set_num_threads(count)
 
 

@@ -153,11 +153,12 @@ class SPGFConfig(_Checked):
 
 @dataclass(frozen=True)
 class UfMStarConfig(_Checked):
-    """Everything UfM* can be told. The defaults are the paper's unless a comment says otherwise."""
+    """Everything UfM* can be told. The defaults are the paper's, with three exceptions, each explained where it
+    stands: the pruning rule (``segment.prune``, docs/segmentation.md), ``regression`` and ``thickness_floor``.
+    """
 
     segment: SPGFConfig = field(default_factory=SPGFConfig)
-    # Not in the paper, which is silent on thin surfaces: see ufmstar_torch.step.covariance_floor.
-    thickness_floor: bool = True
+    aleatoric_in_moments: bool = False  # SPGF's optional per-pixel variance: A r r^T added to J
 
     # Correspondence (section "Multiview Gaussian Correspondence")
     eta: float = _number(0.5, "eta", "1", 0.0, 1.0, open_low=True)
@@ -170,7 +171,10 @@ class UfMStarConfig(_Checked):
     # Regression (section "Uncertainty Regression")
     prior_weight: float = _number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
     prior_mean: float = _number(0.0, "mu_0", "m^2", 0.0)
+    # The paper's neighbourhood approximates the exact sum to save time, which our kernel does not need.
     regression: str = _choice("exact", "neighbourhood")
+    # Not in the paper, which is silent on thin surfaces: see ufmstar_torch.step.thickened.
+    thickness_floor: bool = True
     near_radius: float = _number(0.1, "r", "m", 0.0, open_low=True)
     far_radius: float = _number(0.5, "R", "m", 0.0, open_low=True)
     neighbourhood_sigmas: float = _number(2.0, "s", "1", 0.0, open_low=True)

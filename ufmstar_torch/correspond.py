@@ -16,6 +16,9 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.gaussian import PIXEL_VARIANCE, bhattacharyya
 from ufmstar_torch.mixture import GaussianMixture
 
+# Pairs (k, k') compared at a time: bounds the temporary memory to some 200 MB.
+_CHUNK = 2**21
+
 
 @dataclass(frozen=True)
 class Correspondence:
@@ -63,10 +66,16 @@ def correspond(
 
 def _hidden(match: Tensor, mean: Tensor, covariance: Tensor, depth: Tensor, config: UfMStarConfig) -> Tensor:
     """[B, C, K] True where a nearer member of the same set covers k."""
-    mutual = bhattacharyya(mean[:, :, None], covariance[:, :, None], mean[:, None], covariance[:, None])
-    hides = (mutual > config.eta_occlusion) & (depth[:, None, :] < depth[:, :, None])  # [B, k, k'] k' hides k
-    # Counts of hiding members, as a product of 0/1 matrices in float32: exact up to 2^24 of them.
-    return match.float() @ hides.float().mT > 0.5
+    streams, capacity = depth.shape
+    rows = max(1, _CHUNK // max(1, streams * capacity))
+    hidden = []
+    for k in range(0, capacity, rows):
+        part = slice(k, k + rows)
+        mutual = bhattacharyya(mean[:, part, None], covariance[:, part, None], mean[:, None], covariance[:, None])
+        hides = (mutual > config.eta_occlusion) & (depth[:, None, :] < depth[:, part, None])  # k' hides k
+        # Counts of hiding members, as a product of 0/1 matrices: not 0 where there is one, in any precision.
+        hidden.append(match.float() @ hides.float().mT > 0.5)
+    return torch.cat(hidden, dim=2)
 
 
 def _candidates(
@@ -76,8 +85,8 @@ def _candidates(
     height, width = size
     mean_cam = mixture_cam.mean.to(intrinsics.dtype)
     in_front = mixture_cam.valid & (mean_cam[..., 2] > near_plane)
-    ahead = mean_cam.new_tensor([0.0, 0.0, 1.0])
-    safe_mean = torch.where(in_front[..., None], mean_cam, ahead)
+    x, y, z = mean_cam.unbind(-1)
+    safe_mean = torch.stack([x, y, torch.where(in_front, z, torch.ones_like(z))], dim=-1)
     mean, covariance = project_gaussian(safe_mean, mixture_cam.covariance.to(intrinsics.dtype), intrinsics)
     eye = torch.eye(2, dtype=intrinsics.dtype, device=intrinsics.device)
     u, v = mean.unbind(-1)

@@ -89,7 +89,7 @@ def check_frame(
     T = _matrix("pose", pose, 4, plain)
     K = _matrix("intrinsics", intrinsics, 3, plain)
     deviation = rotation_deviation(T[..., :3, :3])
-    fault = _frame_fault(T, K, deviation, rotation_tolerance).to(plain.device)
+    fault = _first(_pose_fault(T, deviation, rotation_tolerance), _intrinsics_fault(K), plain.device)
     fine = fault == 0
 
     use = plain.isfinite() & (plain > 0) & fine[:, None, None]
@@ -100,9 +100,9 @@ def check_frame(
         use = use & extra.isfinite().all(1)
     if valid is not None:
         use = use & _mask(valid, depth).reshape(plain.shape)
-    T_safe, K_safe = _harmless(T.to(plain.device), K.to(plain.device), fine)
+    T_safe, K_safe = _harmless(_moved(T, plain.device), _moved(K, plain.device), fine)
     safe_depth = torch.where(use, plain, torch.zeros_like(plain))
-    return FrameInput(safe_depth, T_safe, K_safe, a, e, extra, use, fault, deviation.to(plain.device))
+    return FrameInput(safe_depth, T_safe, K_safe, a, e, extra, use, fault, _moved(deviation, plain.device))
 
 
 def _require_float(name: str, value: object) -> None:
@@ -162,24 +162,42 @@ def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
     return value.detach().to(torch.float64).expand(plain.shape[0], n, n)
 
 
-def _frame_fault(T: Tensor, K: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
-    """[B] the first fault of each stream; later entries of the list do not overwrite earlier ones."""
+def _moved(value: Tensor, device: torch.device) -> Tensor:
+    """On ``device``; copies to an accelerator are queued, not waited for."""
+    return value.to(device, non_blocking=device.type != "cpu")
+
+
+def _pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
+    """[B] codes 1 to 4, on the pose's own device."""
     zero = torch.zeros((), dtype=T.dtype, device=T.device)
     last = torch.stack([zero, zero, zero, zero + 1])
-    K = K.to(T.device)
-    off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
     checks = [
         ~T.isfinite().all((-2, -1)),
         (T[:, 3] - last).abs().amax(-1) > tolerance,
         deviation > tolerance,
         (torch.linalg.cross(T[:, 0, :3], T[:, 1, :3]) * T[:, 2, :3]).sum(-1) < 0,  # the determinant
-        ~K.isfinite().all((-2, -1)),
-        (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0),
     ]
-    fault = torch.zeros(T.shape[0], dtype=torch.int64, device=T.device)
-    for code, bad in reversed(list(enumerate(checks, start=1))):
+    return _code(checks, start=1)
+
+
+def _intrinsics_fault(K: Tensor) -> Tensor:
+    """[B] codes 5 and 6, on the intrinsics' own device."""
+    off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
+    shape = (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0)
+    return _code([~K.isfinite().all((-2, -1)), shape], start=5)
+
+
+def _code(checks: list[Tensor], start: int) -> Tensor:
+    """The number of the first check that is True, 0 for none."""
+    fault = torch.zeros(checks[0].shape, dtype=torch.int64, device=checks[0].device)
+    for code, bad in reversed(list(enumerate(checks, start=start))):
         fault = torch.where(bad, torch.full_like(fault, code), fault)
     return fault
+
+
+def _first(fault: Tensor, other: Tensor, device: torch.device) -> Tensor:
+    fault, other = _moved(fault, device), _moved(other, device)
+    return torch.where(fault > 0, fault, other)
 
 
 def _harmless(T: Tensor, K: Tensor, fine: Tensor) -> tuple[Tensor, Tensor]:

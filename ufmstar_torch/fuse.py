@@ -1,7 +1,8 @@
 """Step 4, multiview fusion: measure the disagreement of matched Gaussians and fold it into the mixture.
 
 Section "Multiview Fusion". Both mixtures must be in one frame; distances are rigid invariants, so any
-frame serves. Everything is computed in float64 and stored in the mixture's dtype.
+frame serves. Everything is computed in float64 and stored in the mixture's dtype; before that, eigenvalues that the
+storage would round away are lifted, so that a thin covariance stays positive definite.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.gaussian import geodesic
+from ufmstar_torch.gaussian import floor_covariance, geodesic, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
 
 
@@ -71,6 +72,8 @@ def _fuse_one_each(
     cov_k = torch.where(used[..., None, None], mixture.covariance.to(dtype), eye)
     cov_c = torch.where(used[..., None, None], of_c(current.covariance), eye)
     mean, covariance, distance = geodesic(mixture.mean.to(dtype), cov_k, of_c(current.mean), cov_c, lam)
+
+    covariance = floor_covariance(covariance, storage_floor(covariance, mixture.covariance.dtype))
 
     def average(old: Tensor, new: Tensor, share: Tensor) -> Tensor:
         return (1 - share) * old.to(dtype) + share * new

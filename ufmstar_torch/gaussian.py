@@ -1,7 +1,8 @@
 """Closed forms for Gaussians: eigenvalues, square roots, Wasserstein distance and geodesic, overlap.
 
-All functions are batched over leading dimensions, differentiable almost everywhere, free of host
-synchronisation, and compute in the dtype they are given: callers pass float64 where it matters.
+All functions are batched over leading dimensions, differentiable almost everywhere and free of host
+synchronisation. Distances, geodesics and barycenters are computed in float64 whatever the caller's dtype, and
+returned in it; the decompositions work in the dtype they are given.
 
 Why Jacobi rotations: the trigonometric eigenvalues of a symmetric 3x3 lose half the digits where two
 of them coincide, and the batched ``eigh`` is slow on GPUs. A few sweeps of Jacobi rotations are a
@@ -90,7 +91,7 @@ def cholesky3(S: Tensor) -> Tensor:
     """Lower Cholesky factor of positive semidefinite S [..., 3, 3], without a check that would wait for the device.
 
     A pivot at or below rounding (16 eps of the largest diagonal entry) ends its column with zeros: the
-    factor of a singular S then still satisfies L L^T = S up to that rounding.
+    factor of a singular S then still satisfies L L^T = S up to 4 sqrt(eps) of that entry.
     """
     scale = torch.diagonal(S, dim1=-2, dim2=-1).amax(-1)
     negligible = 16 * torch.finfo(S.dtype).eps * scale
@@ -128,9 +129,15 @@ def wasserstein_squared(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Te
     tr Q^(1/2) is the sum of the singular values of L_b^T L_a. Never negative; [...] in m^2 for inputs
     mean [..., 3] in m and covariance [..., 3, 3] in m^2. Semidefinite covariances are allowed.
     """
+    dtype = mean_a.dtype
+    mean_a, cov_a, mean_b, cov_b = _double(mean_a, cov_a, mean_b, cov_b)
     singular, _ = right_singular(cholesky3(cov_b).mT @ cholesky3(cov_a))
     shape = _trace(cov_a) + _trace(cov_b) - 2 * singular.sum(-1)
-    return ((mean_a - mean_b) ** 2).sum(-1) + shape.clamp_min(0)
+    return (((mean_a - mean_b) ** 2).sum(-1) + shape.clamp_min(0)).to(dtype)
+
+
+def _double(*values: Tensor) -> tuple[Tensor, ...]:
+    return tuple(value.to(torch.float64) for value in values)
 
 
 def transport_map(cov_a: Tensor, cov_b: Tensor) -> Tensor:
@@ -139,7 +146,7 @@ def transport_map(cov_a: Tensor, cov_b: Tensor) -> Tensor:
     Equals the paper's Sigma_a^(-1/2) Q^(1/2) Sigma_a^(-1/2), which is the only such matrix; computed
     as L^-T (L^T Sigma_b L)^(1/2) L^-1 with Sigma_a = L L^T. Sigma_a must be positive definite.
     """
-    return _transport(cov_a, cov_b)[0]
+    return _transport(*_double(cov_a, cov_b))[0].to(cov_a.dtype)
 
 
 def _transport(cov_a: Tensor, cov_b: Tensor) -> tuple[Tensor, Tensor]:
@@ -166,13 +173,16 @@ def geodesic(
     Returns:
         mean [..., 3], covariance [..., 3, 3], W2^2 [...] [m^2].
     """
+    dtype = mean_a.dtype
+    mean_a, cov_a, mean_b, cov_b, lam = _double(mean_a, cov_a, mean_b, cov_b, lam)
     Z, trace_root = _transport(cov_a, cov_b)
     shape = _trace(cov_a) + _trace(cov_b) - 2 * trace_root
     distance = ((mean_a - mean_b) ** 2).sum(-1) + shape.clamp_min(0)
     eye = torch.eye(3, dtype=Z.dtype, device=Z.device)
     l = lam[..., None]
     T = (1 - l[..., None]) * eye + l[..., None] * Z
-    return (1 - l) * mean_a + l * mean_b, symmetrize(T @ cov_a @ T.mT), distance
+    moved = (1 - l) * mean_a + l * mean_b, symmetrize(T @ cov_a @ T.mT), distance
+    return moved[0].to(dtype), moved[1].to(dtype), moved[2].to(dtype)
 
 
 def bhattacharyya(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Tensor) -> Tensor:
@@ -218,6 +228,8 @@ def barycenter(
     """
     if bool((weight < 0).any()) or bool((weight.sum(-1) <= 0).any()):
         raise ValueError("weight must be non-negative with a positive sum for every barycenter")
+    dtype = mean.dtype
+    mean, covariance, weight = _double(mean, covariance, weight)
     w = (weight / weight.sum(-1, keepdim=True))[..., None]
     centre = (w * mean).sum(-2)
     S = (w[..., None] * covariance).sum(-3)
@@ -227,7 +239,7 @@ def barycenter(
         moved = ((updated - S).abs().amax((-2, -1)) / _trace(updated)).max()
         S = updated
         if float(moved) <= max(tolerance, 8 * torch.finfo(S.dtype).eps):
-            return centre, S
+            return centre.to(dtype), S.to(dtype)
     raise RuntimeError(f"the barycenter moved by {float(moved):.1e} of its trace after {iterations} iterations")
 
 
@@ -236,11 +248,13 @@ def wasserstein_variance(mean: Tensor, covariance: Tensor, weight: Tensor) -> Te
 
     The definition that the running update of the fusion step approximates; shapes as :func:`barycenter`.
     """
+    dtype = mean.dtype
+    mean, covariance, weight = _double(mean, covariance, weight)
     centre, S = barycenter(mean, covariance, weight)
     distances = wasserstein_squared(
         centre[..., None, :].expand_as(mean), S[..., None, :, :].expand_as(covariance), mean, covariance
     )
-    return (weight * distances).sum(-1) / weight.sum(-1)
+    return ((weight * distances).sum(-1) / weight.sum(-1)).to(dtype)
 
 
 def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
@@ -257,6 +271,15 @@ def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
     low = values[..., 0] < floor
     lifted = symmetrize((V * torch.maximum(values, floor[..., None])[..., None, :]) @ V.mT)
     return torch.where(low[..., None, None], lifted, covariance)
+
+
+def storage_floor(covariance: Tensor, dtype: torch.dtype) -> Tensor:
+    """[...] the least eigenvalue [m^2] that survives rounding covariances [..., 3, 3] to ``dtype``.
+
+    Rounding moves an eigenvalue by at most 3 eps/2 of the greatest entry, which tr Sigma bounds; 8 eps tr Sigma
+    keeps a plate hundreds of times wider than thick positive definite through any number of fusions.
+    """
+    return 8 * torch.finfo(dtype).eps * _trace(covariance)
 
 
 def pixel_footprint(z: Tensor, focal: Tensor) -> Tensor:

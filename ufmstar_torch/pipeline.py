@@ -130,8 +130,7 @@ class UncertainDepth(nn.Module):
             member = None if self.mode == "full" else self._next % len(self.networks)
             prediction = self._all(x) if member is None else self._one(member, x)
         ufm = self.ufm(prediction.depth, pose, K, prediction.aleatoric_variance, prediction.epistemic_variance, valid)
-        self._next += 1
-        self.image_index = torch.full_like(self.image_index, self._next)
+        self._count(self._next + 1)
         return UncertainPrediction(prediction, ufm, K, member)
 
     def _one(self, member: int, x: Tensor) -> DepthPrediction:
@@ -148,8 +147,13 @@ class UncertainDepth(nn.Module):
         """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
         self.ufm.reset(streams)
         if streams is None:
-            self._next = 0
-            self.image_index = torch.zeros_like(self.image_index)
+            self._count(0)
+
+    def _count(self, images: int) -> None:
+        """Images seen, as a number for the alternation and as a buffer for state_dict."""
+        self._next = images
+        with torch.inference_mode(False):  # the buffer must outlive the caller's inference mode
+            self.image_index = torch.full_like(self.image_index, images)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
         super()._load_from_state_dict(state_dict, prefix, *args)

@@ -99,9 +99,11 @@ def _chunk(
     if config.regression == "neighbourhood":
         density = density * _near(mixture, offset, config)
     evidence = density.sum(-1) + config.prior_weight
-    weighted = torch.einsum("bpk,bk->bp", density, mixture.disagreement.to(dtype))
+    # Products and sums, not matrix products: those may run in TF32 where the caller allows it.
+    weighted = (density * mixture.disagreement.to(dtype)[:, None]).sum(-1)
     disagreement = (weighted + config.prior_weight * config.prior_mean) / evidence
-    features = torch.einsum("bpk,bkf->bpf", density, mixture.features.to(dtype)) / evidence[..., None]
+    each = [(density * feature[:, None]).sum(-1) / evidence for feature in mixture.features.to(dtype).unbind(-1)]
+    features = torch.stack(each, dim=-1) if each else density.new_zeros(*evidence.shape, 0)
     return Regression(disagreement, features)
 
 
@@ -143,6 +145,6 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
         leave the rest of ``used`` False.
     """
     generator = torch.Generator().manual_seed(seed)
-    keys = torch.rand(valid.shape, generator=generator).to(valid.device)
+    keys = torch.rand(valid.shape, generator=generator, device="cpu").to(valid.device, non_blocking=True)
     score, index = torch.where(valid, keys, torch.full_like(keys, -1.0)).flatten(1).topk(count, dim=1)
     return index, score >= 0

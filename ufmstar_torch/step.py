@@ -6,6 +6,7 @@ float64, so large world coordinates never reach the float32 state, and component
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,7 +33,8 @@ class UfMStarState:
         started: [B] bool, True once a stream has seen a frame.
         frames: [B] int64 number of frames used.
         skipped: [B] int64 number of frames skipped for a fault.
-        smoothed: [B, H, W] moving average of the dense disagreement [m^2], NaN without a value; None at the start.
+        smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
+            value; None at the start.
     """
 
     mixture: GaussianMixture
@@ -69,7 +71,7 @@ class FrameStatistics:
         matched: segments fused with at least one earlier component.
         pairs: fused (c, k) pairs.
         new: segments appended to the mixture.
-        dropped: segments lost because ``max_components`` was reached.
+        dropped: segments not remembered: ``max_components`` was reached, or nearer than the near plane.
         valid_pixels: pixels used.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
@@ -138,7 +140,9 @@ def step(
     R_cam, t_cam = relative_pose(first, frame.T_world_cam)
     previous_cam = state.mixture.to(torch.float64).rigid(R_cam, t_cam)
     pairs = backend.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
-    new = current_cam.valid & ~pairs.match.any(dim=2)
+    # What is nearer than the near plane could never be matched again: it is not remembered.
+    far_enough = current_cam.mean[..., 2] > config.near_plane
+    new = current_cam.valid & far_enough & ~pairs.match.any(dim=2)
 
     mixture, rounds = _make_room(state.mixture, pairs, new, frame.fault, config)
     pairs = _pad_pairs(pairs, mixture.capacity)
@@ -149,7 +153,9 @@ def step(
 
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
     result = _read_out(mixture_cam, frame, config, backend, pixels)
-    disagreement, smoothed = _average(state.smoothed, result.disagreement, frame, config, pixels, average)
+    disagreement, smoothed = _average(
+        state.smoothed, result.disagreement, frame, config, pixels, average, state.mixture.mean.dtype
+    )
 
     statistics = FrameStatistics(
         components=mixture.components,
@@ -157,7 +163,7 @@ def step(
         matched=pairs.match.any(dim=2).sum(1),
         pairs=pairs.match.sum((1, 2)),
         new=new.sum(1) - dropped,
-        dropped=dropped,
+        dropped=dropped + (current_cam.valid & ~far_enough).sum(1),
         valid_pixels=frame.valid.sum((1, 2)),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
@@ -178,28 +184,21 @@ def raise_faults(faults: list[int]) -> None:
 
 
 def segment(frame: FrameInput, config: UfMStarConfig, backend: Backend) -> tuple[GaussianMixture, Tensor]:
-    """Step 2: C_i in the camera frame, float64, eigenvalues at least :func:`covariance_floor`; and its labels."""
+    """Step 2: C_i in the camera frame, float64, and its labels.
+
+    SPGF's raw moments have no floor, and an exactly flat surface is singular. Eigenvalues are lifted to
+    the variance across one pixel at that depth, (z/f)^2/12: the depth map resolves nothing finer.
+    """
+    variance = frame.aleatoric.detach() if config.aleatoric_in_moments and frame.aleatoric is not None else None
     mixture, labels = backend.spgf(
-        frame.depth, frame.intrinsics, config.segment, valid=frame.valid, features=frame.features
+        frame.depth, frame.intrinsics, config.segment, variance=variance, valid=frame.valid, features=frame.features
     )
     mixture = mixture.to(torch.float64)
-    floor = covariance_floor(mixture.mean[..., 2], frame.intrinsics, config)
-    return mixture.replace(covariance=backend.floor_covariance(mixture.covariance, floor)), labels
-
-
-def covariance_floor(z: Tensor, intrinsics: Tensor, config: UfMStarConfig) -> Tensor:
-    """[B, C] the least eigenvalue of a segment's covariance [m^2]; SPGF's raw moments have no floor.
-
-    Two lengths that the segmentation cannot resolve, each as the variance of a uniform density over it:
-    the width of one pixel, (z/f)^2/12, and with ``config.thickness_floor`` the slab of +- noise_floor within
-    which SPGF counts points to one plane, noise_floor^2/3. Without the second, a wall as flat as a network
-    (or a renderer) likes it explains nothing a few centimetres off itself, and the regression
-    returns the prior just where views disagree (docs/disagreement.md has the measurement).
-    """
-    fx, fy, _, _ = focal_and_centre(intrinsics)
+    fx, fy, _, _ = focal_and_centre(frame.intrinsics)
     # Nearer than the near plane nothing is ever matched; the footprint there keeps the floor above zero.
-    pixel = pixel_footprint(z.clamp_min(config.near_plane), torch.minimum(fx, fy)[:, None])
-    return pixel.clamp_min(config.segment.noise_floor**2 / 3) if config.thickness_floor else pixel
+    z = mixture.mean[..., 2].clamp_min(config.near_plane)
+    floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
+    return mixture.replace(covariance=backend.floor_covariance(mixture.covariance, floor)), labels
 
 
 def _make_room(
@@ -245,6 +244,7 @@ def _read_out(
     pixels: Tensor | None,
 ) -> Regression:
     """Step 5 at every pixel, or at some; NaN where not valid."""
+    mixture_cam = thickened(mixture_cam, config, backend.floor_covariance)
     if pixels is None:
         result = backend.regress_image(mixture_cam, frame.depth, frame.intrinsics, config)
         valid = frame.valid
@@ -258,6 +258,23 @@ def _read_out(
     return replace(result, disagreement=torch.where(valid, result.disagreement, nan), features=features)
 
 
+def thickened(
+    mixture: GaussianMixture, config: UfMStarConfig, floor_covariance: Callable[..., Tensor]
+) -> GaussianMixture:
+    """The mixture as the regression sees it: no component thinner than SPGF resolves.
+
+    SPGF counts points within +- noise_floor of a plane to that plane; the variance across that slab is
+    noise_floor^2/3. A wall as flat as a network (or a renderer) likes it would otherwise explain nothing a few
+    centimetres off itself, and the prior would answer just where views disagree (docs/disagreement.md
+    has the measurement). Matching and fusion use the covariances as they are.
+    """
+    if not config.thickness_floor:
+        return mixture
+    slab = torch.full_like(mixture.weight, config.segment.noise_floor**2 / 3)
+    slab = torch.where(mixture.valid, slab, torch.zeros_like(slab))
+    return mixture.replace(covariance=floor_covariance(mixture.covariance, slab))
+
+
 def _average(
     smoothed: Tensor | None,
     disagreement: Tensor,
@@ -265,20 +282,24 @@ def _average(
     config: UfMStarConfig,
     pixels: Tensor | None,
     average: bool,
+    dtype: torch.dtype,
 ) -> tuple[Tensor, Tensor | None]:
     """The moving average for output (NaN where not valid now) and for the state.
 
-    It restarts when the image size changes. On a subset the dense map serves as memory at those pixels.
+    It is kept in the state's dtype, so that a saved run goes on as it was, and restarts when the image size
+    changes. On a subset the dense map serves as memory at those pixels.
     """
     if not average or config.ema_alpha == 1.0:
         return disagreement, smoothed
     if smoothed is not None and smoothed.shape[1:] != frame.size:
         smoothed = None
+    shown_dtype = disagreement.dtype
     if pixels is None:
-        mixed = smooth(smoothed, disagreement, config.ema_alpha)
-        return torch.where(frame.valid, mixed, torch.nan), mixed
-    memory = torch.full_like(frame.depth, torch.nan) if smoothed is None else smoothed
-    memory = memory.to(disagreement.dtype).flatten(1)
-    mixed = smooth(torch.gather(memory, 1, pixels), disagreement, config.ema_alpha)
+        mixed = smooth(smoothed, disagreement.to(dtype), config.ema_alpha)
+        return torch.where(frame.valid, mixed, torch.nan).to(shown_dtype), mixed
+    memory = torch.full(frame.depth.shape, torch.nan, dtype=dtype, device=frame.depth.device)
+    memory = (memory if smoothed is None else smoothed).flatten(1)
+    mixed = smooth(torch.gather(memory, 1, pixels), disagreement.to(dtype), config.ema_alpha)
     valid = torch.gather(frame.valid.flatten(1), 1, pixels)
-    return torch.where(valid, mixed, torch.nan), memory.scatter(1, pixels, mixed).view(frame.depth.shape)
+    shown = torch.where(valid, mixed, torch.nan).to(shown_dtype)
+    return shown, memory.scatter(1, pixels, mixed).view(frame.depth.shape)

@@ -16,9 +16,10 @@ from ufmstar_torch.backend import select
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput, check_frame
+from ufmstar_torch.gaussian import floor_covariance
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression, regress, sample_pixels
-from ufmstar_torch.step import FrameStatistics, StepOutput, UfMStarState, step
+from ufmstar_torch.step import FrameStatistics, StepOutput, UfMStarState, step, thickened
 
 _MIXTURE = ("mean", "covariance", "weight", "disagreement", "count", "features")
 _STATE = (*_MIXTURE, "T_world_first", "started", "frames", "skipped", "smoothed")
@@ -222,11 +223,15 @@ class UfMStar(nn.Module):
         value = torch.where(used, variance, torch.zeros_like(variance))
         mean = value.sum(1) / count  # 0/0 = NaN where no pixel is valid
         squares = torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)).sum(1)
-        error = (squares / (count - 1).clamp_min(0) / count).sqrt()
+        left = 1 - count / frame.valid.sum((1, 2)).clamp_min(1)  # without replacement: all pixels, no error
+        error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
         return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, out.statistics)
 
     def query(self, points: Tensor, frame: str = "world") -> Regression:
         """The disagreement at any 3D point, from the present mixture, without touching the state.
+
+        With ``config.regression == "neighbourhood"`` the boxes are cut along the axes of the first camera, where
+        :meth:`forward` cuts them along those of the present one.
 
         Args:
             points: [B, N, 3] [m].
@@ -251,7 +256,8 @@ class UfMStar(nn.Module):
                 T = invert_rigid(self.T_world_first)
                 local = torch.einsum("bij,bnj->bni", T[:, :3, :3], local.double()) + T[:, None, :3, 3]
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-            return regress(self.mixture, local.to(dtype), self.config)
+            mixture = thickened(self.mixture.to(torch.float64), self.config, floor_covariance)
+            return regress(mixture, local.to(dtype), self.config)
 
     # ---- the state ----
 
@@ -276,6 +282,10 @@ class UfMStar(nn.Module):
             IndexError: an index is out of range.
             ValueError: a mask of the wrong length.
         """
+        with torch.inference_mode(False), torch.no_grad():  # buffers must outlive the caller's inference mode
+            self._reset(streams)
+
+    def _reset(self, streams: Sequence[int] | Tensor | None) -> None:
         dtype, device, b = self.mean.dtype, self.mean.device, self.mean.shape[0]
         if streams is None:
             self._store(UfMStarState.initial(0, self.config, dtype, device))

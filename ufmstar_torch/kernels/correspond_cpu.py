@@ -35,7 +35,7 @@ def correspond(
         return [value.detach().double().contiguous().numpy() for value in fields]
 
     camera = intrinsics.detach().double().contiguous().numpy()
-    thresholds = (config.eta, config.eta_occlusion, config.near_plane)
+    thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     previous, current = arrays(previous_cam), arrays(current_cam)
     for s in range(b):
         streams = (*(value[s] for value in previous), *(value[s] for value in current), camera[s])
@@ -44,7 +44,7 @@ def correspond(
 
 
 @compiled
-def _project(mean, covariance, weight, K, height, width, near):
+def _project(mean, covariance, weight, K, height, width, near, widening):
     """Indices of the candidates, and per candidate u, v, the covariance's xx, xy, yy, and the depth."""
     index = np.empty(weight.size, np.int64)
     image = np.empty((weight.size, 6))
@@ -61,9 +61,9 @@ def _project(mean, covariance, weight, K, height, width, near):
         a, b, c, d = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)  # A = [[a, 0, b], [0, c, d]]
         index[n] = k
         image[n, 0], image[n, 1], image[n, 5] = u, v, z
-        image[n, 2] = a * a * S[0, 0] + 2 * a * b * S[0, 2] + b * b * S[2, 2] + PIXEL_VARIANCE
+        image[n, 2] = a * a * S[0, 0] + 2 * a * b * S[0, 2] + b * b * S[2, 2] + widening
         image[n, 3] = a * c * S[0, 1] + a * d * S[0, 2] + b * c * S[2, 1] + b * d * S[2, 2]
-        image[n, 4] = c * c * S[1, 1] + 2 * c * d * S[1, 2] + d * d * S[2, 2] + PIXEL_VARIANCE
+        image[n, 4] = c * c * S[1, 1] + 2 * c * d * S[1, 2] + d * d * S[2, 2] + widening
         n += 1
     return index[:n], image[:n]
 
@@ -80,10 +80,12 @@ def _bhattacharyya(p, q):
 
 
 @compiled
-def _stream(mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, match, overlap):
+def _stream(
+    mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening, match, overlap
+):
     """One stream: overlaps of all candidate pairs, then the occlusion filter within each set."""
-    index_k, image_k = _project(mean_k, cov_k, weight_k, K, height, width, near)
-    index_c, image_c = _project(mean_c, cov_c, weight_c, K, height, width, near)
+    index_k, image_k = _project(mean_k, cov_k, weight_k, K, height, width, near, widening)
+    index_c, image_c = _project(mean_c, cov_c, weight_c, K, height, width, near, widening)
     members = np.empty(index_k.size, np.int64)
     for i in range(index_c.size):
         n = 0

@@ -42,6 +42,7 @@ def fuse(
         pairs.match.contiguous().numpy(),
         pairs.overlap.contiguous().numpy(),
         config.overlap_weighted,
+        float(torch.finfo(mixture.covariance.dtype).eps),
     )
     return fused
 
@@ -172,11 +173,11 @@ def _floor(covariance, floor):
 @compiled
 def _fuse(
     mean, covariance, weight, disagreement, count, features,
-    mean_c, cov_c, weight_c, features_c, match, overlap, overlap_weighted,
+    mean_c, cov_c, weight_c, features_c, match, overlap, overlap_weighted, epsilon,
 ):  # fmt: skip
     """Apply every pair in place; after each one the values take the precision they are stored in."""
     work = np.empty((6, 3, 3))
-    mean_k, cov_k = np.empty(3), np.empty((3, 3))
+    mean_k, cov_k, least = np.empty(3), np.empty((3, 3)), np.empty(1)
     for b in range(match.shape[0]):
         for c in range(match.shape[1]):
             for k in range(match.shape[2]):
@@ -188,6 +189,8 @@ def _fuse(
                 mean_k[:] = mean[b, k]
                 cov_k[:] = covariance[b, k]
                 distance = geodesic(mean_k, cov_k, mean_c[b, c], cov_c[b, c], lam, work)
+                least[0] = 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2])
+                _floor(cov_k[None], least)
                 mean[b, k] = mean_k
                 covariance[b, k] = cov_k
                 weight[b, k] = pi_k + pi_c
