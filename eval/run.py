@@ -173,11 +173,12 @@ def _all_frames(job: Job, folder: RunFolder, progress: Callable[[Progress], None
     first, earlier = folder.checkpoint.position, list(folder.checkpoint.sessions)
     skipped = sum(record["state"] == "skipped" for record in folder.records)
     started = reported = perf_counter()
+    saving = 0.0
     progress(Progress("frames", first, len(job.indices), None, skipped))
     for position in range(first, len(job.indices)):
         if stop():
             raise _Stopped
-        record = _one_frame(job, folder, judge, job.indices[position])
+        record = _one_frame(job, folder, judge, job.indices[position], saving)
         session = {"first": first, "frames": position + 1 - first, "seconds": perf_counter() - started}
         state = Checkpoint(
             position=position + 1,
@@ -185,7 +186,9 @@ def _all_frames(job: Job, folder: RunFolder, progress: Callable[[Progress], None
             metrics=judge.state(),
             sessions=[*earlier, session],
         )
+        before = perf_counter()
         folder.commit(record, state)
+        saving = 1000 * (perf_counter() - before)
         skipped += record["state"] == "skipped"
         progress(Progress("frames", position + 1, len(job.indices), record.get("components"), skipped))
         if perf_counter() - reported > _SUMMARY_EVERY:
@@ -193,8 +196,12 @@ def _all_frames(job: Job, folder: RunFolder, progress: Callable[[Progress], None
             reported = perf_counter()
 
 
-def _one_frame(job: Job, folder: RunFolder, judge: Judge, index: int) -> dict[str, Any]:
-    """Predict, judge and write one frame; its line for frames.jsonl."""
+def _one_frame(job: Job, folder: RunFolder, judge: Judge, index: int, saving: float) -> dict[str, Any]:
+    """Predict, judge and write one frame; its line for frames.jsonl.
+
+    Args:
+        saving: [ms] what it took to save the state after the frame before; this frame's is not known yet.
+    """
     clock, name = job.source.clock, job.sequence.entries[index].name
     clock.take()
     try:
@@ -219,7 +226,8 @@ def _one_frame(job: Job, folder: RunFolder, judge: Judge, index: int) -> dict[st
             disagreement=result.disagreement[0],
             valid=result.ufm.valid[0],
         )
-    return _record(index, name, result, truth is not None, written, clock.take())
+    ms = {**clock.take(), "save": saving}
+    return _record(index, name, result, truth is not None, written, ms)
 
 
 def _truth(frame: Frame, result: UncertainPrediction) -> np.ndarray | None:
@@ -233,7 +241,8 @@ def _record(
     """What is remembered of a frame. "prepare" is what a prediction takes beside the network and UfM*."""
     statistics, K = result.ufm.statistics, result.intrinsics[0].tolist()
     counts = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-    ms["prepare"] = ms.pop("predict") - ms.get("network", 0.0) - ms["ufm"]
+    prepare = ms["predict"] - ms.get("network", 0.0) - ms["ufm"]
+    times = {stage: time for stage, time in {**ms, "prepare": prepare}.items() if stage != "predict"}
     own = result.prediction.variance
     return {
         "index": index,
@@ -247,10 +256,10 @@ def _record(
         "mean_disagreement": _mean(result.disagreement, result.ufm.valid),
         "mean_sigma": _mean(result.std, result.ufm.valid),
         "mean_network_sigma": None if own is None else _mean(own.sqrt(), result.ufm.valid),
-        "near_zero": int((result.std < NEAR_ZERO).sum()),
+        "near_zero": int(((result.std > 0) & (result.std < NEAR_ZERO)).sum()),
         "ground_truth": judged,
         "saturated": {"depth": written.depth_saturated, "sigma": written.sigma_saturated},
-        "ms": ms,
+        "ms": times,
     }
 
 

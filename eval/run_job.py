@@ -9,7 +9,7 @@ import torch
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.run import Job
-from ufmstar_torch.eval.run_options import OWN_DEPTH, parse_intrinsics, parse_size, parse_slice
+from ufmstar_torch.eval.run_options import OWN_DEPTH, check_options, parse_intrinsics, parse_size, parse_slice
 from ufmstar_torch.eval.run_source import Source, folder_source, network_source, own_depth_source
 from ufmstar_torch.eval.sequences import Sequence, open_sequence
 
@@ -25,7 +25,7 @@ def job_from(options: Mapping[str, Any]) -> Job:
         FileNotFoundError, NotADirectoryError: something that was named does not exist.
         ModuleNotFoundError: an optional package is missing.
     """
-    _check_combination(options)
+    check_options(options)
     config = UfMStarConfig.from_dict(options["ufm"])
     device = _device(options["device"])
     chosen = parse_slice(options["frames"])
@@ -41,26 +41,6 @@ def job_from(options: Mapping[str, Any]) -> Job:
         video=not options["no_video"],
         sheet=not options["no_sheet"],
     )
-
-
-def _check_combination(options: Mapping[str, Any]) -> None:
-    """Raises ValueError where two options contradict each other, or one needs another."""
-    model, depth = options["model"], options["depth"]
-    if (model is None) == (depth is None):
-        wanted = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"
-        raise ValueError(f"the depth must come from one place: give {wanted}" + (", not both" if model else ""))
-    if model is not None and not options["weights"]:
-        raise ValueError(f"--model {model} needs --weights FILE")
-    needs_model = [name for name in ("weights", "spec") if options[name] and model is None]
-    needs_depth = [name for name in ("variance", "depth_scale", "size") if options[name] is not None and depth is None]
-    needs_folder = [name for name in ("variance", "depth_scale") if options[name] is not None and depth in OWN_DEPTH]
-    for names, missing in ((needs_model, "--model"), (needs_depth, "--depth"), (needs_folder, "--depth DIR")):
-        if names:
-            raise ValueError(f"--{names[0].replace('_', '-')} goes with {missing} only")
-    if options["mode"] == "full" and len(options["weights"]) < 2:
-        raise ValueError("--mode full needs several --weights")
-    if options["resume"] and options["overwrite"]:
-        raise ValueError("--resume and --overwrite contradict each other")
 
 
 def _device(name: str) -> str:

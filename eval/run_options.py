@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ _TYPES = {"float": float, "int": int, "bool": bool, "str": str, "int | None": in
 _USAGE = "ufmstar run SEQUENCE (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
 _WORDS = "several words"
 # (option, type, default, help) by group; all of them may also stand in the file given as --config.
-_GROUPS = {
+_GROUPS: dict[str, tuple[tuple[str, Any, Any, str], ...]] = {
     "sequence": (
         ("--layout", LAYOUTS, "auto", "of the sequence's folder"),
         ("--frames", str, None, "START:STOP:STEP, which frames, counted from 0 as Python does"),
@@ -106,6 +106,35 @@ def parse_run(parser: ArgumentParser, arguments: Sequence[str]) -> dict[str, Any
     plain: dict[str, Any] = options.as_dict()
     plain["config"] = [str(file) for file in plain["config"] or []]
     return plain
+
+
+def check_options(options: Mapping[str, Any]) -> None:
+    """What can be said of the options before anything is opened.
+
+    Raises:
+        ValueError: two contradict each other, one needs another, or a value is out of its range.
+    """
+    UfMStarConfig.from_dict(options["ufm"])
+    parse_slice(options["frames"])
+    parse_size(options["size"])
+    for name in ("intrinsics", "depth_intrinsics"):
+        parse_intrinsics(options[name], f"--{name.replace('_', '-')}")
+    model, depth = options["model"], options["depth"]
+    if (model is None) == (depth is None):
+        wanted = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"
+        raise ValueError(f"the depth must come from one place: give {wanted}" + (", not both" if model else ""))
+    if model is not None and not options["weights"]:
+        raise ValueError(f"--model {model} needs --weights FILE")
+    needs_model = [name for name in ("weights", "spec") if options[name] and model is None]
+    needs_depth = [name for name in ("variance", "depth_scale", "size") if options[name] is not None and depth is None]
+    needs_folder = [name for name in ("variance", "depth_scale") if options[name] is not None and depth in OWN_DEPTH]
+    for names, missing in ((needs_model, "--model"), (needs_depth, "--depth"), (needs_folder, "--depth DIR")):
+        if names:
+            raise ValueError(f"--{names[0].replace('_', '-')} goes with {missing} only")
+    if options["mode"] == "full" and len(options["weights"]) < 2:
+        raise ValueError("--mode full needs several --weights")
+    if options["resume"] and options["overwrite"]:
+        raise ValueError("--resume and --overwrite contradict each other")
 
 
 def parse_slice(text: str | None) -> slice:

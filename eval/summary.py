@@ -20,7 +20,7 @@ FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 NEAR_ZERO = 1e-3
 # [nats] Above it, the mean NLL tells of a few pixels with almost no variance, and of nothing else.
 _NLL_DOMINATED = 100.0
-STAGES = ("read", "prepare", "network", "ufm", "metrics", "write")
+STAGES = ("read", "prepare", "network", "ufm", "metrics", "write", "save")
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 _COLUMNS = {
     "delta1": "delta1",
@@ -147,8 +147,7 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _near_zero_share(done: Sequence[Mapping[str, Any]]) -> float | None:
-    """Of the valid pixels those with a sigma below ``NEAR_ZERO``: all of the first frame, where nothing has been
-    compared yet, and points near no component, where the prior says 0."""
+    """Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component: there, the prior says 0."""
     pixels = sum(record["valid_pixels"] for record in done)
     return sum(record["near_zero"] for record in done) / pixels if pixels else None
 
@@ -174,13 +173,18 @@ def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dic
 
 
 def _time(done: Sequence[Mapping[str, Any]], sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Medians by stage; "prepare" is preprocessing, or reading the predicted map."""
+    """Medians by stage; "prepare" is preprocessing, or reading the predicted map.
+
+    The rate is that of the median frame: the first one also loads libraries and compiled kernels.
+    """
     seconds = sum(session["seconds"] for session in sessions)
     stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
+    total = median(sum(record["ms"].values()) for record in done) if done else None
     return {
-        "median_ms": {stage: median(times) if times else None for stage, times in stages.items()},
+        "median_ms": {stage: median(times) if times else None for stage, times in stages.items()} | {"frame": total},
+        "frames_per_second": 1000 / total if total else None,
+        "frames_per_second_with_start": len(done) / seconds if seconds else None,
         "wall_seconds": seconds,
-        "frames_per_second": len(done) / seconds if seconds else None,
         "sessions": list(sessions),
     }
 
@@ -202,8 +206,8 @@ def table(summary: Mapping[str, Any]) -> str:
             lines.append(f"network alone: no row, {summary['network_alone_reason']}")
         if (summary["metrics"]["nll"] or 0) > _NLL_DOMINATED:
             lines.append(
-                f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma below "
-                f"{1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
+                f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
+                f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
             )
     else:
         sigma = _number(uncertainty["mean_sigma"])

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.run_source import MapSource, NetworkSource, own_depth_so
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
 
-CONFIG = UfMStarConfig(on_bad_frame="skip", backend="torch")
+CONFIG = UfMStarConfig(on_bad_frame="skip")
 
 
 class Brightness(nn.Module):

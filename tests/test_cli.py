@@ -59,7 +59,7 @@ def brightness(monkeypatch, tmp_path):
     return types.SimpleNamespace(files=files, loaded=loaded)
 
 
-QUICK = ("--no-video", "--no-sheet", "--ufm.backend", "torch")
+QUICK = ("--no-video", "--no-sheet")
 
 
 # ---- help and mistakes ----

@@ -62,11 +62,12 @@ def run(arguments: Sequence[str]) -> int:
     """depth and variance of a sequence of posed images, onto disk"""
     from jsonargparse import ArgumentError
 
-    from ufmstar_torch.eval.run_options import parse_run, run_parser
+    from ufmstar_torch.eval.run_options import check_options, parse_run, run_parser
 
     try:
         options = parse_run(run_parser(), arguments)
-    except ArgumentError as error:
+        check_options(options)
+    except (ArgumentError, ValueError) as error:
         raise UsageError(_one_line(error)) from error
     try:
         summary = _run(options)
