@@ -71,7 +71,6 @@ class Segmentation:
     settings: oracle_spgf.Settings
     min_pixels: int
     min_rows: int
-    thickness_floor: bool
     prune: str  # "both": drop if both are small, "either": drop if one is, "none"
 
     def keeps(self, piece):
@@ -239,9 +238,6 @@ class Oracle:
             remembered=[g["mean"][2] > self.near for g in current],
         )
         mixture_cam = [transform(g, *to_cam) for g in self.mixture]
-        if self.spgf.thickness_floor:  # the slab that SPGF cannot resolve, in the regression only
-            slab = self.spgf.settings.noise_floor**2 / 3
-            mixture_cam = [{**g, "cov": floor_eigenvalues(g["cov"], slab)} for g in mixture_cam]
         M = dense(mixture_cam, depth, valid, K, **self.prior)
         if self.smoothed is not None:
             both = (1 - self.alpha) * self.smoothed + self.alpha * M

@@ -12,6 +12,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_ufmstar import SPGF, run
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
@@ -40,17 +43,19 @@ def unchanged(ufm: UfMStar, before: dict[str, torch.Tensor]) -> bool:
 
 
 @pytest.mark.parametrize("cut", [1, 4])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_saved_state_continues_bit_for_bit(cut, dtype):
-    whole = UfMStar(CONFIG.replace(initial_capacity=4), dtype=dtype)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["depth32", "depth64"])
+@pytest.mark.parametrize("own", [torch.float32, torch.float64], ids=["state32", "state64"])
+def test_saved_state_continues_bit_for_bit(cut, dtype, own):
+    whole = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
     expected = [whole(*frame(i, dtype)).variance for i in range(8)]
-    first = UfMStar(CONFIG.replace(initial_capacity=4), dtype=dtype)
+    assert {e.dtype for e in expected} == {dtype}
+    first = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
     for i in range(cut):
         first(*frame(i, dtype))
     file = io.BytesIO()
     torch.save(first.state_dict(), file)
     file.seek(0)
-    second = UfMStar(CONFIG.replace(initial_capacity=4), dtype=dtype)
+    second = UfMStar(CONFIG.replace(initial_capacity=4), dtype=own)
     second.load_state_dict(torch.load(file, weights_only=True))
     for i in range(cut, 8):
         assert same(second(*frame(i, dtype)).variance, expected[i])
@@ -140,6 +145,10 @@ def test_inference_mode_then_normal_mode(backend):
     assert not ufm.mean.is_inference()
     assert same(ufm(*frame(1)).variance, plain(*frame(1)).variance)
     ufm.mean += 0.0  # an inference tensor would refuse
+    with torch.inference_mode():
+        ufm.reset([0])
+    assert not any(value.is_inference() for value in ufm.buffers())
+    ufm.load_state_dict(plain.state_dict())
 
 
 def test_gradients_reach_the_networks_own_variance_only():
@@ -239,6 +248,13 @@ def test_mean_uncertainty():
     assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on where it is read
 
 
+def test_the_standard_error_knows_that_pixels_are_drawn_once():
+    ufm = UfMStar(CONFIG)
+    ufm(*frame(0))
+    every = ufm.mean_uncertainty(*frame(1), fraction=1.0)
+    assert every.standard_error.item() < 1e-12 < every.mean.item()
+
+
 def test_mean_uncertainty_is_seeded_and_checked():
     def mean(**options):
         ufm = UfMStar(CONFIG)
@@ -302,6 +318,39 @@ def test_no_host_synchronisation():
         )
     assert out.variance.shape == (2, 12, 16)
     assert out.variance.device.type == "meta"
+
+
+class Transfers(TorchDispatchMode):
+    """Counts what crosses between devices and waits, on fake tensors: no accelerator is needed."""
+
+    def __init__(self):
+        super().__init__()
+        self.waits = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        tensors = [x for x in tree_leaves((args, kwargs or {}, out)) if isinstance(x, torch.Tensor)]
+        crosses = len({x.device.type for x in tensors}) > 1
+        queued = (kwargs or {}).get("non_blocking") or (len(args) > 2 and args[-1] is True)
+        if "_local_scalar_dense" in func.name() or ("copy" in func.name() and crosses and not queued):
+            self.waits.append(func.name())
+        return out
+
+
+@pytest.mark.parametrize("given", ["all there", "pose on the host", "pose and intrinsics on the host"])
+def test_nothing_waits_for_the_accelerator(given):
+    """Also copies to it would wait, which the meta device cannot show."""
+    config = UfMStarConfig(segment=SPGF, backend="torch", initial_capacity=16, max_components=16, on_bad_frame="skip")
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        ufm = UfMStar(config, device="cuda")
+        depth = torch.empty(1, 12, 16, device="cuda")
+        pose = torch.empty(1, 4, 4, device="cpu" if "pose" in given else "cuda")
+        intrinsics = torch.empty(1, 3, 3, device="cpu" if "intrinsics" in given else "cuda")
+        with Transfers() as transfers:
+            ufm(depth, pose, intrinsics)
+            ufm.mean_uncertainty(depth, pose, intrinsics, pixels=5)
+            ufm.query(torch.empty(1, 3, 3, device="cuda"))
+    assert transfers.waits == []
 
 
 # ---- bad input ----

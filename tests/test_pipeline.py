@@ -148,6 +148,15 @@ def test_state_continues_and_resets():
     assert whole(image(0), POSES[0], K).member == 0
 
 
+def test_inference_mode_leaves_loadable_buffers():
+    model, other = UncertainDepth(Scaled(1.0), CONFIG), UncertainDepth(Scaled(1.0), CONFIG)
+    with torch.inference_mode():
+        model(image(0), POSES[0], K)
+    other(image(0), POSES[0], K)
+    model.load_state_dict(other.state_dict())
+    assert model(image(1), POSES[1], K).member == 0
+
+
 def test_what_cannot_be_meant_is_refused():
     for arguments in (
         {"networks": []},

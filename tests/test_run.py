@@ -22,7 +22,7 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.pictures import field_of_view, square_pixels
 from ufmstar_torch.eval.run import Progress, run
 from ufmstar_torch.eval.run_folder import FolderError
-from ufmstar_torch.eval.run_source import folder_source
+from ufmstar_torch.eval.run_source import NetworkSource, folder_source
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.writers import read_frame
 from ufmstar_torch.models import Preprocess
@@ -187,6 +187,7 @@ def test_pictures_and_mixture(path, tmp_path):
     summary = run(network_job(path, video=True, sheet=True, frames=slice(0, 4)), out)
     made = {"mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json", "contact_sheet.png", "preview.mp4"}
     assert summary["outputs"] == dict.fromkeys(made)
+    assert all((out / name).is_file() for name in made)
     video = cv2.VideoCapture(str(out / "preview.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 4
     sheet = cv2.imread(str(out / "contact_sheet.png"))
@@ -288,13 +289,33 @@ def test_maps_are_brought_to_a_size(path, tmp_path):
     np.testing.assert_array_equal(stored["variance"], out.variance[0].numpy())
 
 
-def test_maps_that_were_cropped_are_refused(path, tmp_path):
+def test_maps_that_were_cropped_need_their_intrinsics(path, tmp_path):
     for name in range(7, 13):
         write_depth_png(tmp_path / "maps" / f"{name}.png", np.ones((48, 48)), 1000, scale_text="0.001")
     sequence = open_sequence(path)
+    with pytest.raises(ValueError, match=r"7\.png: the map is 48x48, the images are 64x48: it does not show the whole"):
+        folder_source(sequence, tmp_path / "maps", CONFIG)
+    # Only a later one: that frame is left out.
+    for name in (7, 8, 9):
+        write_depth_png(tmp_path / "maps" / f"{name}.png", np.ones((48, 64)), 1000, scale_text="0.001")
     summary = run(job_of(sequence, folder_source(sequence, tmp_path / "maps", CONFIG)), tmp_path / "out")
-    assert summary["state"] == "failed"
-    assert "does not show the whole image" in summary["reason"]
+    assert summary["frames"]["done"] == 3
+    assert "does not show the whole image" in next(iter(summary["frames"]["skipped"]))
+
+
+def test_the_depth_of_a_run_as_maps_of_another_gives_the_same(path, tmp_path):
+    """A network's cropped view, once from the network and once from its stored maps and their intrinsics."""
+    preprocess = Preprocess(resize_height=40, crop=(30, 40), size=(24, 36))
+    sequence = open_sequence(path)
+    pipeline = UncertainDepth(Brightness(), CONFIG, preprocess=preprocess)
+    first = run(job_of(sequence, NetworkSource(pipeline, torch.device("cpu"), {})), tmp_path / "first")
+    K = first["prediction"]["intrinsics"]
+    source = folder_source(sequence, tmp_path / "first" / "frames", CONFIG, intrinsics=K)
+    second = run(job_of(sequence, source), tmp_path / "second")
+    assert second["metrics"] == first["metrics"]
+    for name in range(7, 13):
+        a, b = (read_frame(tmp_path / out / "frames" / f"{name}.npz") for out in ("first", "second"))
+        assert all(a[key].tobytes() == b[key].tobytes() for key in a)
 
 
 def test_an_ensemble_alternates(path, tmp_path):

@@ -125,9 +125,12 @@ def _report(summary: Mapping[str, Any], out: str) -> int:
     from ufmstar_torch.eval.summary import FINISHED, table
     from ufmstar_torch.eval.summary import INTERRUPTED as STOPPED
 
-    print(table(summary))
+    if summary["frames"]["done"]:
+        print(table(summary))
     made = [name for name, reason in summary["outputs"].items() if reason is None]
-    print("\n".join(f"no {name}: {reason}" for name, reason in summary["outputs"].items() if reason), end="")
+    for name, reason in summary["outputs"].items():
+        if reason is not None:
+            print(f"no {name}: {reason}")
     print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', 'depth/', 'sigma/', *made])}")
     told = f"ufmstar run: {summary['state']}: {summary['reason']}"
     if summary["state"] == FINISHED:

@@ -153,8 +153,8 @@ class SPGFConfig(_Checked):
 
 @dataclass(frozen=True)
 class UfMStarConfig(_Checked):
-    """Everything UfM* can be told. The defaults are the paper's, with three exceptions, each explained where it
-    stands: the pruning rule (``segment.prune``, docs/segmentation.md), ``regression`` and ``thickness_floor``.
+    """Everything UfM* can be told. The defaults are the paper's, with two exceptions, each explained where it
+    stands: the pruning rule (``segment.prune``, docs/segmentation.md) and ``regression``.
     """
 
     segment: SPGFConfig = field(default_factory=SPGFConfig)
@@ -173,8 +173,6 @@ class UfMStarConfig(_Checked):
     prior_mean: float = _number(0.0, "mu_0", "m^2", 0.0)
     # The paper's neighbourhood approximates the exact sum to save time, which our kernel does not need.
     regression: str = _choice("exact", "neighbourhood")
-    # Not in the paper, which is silent on thin surfaces: see ufmstar_torch.step.thickened.
-    thickness_floor: bool = True
     near_radius: float = _number(0.1, "r", "m", 0.0, open_low=True)
     far_radius: float = _number(0.5, "R", "m", 0.0, open_low=True)
     neighbourhood_sigmas: float = _number(2.0, "s", "1", 0.0, open_low=True)

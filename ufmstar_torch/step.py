@@ -6,7 +6,6 @@ float64, so large world coordinates never reach the float32 state, and component
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -244,7 +243,6 @@ def _read_out(
     pixels: Tensor | None,
 ) -> Regression:
     """Step 5 at every pixel, or at some; NaN where not valid."""
-    mixture_cam = thickened(mixture_cam, config, backend.floor_covariance)
     if pixels is None:
         result = backend.regress_image(mixture_cam, frame.depth, frame.intrinsics, config)
         valid = frame.valid
@@ -256,23 +254,6 @@ def _read_out(
     nan = torch.full_like(result.disagreement, torch.nan)
     features = torch.where(valid[..., None], result.features, nan[..., None])
     return replace(result, disagreement=torch.where(valid, result.disagreement, nan), features=features)
-
-
-def thickened(
-    mixture: GaussianMixture, config: UfMStarConfig, floor_covariance: Callable[..., Tensor]
-) -> GaussianMixture:
-    """The mixture as the regression sees it: no component thinner than SPGF resolves.
-
-    SPGF counts points within +- noise_floor of a plane to that plane; the variance across that slab is
-    noise_floor^2/3. A wall as flat as a network (or a renderer) likes it would otherwise explain nothing a few
-    centimetres off itself, and the prior would answer just where views disagree (docs/disagreement.md
-    has the measurement). Matching and fusion use the covariances as they are.
-    """
-    if not config.thickness_floor:
-        return mixture
-    slab = torch.full_like(mixture.weight, config.segment.noise_floor**2 / 3)
-    slab = torch.where(mixture.valid, slab, torch.zeros_like(slab))
-    return mixture.replace(covariance=floor_covariance(mixture.covariance, slab))
 
 
 def _average(

@@ -16,10 +16,9 @@ from ufmstar_torch.backend import select
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput, check_frame
-from ufmstar_torch.gaussian import floor_covariance
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression, regress, sample_pixels
-from ufmstar_torch.step import FrameStatistics, StepOutput, UfMStarState, step, thickened
+from ufmstar_torch.step import FrameStatistics, StepOutput, UfMStarState, step
 
 _MIXTURE = ("mean", "covariance", "weight", "disagreement", "count", "features")
 _STATE = (*_MIXTURE, "T_world_first", "started", "frames", "skipped", "smoothed")
@@ -256,8 +255,7 @@ class UfMStar(nn.Module):
                 T = invert_rigid(self.T_world_first)
                 local = torch.einsum("bij,bnj->bni", T[:, :3, :3], local.double()) + T[:, None, :3, 3]
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-            mixture = thickened(self.mixture.to(torch.float64), self.config, floor_covariance)
-            return regress(mixture, local.to(dtype), self.config)
+            return regress(self.mixture, local.to(dtype), self.config)
 
     # ---- the state ----
 

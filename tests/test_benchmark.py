@@ -1,0 +1,470 @@
+"""The benchmark: its arithmetic, its clocks, its rendered room, and a tiny run from end to end."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import fields
+
+import numba
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from layouts import write_tum
+
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.backend import TORCH, Backend
+from ufmstar_torch.eval import benchmark, synthetic
+from ufmstar_torch.eval.benchmark_frames import PosedDepth, RecordedSequence, RenderedRoom
+from ufmstar_torch.eval.benchmark_long import measure_long_run
+from ufmstar_torch.eval.benchmark_machine import available_cores, cpu_model, versions
+from ufmstar_torch.eval.benchmark_report import format_report
+from ufmstar_torch.eval.benchmark_step import build_up, components_in_view, memory
+from ufmstar_torch.eval.benchmark_timing import STAGES, StageClock, Stopwatch, paired_ratio, pinned_threads, spread
+from ufmstar_torch.models import FastDepth, FastDepthWidths
+
+SPREAD = {"median_ms", "iqr_ms", "q1_ms", "q3_ms", "min_ms", "count"}
+
+
+# ---- statistics ----
+
+
+def test_spread_of_known_values():
+    told = spread([5.0, 1.0, 2.0, 4.0, 3.0])
+    assert told == {"median_ms": 3.0, "iqr_ms": 2.0, "q1_ms": 2.0, "q3_ms": 4.0, "min_ms": 1.0, "count": 5}
+    assert spread([1.0, 2.0, 3.0, 4.0])["q1_ms"] == 1.75  # linear between the sorted values
+    assert spread([7.0])["iqr_ms"] == 0
+
+
+def test_one_outlier_does_not_move_the_median():
+    assert spread([1.0, 1.0, 1.0, 1.0, 1000.0])["median_ms"] == 1.0
+
+
+@given(st.lists(st.floats(0.01, 1e4), min_size=1, max_size=30), st.floats(0.1, 10))
+def test_spread_is_ordered_and_scales(times, factor):
+    told, scaled = spread(times), spread([factor * t for t in times])
+    assert told["min_ms"] <= told["q1_ms"] <= told["median_ms"] <= told["q3_ms"]
+    assert scaled["median_ms"] == pytest.approx(factor * told["median_ms"])
+    assert scaled["iqr_ms"] == pytest.approx(factor * told["iqr_ms"], abs=1e-9 * factor * max(times))
+
+
+def test_paired_ratio_cancels_a_common_slowdown():
+    quiet = paired_ratio([1.0, 2.0, 3.0], [2.0, 4.0, 6.0])
+    assert quiet == {"median": 0.5, "q1": 0.5, "q3": 0.5, "count": 3}
+    assert paired_ratio([1.0, 40.0, 3.0], [2.0, 80.0, 6.0])["median"] == 0.5
+
+
+@pytest.mark.parametrize(("a", "b"), [([], []), ([1.0], [1.0, 2.0])])
+def test_paired_ratio_needs_pairs(a, b):
+    with pytest.raises(ValueError, match="as many numerators"):
+        paired_ratio(a, b)
+
+
+def test_spread_needs_a_measurement():
+    with pytest.raises(ValueError, match="at least one"):
+        spread([])
+
+
+# ---- clocks ----
+
+
+def test_stopwatch_tells_waiting_from_computing():
+    watch = Stopwatch()
+    for _ in range(3):
+        assert watch.time("sleep", lambda x: (time.sleep(0.02), x)[1], 7) == 7
+    assert watch.spread("sleep")["min_ms"] >= 20
+    assert watch.spread("sleep")["cpu_median_ms"] < 15
+    watch.drop(2)
+    assert watch.spread("sleep")["count"] == 1
+
+
+def pretend(pauses):
+    """A backend whose functions only take time [s]."""
+
+    def taking(seconds):
+        return lambda *_: time.sleep(seconds)
+
+    names = [f.name for f in fields(Backend) if f.name != "name"]
+    return Backend("pretended", **{name: taking(pauses.get(name, 0)) for name in names})
+
+
+def test_every_moment_belongs_to_the_stage_that_needs_it():
+    clock = StageClock()
+    backend = clock.wrap(pretend({"spgf": 0.02, "regress_image": 0.03}))
+    assert backend.name == "pretended"
+    began = time.perf_counter()
+    clock.start()
+    clock.checked()
+    backend.spgf()
+    backend.floor_covariance()
+    backend.correspond()
+    backend.fuse()
+    time.sleep(0.04)  # appending happens outside the backend
+    backend.floor_covariance()
+    backend.regress_image()
+    clock.stop()
+    total = 1e3 * (time.perf_counter() - began)
+    told = clock.summary()
+    medians = {name: told["stages"][name]["median_ms"] for name in STAGES}
+    assert medians["segment"] >= 20
+    assert medians["append"] >= 40
+    assert medians["regress"] >= 30
+    assert min(medians.values()) >= 0
+    assert told["kernels"]["spgf"]["median_ms"] >= 20
+    assert told["stages_total"]["median_ms"] == pytest.approx(sum(medians.values()))
+    assert sum(medians.values()) == pytest.approx(total, abs=1)
+
+
+def test_another_order_of_the_stages_is_noticed():
+    clock = StageClock()
+    backend = clock.wrap(TORCH)
+    assert backend.spgf is not TORCH.spgf
+    assert TORCH.spgf.__module__ == "ufmstar_torch.segment", "the backend itself is left alone"
+    clock.start()
+    clock.checked()
+    with pytest.raises(RuntimeError, match="in this order"):
+        clock.stop()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_threads_are_pinned_and_restored(fails):
+    before = torch.get_num_threads(), numba.get_num_threads()
+    try:
+        with pinned_threads(1):
+            assert (torch.get_num_threads(), numba.get_num_threads()) == (1, 1)
+            if fails:
+                raise KeyError("anything")
+    except KeyError:
+        pass
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+
+
+@pytest.mark.parametrize("count", [0, -1, 10_000])
+def test_impossible_thread_counts(count):
+    before = torch.get_num_threads(), numba.get_num_threads()
+    with pytest.raises(ValueError, match="threads must be at"), pinned_threads(count):
+        pass
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+
+
+# ---- the rendered room ----
+
+
+def scene(size=96, boxes=25):
+    return synthetic.Room.furnished(boxes, seed=3), synthetic.intrinsics(size, size), size
+
+
+def points_in_world(depth, T, K):
+    v, u = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(depth)], axis=-1)
+    return (rays * depth[..., None]) @ T[:3, :3].T + T[:3, 3]
+
+
+def surface_distance(points, box):
+    """Distance [m] of points [..., 3] from the surface of a box [2, 3]."""
+    outside = np.maximum(np.maximum(box[0] - points, points - box[1]), 0)
+    inside = np.minimum(points - box[0], box[1] - points).min(-1)
+    return np.where((outside > 0).any(-1), np.linalg.norm(outside, axis=-1), inside)
+
+
+def test_every_pixel_lies_on_a_surface():
+    room, K, size = scene()
+    for T in synthetic.walk(4, period=4):
+        points = points_in_world(synthetic.render(room, T, K, size, size), T, K)
+        distances = [surface_distance(points, box) for box in (room.walls, *room.boxes)]
+        assert np.min(distances, axis=0).max() < 1e-9
+
+
+def test_nothing_stands_in_front_of_a_pixel():
+    room, K, size = scene(48)
+    for T in synthetic.walk(3, period=7):
+        points, origin = points_in_world(synthetic.render(room, T, K, size, size), T, K), T[:3, 3]
+        for share in np.linspace(0, 0.995, 60):
+            between = origin + share * (points - origin)
+            inside = ((room.boxes[:, None, None, 0] < between) & (between < room.boxes[:, None, None, 1])).all(-1)
+            assert not inside.any()
+
+
+def test_depth_warped_into_the_next_frame_agrees():
+    """Where both frames see a surface, its point has the depth that the other frame measured there."""
+    room, K, size = scene(160)
+    first, second = list(synthetic.walk(2, period=100))
+    a, b = (synthetic.render(room, T, K, size, size) for T in (first, second))
+    x, y, z = ((points_in_world(a, first, K) - second[:3, 3]) @ second[:3, :3]).transpose(2, 0, 1)
+    u, v = (np.rint(K[0, 0] * x / z + K[0, 2]).astype(int), np.rint(K[1, 1] * y / z + K[1, 2]).astype(int))
+    seen = (u >= 0) & (u < size) & (v >= 0) & (v < size)
+    error = np.abs(b[v[seen], u[seen]] - z[seen])
+    assert seen.mean() > 0.8
+    assert np.median(error) < 0.01  # the rounding to a pixel on slanted surfaces
+    assert (error < 0.05).mean() > 0.93, "the rest is hidden in one of the two"
+
+
+def test_the_window_of_a_box_loses_no_pixel():
+    room, K, size = scene(64)
+    for T in synthetic.walk(5, period=5):
+        brute = np.min(
+            [synthetic.render(synthetic.Room(room.walls, box[None]), T, K, size, size) for box in room.boxes], axis=0
+        )
+        np.testing.assert_array_equal(synthetic.render(room, T, K, size, size), brute)
+
+
+def test_a_wall_straight_ahead():
+    room = synthetic.Room(np.array([[-2.0, -1, -3], [2, 1, 5]]), np.zeros((0, 2, 3)))
+    T = synthetic.look((0, 0, 1), yaw=0)
+    np.testing.assert_allclose(synthetic.render(room, T, synthetic.intrinsics(9, 9, 10), 9, 9), 4.0)
+    sideways = synthetic.look((0, 0, 1), yaw=np.pi / 2)  # right: the wall at x = 2
+    np.testing.assert_allclose(synthetic.render(room, sideways, synthetic.intrinsics(9, 9, 10), 9, 9), 2.0)
+    down = synthetic.look((0, 0, 1), yaw=0, pitch=np.pi / 2)  # y points down: the floor at y = 1
+    np.testing.assert_allclose(synthetic.render(room, down, synthetic.intrinsics(9, 9, 10), 9, 9), 1.0)
+
+
+def test_poses_are_rotations_and_come_round_again():
+    poses = np.array(list(synthetic.walk(11, period=10)))
+    eye = np.broadcast_to(np.eye(3), (11, 3, 3))
+    np.testing.assert_allclose(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), eye, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1)
+    assert np.trace(poses[0, :3, :3].T @ poses[10, :3, :3]) > 1 + 2 * np.cos(np.radians(60))
+    assert np.abs(poses[0] - poses[10]).max() > 1e-3, "but no view comes back exactly"
+
+
+def test_flicker_has_the_size_it_says_and_is_smooth():
+    depth, rng = np.full((60, 80), 2.0), np.random.default_rng(0)
+    errors = np.array([synthetic.flicker(depth, 0.05, rng) / depth - 1 for _ in range(400)])
+    assert errors.std(axis=0).mean() == pytest.approx(0.05, rel=0.1)
+    assert np.abs(np.diff(errors, axis=1)).max() < 0.1 * np.abs(errors).max()
+    assert depth.max() == 2.0, "the argument is left alone"
+
+
+@pytest.mark.parametrize("position", [(9, 0, 0), (0, 3, 0)])
+def test_a_camera_outside_the_room(position):
+    room, K, size = scene(8)
+    with pytest.raises(ValueError, match="inside the room"):
+        synthetic.render(room, synthetic.look(position, 0), K, size, size)
+
+
+def test_the_walk_stays_free_of_the_boxes():
+    boxes = synthetic.Room.furnished(1000).boxes
+    positions = np.array([T[:3, 3] for T in synthetic.walk(1000, period=37)])
+    gap = np.maximum(boxes[:, 0] - positions[:, None], positions[:, None] - boxes[:, 1]).max(-1)
+    assert gap.min() > 0.3
+
+
+def test_impossible_rooms_and_walks():
+    with pytest.raises(ValueError, match="boxes"):
+        synthetic.Room.furnished(-1)
+    with pytest.raises(ValueError, match="period"):
+        list(synthetic.walk(3, period=0))
+
+
+def test_frames_are_the_same_for_the_same_seed():
+    a, b, c = (list(RenderedRoom(seed=s).frames(32, 3)) for s in (1, 1, 2))
+    assert torch.equal(a[2].depth, b[2].depth)
+    assert not torch.equal(a[2].depth, c[2].depth)
+    assert a[0].depth.shape == (1, 32, 32)
+    assert a[0].depth.dtype == torch.float32
+    assert a[0].T_world_cam.dtype == torch.float64
+
+
+# ---- what is counted ----
+
+
+def test_components_in_view_are_those_whose_mean_projects_inside():
+    ufm = UfMStar()
+    frame = next(iter(RenderedRoom().frames(64, 1)))
+    out = ufm(frame.depth, frame.T_world_cam, frame.intrinsics)
+    total = int(out.statistics.components)
+    assert components_in_view(ufm, frame) == total > 5, "the frame that made them sees them all"
+    behind = frame.T_world_cam @ torch.from_numpy(synthetic.look((0, 0, 0), np.pi))
+    assert components_in_view(ufm, PosedDepth(frame.depth, behind, frame.intrinsics)) == 0
+
+
+def test_memory_counts_components_slots_and_the_map():
+    ufm = UfMStar(UfMStarConfig(initial_capacity=256))
+    frame = next(iter(RenderedRoom().frames(64, 1)))
+    used = int(ufm(frame.depth, frame.T_world_cam, frame.intrinsics).statistics.components)
+    # mean 3, covariance 9, weight and disagreement 1 each in float32, and an int64 count
+    assert memory(ufm) == {
+        "bytes_per_component": 64,
+        "components": used,
+        "in_use": 64 * used,
+        "allocated": 64 * 256,
+        "moving_average": 4 * 64 * 64,
+    }
+
+
+def test_building_up_ends_at_the_number_in_view():
+    source = RenderedRoom(period=30)
+    ufm, frames, seen = build_up(source, UfMStarConfig(), size=48, in_view=5, history=60, rounds=2)
+    assert 20 <= seen < 60, "the mean over 20 frames decides"
+    assert int(ufm.frames) == seen
+    expected = list(source.frames(48, seen + 2))[seen:]
+    assert [torch.equal(a.depth, b.depth) for a, b in zip(frames, expected, strict=True)] == [True, True]
+    assert build_up(source, UfMStarConfig(), size=48, in_view=10**6, history=3, rounds=1)[2] == 3
+
+
+def test_machine_facts():
+    assert available_cores() >= 1
+    assert cpu_model().strip()
+    assert versions()["torch"] == torch.__version__.split("+")[0] or versions()["torch"] == torch.__version__
+    assert versions()["numpy"] == np.__version__
+
+
+# ---- end to end ----
+
+
+def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
+    path = tmp_path / "bench.json"
+    words = "--sizes 64 --frames 3 --history 4 --in-view 5 --backends numba torch --skip-compile --threads 1"
+    before = torch.get_num_threads(), numba.get_num_threads()
+    assert benchmark.main([*words.split(), "--json", str(path)]) == 0
+    assert (torch.get_num_threads(), numba.get_num_threads()) == before
+    report = json.loads(path.read_text())
+    assert report["settings"]["threads"] == 1
+    assert report["settings"]["config"]["eta"] == 0.5
+    assert report["settings"]["source"]["kind"] == "rendered room"
+    assert set(report["versions"]) >= {"ufmstar_torch", "torch", "numba", "numpy", "python"}
+    assert set(report["hardware"]) >= {"cpu", "cores", "platform", "numba_threading_layer"}
+    assert set(report["load_average"]) == {"before", "after"}
+    assert [(r["size"], r["backend"]) for r in report["results"]] == [(64, "numba"), (64, "torch")]
+    for result in report["results"]:
+        check_result(result)
+    assert {row["met"] for row in report["targets"]} == {None}, "targets are for 224 x 224"
+    told = capsys.readouterr()
+    assert "whole step" in told.out
+    assert "64 x 64, numba" in told.err
+
+
+def check_result(result):
+    assert set(result["stages"]) == set(STAGES)
+    assert set(result["kernels"]) == {"spgf", "floor_covariance", "correspond", "fuse", "regress_image"}
+    timed = [*result["stages"].values(), *result["kernels"].values(), result["step"], result["mean_uncertainty"]]
+    for times in timed:
+        assert set(times) >= SPREAD
+        assert times["count"] == result["frames"]["timed"] == 3
+        assert 0 <= times["min_ms"] <= times["median_ms"]
+    assert result["mean_uncertainty"]["pixels"] == 1000
+    assert set(result["networks"]) == {"fastdepth", "resnet50"}
+    assert set(result["ratios"]) == {"step/fastdepth", "step/resnet50", "mean_uncertainty/step"}
+    assert result["networks_about"]["fastdepth"]["size"] == 64
+    # torchvision's ResNet50 without its classifier
+    assert result["networks_about"]["resnet50"]["parameters"] == 25_557_032 - (2048 * 1000 + 1000)
+    assert result["counts"]["in_view"]["min"] <= result["counts"]["components"]["max"]
+    assert result["memory"]["in_use"] <= result["memory"]["allocated"]
+    assert result["history"] == 4
+
+
+def test_backends_see_the_same_mixture():
+    options = benchmark.parse(["--sizes", "48", "--frames", "2", "--history", "3", "--skip-compile", "--threads", "1"])
+    numba_run, torch_run = benchmark.run_benchmark(options)["results"]
+    assert numba_run["counts"]["segments"]["max"] > 3
+    assert abs(numba_run["memory"]["components"] - torch_run["memory"]["components"]) < 20
+
+
+def test_a_long_run_compares_the_same_room_early_and_late():
+    run = measure_long_run(RenderedRoom(period=10), UfMStarConfig(), size=48, frames=40, early=10, window=10)
+    assert (run["early"]["frames"], run["late"]["frames"]) == ([6, 15], [31, 40])
+    assert run["ratio"] == run["late"]["step_median_ms"] / run["early"]["step_median_ms"]
+    assert [row["frames"] for row in run["rows"]] == [[1, 10], [11, 20], [21, 30], [31, 40]]
+    components = [row["components"] for row in run["rows"]]
+    assert components == sorted(components)
+    assert components[-1] == run["memory"]["components"]
+    with pytest.raises(ValueError, match="at least 25 frames"):
+        measure_long_run(RenderedRoom(), UfMStarConfig(), size=48, frames=24, early=10, window=10)
+
+
+def report_with(**changes):
+    result = {
+        "size": 224,
+        "backend": "numba",
+        "kernels": {"spgf": {"median_ms": 1.0}},
+        "step": {"median_ms": 12.0},
+        "memory": {"in_use": 20_000},
+        "ratios": {"step/resnet50": {"median": 0.1}},
+    }
+    return {"results": [result | changes.pop("result", {})], "long_run": None, **changes}
+
+
+def test_targets_are_told_as_met_or_missed():
+    told = {row["name"]: (row["value"], row["met"]) for row in benchmark.targets(report_with())}
+    assert told == {
+        "spgf_ms": (1.0, True),
+        "step_ms": (12.0, False),
+        "step/resnet50": (0.1, True),
+        "components_bytes": (20_000, True),
+        "long_run_ratio": (None, None),
+    }
+    long_run = {"ratio": 1.5, "memory": {"in_use": 50_000}}
+    told = {row["name"]: row["met"] for row in benchmark.targets(report_with(long_run=long_run))}
+    assert told["long_run_ratio"] is False
+    assert told["components_bytes"] is False, "a room is what the long run has seen"
+    assert benchmark.targets(report_with(result={"backend": "torch"}))[0]["met"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--frames", "0"], "--frames"),
+        (["--in-view", "0"], "--in-view"),
+        (["--sizes", "8"], "--sizes"),
+        (["--threads", "-2"], "threads"),
+        (["--sequence", "nowhere"], "nowhere"),
+        (["--weights", "nothing.onnx"], "nothing.onnx"),
+    ],
+)
+def test_arguments_that_do_not_fit(words, told, capsys):
+    assert benchmark.main([*words, "--skip-compile"]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_busy_machine_is_mentioned():
+    machine = {"cpu": "c", "cores": 2, "platform": "p"}
+    report = {
+        "hardware": machine,
+        "load_average": {"before": 3.0, "after": None},
+        "versions": {},
+        "settings": {"threads": 2},
+        "compilation": None,
+        "results": [],
+        "long_run": None,
+        "targets": [],
+    }
+    assert "the machine was busy" in format_report(report)
+    assert "the machine was busy" not in format_report(report | {"load_average": {"before": 0.1, "after": 1.0}})
+
+
+# ---- recorded sequences ----
+
+
+def test_a_recorded_sequence_gives_square_frames(tmp_path):
+    path, truth = write_tum(tmp_path, frames=4)  # 64 x 48 pixels
+    source = RecordedSequence(path)
+    assert source.available == 4
+    frames = list(source.frames(48, 3))
+    assert [tuple(f.depth.shape) for f in frames] == [(1, 48, 48)] * 3
+    expected = truth.K - np.array([[0, 0, 8], [0, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(frames[0].intrinsics, expected)
+    np.testing.assert_allclose(frames[0].depth[0], truth.depths[0][:, 8:56], atol=2e-4)
+    np.testing.assert_allclose(frames[2].T_world_cam, truth.T_world_cam[2], atol=1e-6)
+    assert str(tmp_path) not in json.dumps(source.describe()), "a report does not tell where files lie"
+
+
+def test_a_network_predicts_the_depth_of_a_sequence(tmp_path):
+    path, truth = write_tum(tmp_path, frames=2)
+    network = FastDepth(FastDepthWidths((8,) * 14, (8,) * 5)).eval()
+    frame = next(iter(RecordedSequence(path, network).frames(48, 1)))
+    assert frame.depth.shape == (1, 48, 48)
+    # 250 px high, centre of 304 x 228, then 48 (by way of the network's 224)
+    fx, fy = truth.K[0, 0] * 333 / 64 * 48 / 304, truth.K[1, 1] * 250 / 48 * 48 / 228
+    np.testing.assert_allclose(torch.diagonal(frame.intrinsics), [fx, fy, 1])
+
+
+def test_a_sequence_that_is_too_short(tmp_path):
+    path, _ = write_tum(tmp_path, frames=5)
+    source = RecordedSequence(path)
+    with pytest.raises(ValueError, match="there are 5"):
+        build_up(source, UfMStarConfig(), size=48, in_view=5, history=9, rounds=5)
+    assert build_up(source, UfMStarConfig(), size=48, in_view=10**6, history=9, rounds=3)[2] == 2
+    with pytest.raises(ValueError, match="there are 5"):
+        measure_long_run(source, UfMStarConfig(), size=48, frames=40, early=10, window=10)
