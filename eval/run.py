@@ -298,14 +298,16 @@ def _outputs(
             scales = common_scales(finished)
         if job.sheet:
             draw_sheet(finished, scales, f"{job.sequence.name}: {_counts(folder, job)}")
-        made["contact_sheet.png"] = None if job.sheet else "not asked for"
+            made["contact_sheet.png"] = None
         for drawn in draw_video(finished, scales) if job.video else ():
             progress(Progress("pictures", drawn, len(done), None, 0))
             if stop():
                 raise _Stopped
-        made["preview.mp4"] = None if job.video else "not asked for"
+        if job.video:
+            made["preview.mp4"] = None
     except ImportError as error:  # an optional package; the frames are what a run is for
-        made |= {name: str(error) for name in ("contact_sheet.png", "preview.mp4") if name not in made}
+        wanted = {"contact_sheet.png": job.sheet, "preview.mp4": job.video}
+        made |= {name: str(error) for name, asked in wanted.items() if asked and name not in made}
     return made
 
 

@@ -94,6 +94,7 @@ def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: Sequenc
         config,
         variance=options["variance"],
         scale=options["depth_scale"],
+        intrinsics=parse_intrinsics(options["map_intrinsics"], "--map-intrinsics"),
         size=size,
         device=device,
     )

@@ -47,6 +47,12 @@ _GROUPS: dict[str, tuple[tuple[str, Any, Any, str], ...]] = {
         ("--depth", str, None, "folder of predicted maps (16-bit PNG, EXR, npy); 'self': the sequence's own depth"),
         ("--variance", str, None, "folder of variance maps [m^2] that belong to them"),
         ("--depth-scale", float, None, "metres per unit of the maps in the folder"),
+        (
+            "--map-intrinsics",
+            _WORDS,
+            [],
+            "of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]",
+        ),
         ("--size", str, None, "HxW, to which the maps are brought"),
     ),
     "run": (
@@ -117,7 +123,7 @@ def check_options(options: Mapping[str, Any]) -> None:
     UfMStarConfig.from_dict(options["ufm"])
     parse_slice(options["frames"])
     parse_size(options["size"])
-    for name in ("intrinsics", "depth_intrinsics"):
+    for name in ("intrinsics", "depth_intrinsics", "map_intrinsics"):
         parse_intrinsics(options[name], f"--{name.replace('_', '-')}")
     model, depth = options["model"], options["depth"]
     if (model is None) == (depth is None):
@@ -125,9 +131,10 @@ def check_options(options: Mapping[str, Any]) -> None:
         raise ValueError(f"the depth must come from one place: give {wanted}" + (", not both" if model else ""))
     if model is not None and not options["weights"]:
         raise ValueError(f"--model {model} needs --weights FILE")
+    of_folder = [name for name in ("variance", "depth_scale", "map_intrinsics") if options[name] not in (None, [])]
     needs_model = [name for name in ("weights", "spec") if options[name] and model is None]
-    needs_depth = [name for name in ("variance", "depth_scale", "size") if options[name] is not None and depth is None]
-    needs_folder = [name for name in ("variance", "depth_scale") if options[name] is not None and depth in OWN_DEPTH]
+    needs_depth = [*of_folder, *(["size"] if options["size"] is not None else [])] if depth is None else []
+    needs_folder = of_folder if depth in OWN_DEPTH else []
     for names, missing in ((needs_model, "--model"), (needs_depth, "--depth"), (needs_folder, "--depth DIR")):
         if names:
             raise ValueError(f"--{names[0].replace('_', '-')} goes with {missing} only")

@@ -18,8 +18,9 @@ from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.run_clock import Stopwatch
-from ufmstar_torch.eval.sequences.depth_folder import DepthFolder
+from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
+from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
 from ufmstar_torch.prediction import DepthPrediction
@@ -210,36 +211,70 @@ def folder_source(
     *,
     variance: str | Path | None = None,
     scale: float | None = None,
+    intrinsics: IntrinsicsLike | None = None,
     size: Size | None = None,
     device: str = "cpu",
 ) -> MapSource:
     """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
 
-    The maps show the whole image: their intrinsics are the image's, scaled by the sizes' ratio.
+    Without ``intrinsics``, the maps must show the whole image; theirs are then the image's, scaled by the
+    sizes' ratio.
+
+    Args:
+        sequence: the frames.
+        folder, scale, variance: as :class:`DepthFolder` takes them.
+        config: of UfM*.
+        intrinsics: of the maps [px], where the network saw a part of the image.
+        size, device: see :class:`MapSource`.
 
     Raises:
         NotADirectoryError: no such folder.
-        ValueError: no maps, maps that fit no frame or have another aspect ratio than the images.
+        ValueError: no maps, maps that fit no frame, or (the first one) of another aspect ratio than the images.
     """
     maps = DepthFolder(folder, scale, variance).for_frames(sequence.names, sequence.names_on_disk)
+    K_given = None if intrinsics is None else read_intrinsics(intrinsics)
 
     def read(frame: Frame) -> PredictedMap:
         depth, spread = maps[frame.index]
+        if K_given is not None:
+            return PredictedMap(depth, spread, K_given)
         try:
             K = scaled_to_map(frame.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
         except ValueError as error:
-            raise FrameError(maps.depth_files[frame.index], f"does not show the whole image: {error}") from error
+            raise FrameError(maps.depth_files[frame.index], _cropped(sequence, depth)) from error
         return PredictedMap(depth, spread, K)
 
+    _check_first(sequence, maps, K_given is not None)
     files = (*maps.depth_files, *maps.variance_files)
     listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
     identity = {
         "maps": {"count": len(maps.depth_files), "names_and_sizes": hashlib.sha256(listing.encode()).hexdigest()},
         "with_variance": variance is not None,
         "scale": scale,
+        "intrinsics": K_given,
         "size": size,
     }
     return MapSource(read, config, torch.device(device), identity, size=size)
+
+
+def _check_first(sequence: Sequence, maps: DepthMaps, any_shape: bool) -> None:
+    """Raises ValueError at once where the first map has another shape than the images, as then all have."""
+    try:
+        depth, _ = maps[0]
+        if not any_shape:
+            scaled_to_map(sequence.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
+    except FrameError:  # counted when its turn comes
+        return
+    except ValueError as error:
+        raise ValueError(f"{maps.depth_files[0]}: {_cropped(sequence, depth)}") from error
+
+
+def _cropped(sequence: Sequence, depth: np.ndarray) -> str:
+    height, width = sequence.image_size or (0, 0)
+    return (
+        f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the whole "
+        "image, so its own intrinsics must be given"
+    )
 
 
 def own_depth_source(config: UfMStarConfig, *, size: Size | None = None, device: str = "cpu") -> MapSource:
