@@ -50,15 +50,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, help="write the report here")
 
 
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options of the benchmark from arguments without the program's name; None = the process's."""
+    parser = argparse.ArgumentParser(prog="ufmstar bench", description=__doc__)
+    add_arguments(parser)
+    return parser.parse_args(argv)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the benchmark, print its table and write its JSON; returns 0, or 2 for arguments that do not fit.
 
     Args:
         argv: arguments without the program's name; None = those of the process.
     """
-    parser = argparse.ArgumentParser(prog="ufmstar bench", description=__doc__)
-    add_arguments(parser)
-    options = parser.parse_args(argv)
+    options = parse(argv)
     try:
         report = run_benchmark(options, progress=lambda text: print(text, file=sys.stderr, flush=True))
     except (ValueError, FileNotFoundError, ModuleNotFoundError) as error:
@@ -93,13 +98,9 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
     from ufmstar_torch.eval.benchmark_compile import measure_compilation
     from ufmstar_torch.eval.benchmark_long import measure_long_run
 
-    for name in ("frames", "boxes", "history", "in_view"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
-    if min(options.sizes) < 16:
-        raise ValueError(f"--sizes must be at least 16 pixels, got {options.sizes}")
+    _check(options)
     config = UfMStarConfig()
-    threads = options.threads or machine.available_cores()
+    threads = machine.available_cores() if options.threads is None else options.threads
     report: dict[str, Any] = {
         "schema": 1,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -125,6 +126,14 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
     report["load_average"]["after"] = machine.load_average()
     report["targets"] = targets(report)
     return report
+
+
+def _check(options: argparse.Namespace) -> None:
+    for name in ("frames", "boxes", "history", "in_view"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
+    if min(options.sizes) < 16:
+        raise ValueError(f"--sizes must be at least 16 pixels, got {options.sizes}")
 
 
 def _inputs(options: argparse.Namespace) -> tuple[Any, Any]:

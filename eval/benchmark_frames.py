@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ufmstar_torch.eval import synthetic
+from ufmstar_torch.eval.sequences import Sequence
 from ufmstar_torch.models import FastDepth, Preprocess
 
 
@@ -29,12 +31,29 @@ class PosedDepth:
     intrinsics: Tensor
 
 
+class FrameSource(Protocol):
+    """Where frames come from.
+
+    Attributes:
+        available: how many there are, None = as many as one likes.
+    """
+
+    @property
+    def available(self) -> int | None: ...
+
+    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
+        """The first ``count`` frames at size x size pixels, or fewer where there are not so many."""
+
+    def describe(self) -> dict[str, object]:
+        """What it is, for the report."""
+
+
 @dataclass(frozen=True)
 class RenderedRoom:
     """Frames of a room with things in it, whose depth flickers as a network's does.
 
     Attributes:
-        boxes: number of things; 40 give some 100 components in view at 224 and 518 pixels.
+        boxes: number of things.
         period: frames per turn of the camera.
         flicker: standard deviation of the smooth relative error of the depth.
         seed: of the room and of the flicker.
@@ -44,6 +63,11 @@ class RenderedRoom:
     period: int = 100
     flicker: float = 0.03
     seed: int = 0
+
+    @property
+    def available(self) -> int | None:
+        """None: it goes on for ever."""
+        return None
 
     def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
         """The first ``count`` frames at size x size pixels."""
@@ -56,7 +80,7 @@ class RenderedRoom:
 
     def describe(self) -> dict[str, object]:
         """The settings, for the report."""
-        return {"kind": "rendered room", **self.__dict__}
+        return {"kind": "rendered room", **asdict(self)}
 
 
 @dataclass(frozen=True)
@@ -71,22 +95,23 @@ class RecordedSequence:
     path: Path
     network: FastDepth | None = None
 
+    @property
+    def available(self) -> int | None:
+        """The number of its frames."""
+        return len(self._open())
+
     def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
         """The first ``count`` frames, cropped to the centre and resized to size x size pixels.
 
         Raises:
-            ValueError: there are fewer frames, or they have no depth maps and no network predicts any.
+            ValueError: they have no depth maps and no network predicts any.
         """
-        from ufmstar_torch.eval.sequences import open_sequence
-
-        sequence = open_sequence(self.path)
-        if len(sequence) < count:
-            raise ValueError(f"the benchmark needs {count} frames of size {size}, {self.path} has {len(sequence)}")
+        sequence = self._open()
         if self.network is None and sequence.without_depth:
             raise ValueError(
                 f"{self.path} has frames without a depth map: give weights to predict depth from the images"
             )
-        for index in range(count):
+        for index in range(min(count, len(sequence))):
             frame = sequence[index]
             T = torch.from_numpy(frame.T_world_cam)
             if self.network is None:
@@ -100,7 +125,12 @@ class RecordedSequence:
     def describe(self) -> dict[str, object]:
         """What was read, for the report; the folder's name only, not where it lies on this machine."""
         depth = "of the sequence" if self.network is None else "predicted by FastDepth"
-        return {"kind": "recorded sequence", "name": Path(self.path).name, "depth": depth}
+        return {"kind": "recorded sequence", "name": self.path.name, "depth": depth}
+
+    def _open(self) -> Sequence:
+        from ufmstar_torch.eval.sequences import open_sequence
+
+        return open_sequence(self.path)
 
 
 def _square(depth: Tensor, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDepth:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.eval.benchmark_step import FrameSource, components_in_view, memory
+from ufmstar_torch.eval.benchmark_frames import FrameSource
+from ufmstar_torch.eval.benchmark_step import components_in_view, memory
 from ufmstar_torch.eval.benchmark_timing import Stopwatch
 
 
@@ -25,11 +26,13 @@ def measure_long_run(
         and a row per ``window`` frames with times and numbers of components.
 
     Raises:
-        ValueError: the early and the last window would overlap.
+        ValueError: the early and the last window would overlap, or the source has fewer frames.
     """
     start = max(0, early - window // 2)
     if frames < start + 2 * window:
         raise ValueError(f"a long run needs at least {start + 2 * window} frames for two windows, got {frames}")
+    if source.available is not None and source.available < frames:
+        raise ValueError(f"a long run of {frames} frames was asked for, there are {source.available}")
     ufm, watch = UfMStar(config), Stopwatch()
     counts: dict[str, list[int]] = {"components": [], "in_view": [], "segments": [], "matched": [], "new": []}
     for frame in source.frames(size, frames):

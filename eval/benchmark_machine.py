@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -48,10 +49,8 @@ def threading_layer() -> str | None:
     """What runs numba's parallel loops, None before the first of them has run or without numba."""
     if find_spec("numba") is None:
         return None
-    import numba
-
     try:
-        return numba.threading_layer()
+        return str(import_module("numba").threading_layer())
     except ValueError:  # numba's way to say that nothing has run yet
         return None
 

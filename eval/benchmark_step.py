@@ -5,10 +5,10 @@ from __future__ import annotations
 import copy
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.backend import select
 from ufmstar_torch.camera import focal_and_centre, relative_pose
-from ufmstar_torch.eval.benchmark_frames import PosedDepth
+from ufmstar_torch.eval.benchmark_frames import FrameSource, PosedDepth
 from ufmstar_torch.eval.benchmark_timing import StageClock, Stopwatch
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.models import FastDepth
@@ -25,14 +25,6 @@ from ufmstar_torch.models.fastdepth import MULTIPLE
 from ufmstar_torch.step import UfMStarState, step
 
 Call = Callable[[PosedDepth], Any]
-
-
-class FrameSource(Protocol):
-    """Anything that yields the first ``count`` frames at size x size pixels and can say what it is."""
-
-    def frames(self, size: int, count: int) -> Iterator[PosedDepth]: ...
-
-    def describe(self) -> dict[str, object]: ...
 
 
 @dataclass(frozen=True)
@@ -64,7 +56,13 @@ def build_up(
 
     Returns:
         The module, the ``rounds`` frames that follow, and how many it has seen.
+
+    Raises:
+        ValueError: the source has not more than ``rounds`` frames.
     """
+    if source.available is not None and source.available <= rounds:
+        raise ValueError(f"{rounds} frames are timed and some must come before them, there are {source.available}")
+    history = history if source.available is None else min(history, source.available - rounds)
     ufm = UfMStar(config.replace(backend="auto"))
     frames = source.frames(size, history + rounds)
     recent: deque[int] = deque(maxlen=20)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -69,21 +70,20 @@ def pinned_threads(count: int) -> Iterator[None]:
     """
     if count < 1:
         raise ValueError(f"threads must be at least 1, got {count}")
-    numba = None
-    if find_spec("numba") is not None:
-        import numba
-    before, before_numba = torch.get_num_threads(), numba and numba.get_num_threads()
+    numba: Any = import_module("numba") if find_spec("numba") is not None else None
     if numba is not None and count > numba.config.NUMBA_NUM_THREADS:
         raise ValueError(f"threads must be at most numba's {numba.config.NUMBA_NUM_THREADS}, got {count}")
+    before, before_numba = torch.get_num_threads(), numba and numba.get_num_threads()
     try:
-        torch.set_num_threads(count)
+        # torch last: where numba's loops run on OpenMP, setting its number sets torch's as well.
         if numba is not None:
             numba.set_num_threads(count)
+        torch.set_num_threads(count)
         yield
     finally:
-        torch.set_num_threads(before)
         if numba is not None:
             numba.set_num_threads(before_numba)
+        torch.set_num_threads(before)
 
 
 @dataclass
@@ -126,46 +126,50 @@ class StageClock:
     check: the checks of the frame's input. segment: SPGF and the floor of its covariances. correspond:
     the mixture into the camera frame, and the matching. fuse: making room, the segments into the first
     camera's frame, and the fusion. append: the new components, and the mixture into the camera frame.
-    regress: the dense regression alone. average: masks, moving average, statistics, the new state.
+    regress: the mixture made ready, and the dense regression. average: masks, moving average, statistics,
+    the new state.
     """
 
     def __init__(self) -> None:
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
         self.kernels: dict[str, list[float]] = {name: [] for name in _TIMED}
-        self._begin: dict[str, float] = {}
-        self._end: dict[str, float] = {}
+        self._calls: list[tuple[str, float, float]] = []
+        self._start = self._checked = 0.0
 
     def wrap(self, backend: Backend) -> Backend:
         """The same backend, every function of which notes when it begins and ends."""
-        return replace(backend, **{name: self._noted(name, getattr(backend, name)) for name in _TIMED})
+        noted: dict[str, Any] = {name: self._noted(name, getattr(backend, name)) for name in _TIMED}
+        return replace(backend, **noted)
 
     def start(self) -> None:
         """A step begins, with its check."""
-        self._begin, self._end = {"step": time.perf_counter()}, {}
+        self._calls = []
+        self._start = time.perf_counter()
 
     def checked(self) -> None:
         """The check is done."""
-        self._end["check"] = time.perf_counter()
+        self._checked = time.perf_counter()
 
     def stop(self) -> None:
-        """The step is done: add the time of every stage [ms].
+        """The step is done: add the time of every stage and of every kernel [ms].
 
         Raises:
-            RuntimeError: a function of the backend was not called since ``start``.
+            RuntimeError: the step did not call its backend's functions in the order of the stages.
         """
-        self._end["step"] = time.perf_counter()
-        missing = [name for name in _TIMED if name not in self._end]
-        if missing:
-            raise RuntimeError(f"the step did not call {', '.join(missing)} of its backend")
-        end, begin = self._end, self._begin
+        stop = time.perf_counter()
+        names = [name for name, _, _ in self._calls]
+        if list(dict.fromkeys(names)) != list(_TIMED):
+            raise RuntimeError(f"expected the step to call {', '.join(_TIMED)} first in this order, got {names}")
+        end = {name: last for name, _, last in reversed(self._calls)}  # of the first call
+        after_fusion = self._calls[names.index("fuse") + 1][1]
         edges = (
-            begin["step"], end["check"], end["floor_covariance"], end["correspond"], end["fuse"],
-            begin["regress_image"], end["regress_image"], end["step"],
+            self._start, self._checked, end["floor_covariance"], end["correspond"], end["fuse"], after_fusion,
+            end["regress_image"], stop,
         )  # fmt: skip
-        for name, start, stop in zip(STAGES, edges[:-1], edges[1:], strict=True):
-            self.stages[name].append(1e3 * (stop - start))
-        for name in _TIMED:
-            self.kernels[name].append(1e3 * (end[name] - begin[name]))
+        for name, low, high in zip(STAGES, edges[:-1], edges[1:], strict=True):
+            self.stages[name].append(1e3 * (high - low))
+        for kernel in _TIMED:
+            self.kernels[kernel].append(1e3 * sum(high - low for name, low, high in self._calls if name == kernel))
 
     def drop(self, count: int) -> None:
         """Forget the first ``count`` steps: the warm-up."""
@@ -173,7 +177,7 @@ class StageClock:
             del times[:count]
 
     def summary(self) -> Mapping[str, Any]:
-        """Spread of every stage, of every kernel within its stage, and of the steps' sums."""
+        """Spread of every stage, of every kernel (all its calls in a step), and of the steps' sums."""
         totals = np.sum([self.stages[name] for name in STAGES], axis=0)
         return {
             "stages": {name: spread(times) for name, times in self.stages.items()},
@@ -183,9 +187,9 @@ class StageClock:
 
     def _noted(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def noted(*args: Any, **kwargs: Any) -> Any:
-            self._begin[name] = time.perf_counter()
+            begin = time.perf_counter()
             result = function(*args, **kwargs)
-            self._end[name] = time.perf_counter()
+            self._calls.append((name, begin, time.perf_counter()))
             return result
 
         return noted
