@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 
+import pytest
+
 import ufmstar_torch
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.segment import spgf
@@ -24,8 +26,12 @@ def names(function) -> list[str]:
 
 
 def test_public_names():
-    public = {n for n in vars(ufmstar_torch) if n[0].isupper()}
-    assert public == PUBLIC
+    assert set(ufmstar_torch.__all__) == PUBLIC
+    assert set(dir(ufmstar_torch)) >= PUBLIC
+    for name in PUBLIC:
+        assert getattr(ufmstar_torch, name).__name__ == name
+    with pytest.raises(AttributeError, match="UfMStarr"):
+        _ = ufmstar_torch.UfMStarr
     assert ufmstar_torch.__version__ == "0.1.0"
 
 

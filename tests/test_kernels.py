@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import threading
 import warnings
@@ -17,7 +19,7 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig, backend, gaussian
 from ufmstar_torch.correspond import correspond
 from ufmstar_torch.fuse import fuse
-from ufmstar_torch.kernels import correspond_cpu, fuse_cpu
+from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu
 
 SIZE = (48, 64)
 K = torch.tensor(scenes.intrinsics(*SIZE))
@@ -132,3 +134,34 @@ def test_importing_the_package_leaves_the_warnings_alone():
     before = list(warnings.filters)
     __import__("ufmstar_torch.kernels.regress_cpu")
     assert list(warnings.filters) == before
+
+
+@pytest.mark.parametrize("config", [UfMStarConfig(), UfMStarConfig(regression="neighbourhood")])
+def test_threads_share_the_image_and_leave_torchs_number_alone(config):
+    m = mixture(2, 20, 3, features=1)
+    K = torch.tensor(scenes.intrinsics(200, 300)).expand(2, 3, 3)
+    depth = torch.tensor(scenes.render(scenes.tour(8)[1], K[0].numpy(), 200, 300)).expand(2, 200, 300)
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(regress_cpu.regress_image(m, depth, K, config))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert torch.equal(other.disagreement, results[0].disagreement)
+        assert torch.equal(other.features, results[0].features)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_can_use_the_kernels():
+    code = (
+        "import multiprocessing as mp, torch; from ufmstar_torch import UfMStar\n"
+        "def step(_): return float(UfMStar()(torch.full((1, 160, 160), 2.0), torch.eye(4), K).depth.mean())\n"
+        "K = torch.tensor([[100.0, 0, 80], [0, 100, 80], [0, 0, 1]])\n"
+        "step(0); pool = mp.get_context('fork').Pool(1); print(pool.map(step, [0])); pool.close(); pool.join()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "[2.0]", done.stderr

@@ -13,7 +13,18 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {"core": 0, "models": 1, "eval": 2, "train": 3}
-HEAVY = ("lightning", "torchvision", "kornia", "matplotlib", "torchmetrics", "scipy", "cv2", "onnxruntime", "numba")
+HEAVY = (
+    "torch",
+    "lightning",
+    "torchvision",
+    "kornia",
+    "matplotlib",
+    "torchmetrics",
+    "scipy",
+    "cv2",
+    "onnxruntime",
+    "numba",
+)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "fuse", "regress", "mixture", "step", "frame")
 

@@ -140,7 +140,7 @@ def _report(summary: Mapping[str, Any], out: str) -> int:
 
 
 def _set_threads(count: int | None) -> None:
-    """CPU threads of torch and of the compiled kernels.
+    """CPU threads of torch, and with it of the compiled kernels.
 
     Raises:
         ValueError: not a positive number.
@@ -151,13 +151,6 @@ def _set_threads(count: int | None) -> None:
         raise ValueError(f"--threads must be at least 1, got {count}")
     import torch
 
-    try:
-        import numba
-    except ImportError:  # the torch reference serves then
-        pass
-    else:
-        # First: when numba starts its threads, OpenMP's number, which is torch's as well, becomes all there are.
-        numba.set_num_threads(min(count, numba.get_num_threads()))
     torch.set_num_threads(count)
 
 

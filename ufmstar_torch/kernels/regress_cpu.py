@@ -16,11 +16,12 @@ from the camera, and nothing to a far outlier among its pixels either.
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange, types
+from numba import njit, types
 from numba.extending import overload
 from torch import Tensor
 
@@ -29,13 +30,13 @@ from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
 
 compiled: Any = njit(cache=True, nogil=True)
-compiled_parallel: Any = njit(cache=True, nogil=True, parallel=True)
 
 # Share of the denominator that culling may leave out at each of the two levels: about the rounding of a
 # sum in the dtype, so that culling is no coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
 
 _TILE = 16  # pixels; 256 points fill vector registers and still lie close together
+_SHARE = 128 * 128  # pixels; below that a thread costs more than it saves
 _BLOCK = 4  # tiles; a block of 64 x 64 pixels is culled first
 _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 
@@ -55,12 +56,31 @@ def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tenso
         mixture_cam.disagreement.detach().double().contiguous().numpy(),
         mixture_cam.features.detach().double().contiguous().numpy(),
     )
+    prior = (config.prior_weight, config.prior_mean)
     if config.regression == "exact":
-        _exact(*arguments, config.prior_weight, config.prior_mean, EPSILON[depth.dtype], maps, features)
+        _share_out(_exact, *arguments, *prior, EPSILON[depth.dtype], maps, features)
     else:
         radii = (config.neighbourhood_sigmas, config.near_radius, config.far_radius)
-        _neighbourhood(*arguments, config.prior_weight, config.prior_mean, *radii, maps, features)
+        _share_out(_neighbourhood, *arguments, *prior, *radii, maps, features)
     return Regression(torch.from_numpy(maps), torch.from_numpy(features))
+
+
+def _share_out(kernel: Any, *arguments: Any) -> None:
+    """Run ``kernel`` on as many threads as torch may use, each on its share of the image.
+
+    Threads of our own and not numba's parallel loops: those start OpenMP, which puts torch's number of
+    threads back to all cores, and which a forked process cannot use. The kernels release the GIL.
+    """
+    depth = arguments[0]
+    shares = max(1, min(torch.get_num_threads(), depth[0].size // _SHARE))
+    if shares == 1:
+        kernel(*arguments, 0, 1)
+        return
+    with ThreadPoolExecutor(shares - 1) as pool:
+        others = [pool.submit(kernel, *arguments, first, shares) for first in range(1, shares)]
+        kernel(*arguments, 0, shares)
+        for other in others:
+            other.result()
 
 
 @compiled
@@ -71,11 +91,12 @@ def _prepare(mean, covariance, weight):
     log_peak = np.empty(index.size)
     for i in range(index.size):
         S = covariance[index[i]]
-        l00 = math.sqrt(S[0, 0])
+        least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # fusion keeps pivots far above it
+        l00 = math.sqrt(max(S[0, 0], least))
         l10, l20 = S[1, 0] / l00, S[2, 0] / l00
-        l11 = math.sqrt(S[1, 1] - l10 * l10)
+        l11 = math.sqrt(max(S[1, 1] - l10 * l10, least))
         l21 = (S[2, 1] - l20 * l10) / l11
-        l22 = math.sqrt(S[2, 2] - l20 * l20 - l21 * l21)
+        l22 = math.sqrt(max(S[2, 2] - l20 * l20 - l21 * l21, least))
         whitening[i, 0] = 1 / l00
         whitening[i, 1], whitening[i, 2] = -l10 / (l00 * l11), 1 / l11
         whitening[i, 4], whitening[i, 5] = -l21 / (l11 * l22), 1 / l22
@@ -266,9 +287,11 @@ def _block(depth, K, v_low, u_low, components, index, local, log_peak, m, featur
             )  # fmt: skip
 
 
-@compiled_parallel
-def _exact(depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
-    """All streams; blocks of tiles in parallel."""
+@compiled
+def _exact(
+    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
+):
+    """All streams; of their blocks of tiles every ``shares``-th, from ``first`` on."""
     height, width = depth.shape[1:]
     side = _TILE * _BLOCK
     rows, columns = (height + side - 1) // side, (width + side - 1) // side
@@ -276,7 +299,7 @@ def _exact(depth, K, mean, covariance, weight, m, features, prior_weight, prior_
         index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
         local = np.hstack((mean[b][index], whitening))
         components = np.arange(index.size)
-        for block in prange(rows * columns):
+        for block in range(first, rows * columns, shares):
             _block(
                 depth[b], K[b], block // columns * side, block % columns * side, components, index, local,
                 log_peak, m[b], features[b], (prior_weight, prior_mean), epsilon, out[b], out_f[b],
@@ -332,11 +355,12 @@ def _near_row(depth, K, v, components, extent, index, local, log_peak, m, featur
         out_f[v, u] = sums / evidence
 
 
-@compiled_parallel
+@compiled
 def _neighbourhood(
-    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f
-):
-    """All streams; rows in parallel."""
+    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
+    first, shares,
+):  # fmt: skip
+    """All streams; of their rows every ``shares``-th, from ``first`` on."""
     for b in range(depth.shape[0]):
         index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
         local = np.hstack((mean[b][index], whitening))
@@ -345,7 +369,7 @@ def _neighbourhood(
             for i in range(3):
                 extent[k, i] = sigmas * math.sqrt(covariance[b, index[k], i, i])
         components = np.arange(index.size)
-        for v in prange(depth.shape[1]):
+        for v in range(first, depth.shape[1], shares):
             _near_row(
                 depth[b], K[b], v, components, extent, index, local, log_peak, m[b], features[b],
                 (prior_weight, prior_mean), (near, far), out[b], out_f[b],
