@@ -13,7 +13,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {"core": 0, "models": 1, "eval": 2, "train": 3}
-HEAVY = (
+HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetrics", "scipy", "cv2", "onnxruntime")
+HEAVY += ("numba",)
     "torch",
     "lightning",
     "torchvision",
