@@ -15,17 +15,6 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {"core": 0, "models": 1, "eval": 2, "train": 3}
 HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetrics", "scipy", "cv2", "onnxruntime")
 HEAVY += ("numba",)
-    "torch",
-    "lightning",
-    "torchvision",
-    "kornia",
-    "matplotlib",
-    "torchmetrics",
-    "scipy",
-    "cv2",
-    "onnxruntime",
-    "numba",
-)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "fuse", "regress", "mixture", "step", "frame")
 
