@@ -123,12 +123,14 @@ def test_weights_average_between_components():
     assert regress(m, middle, UfMStarConfig()).disagreement.item() == pytest.approx(2, abs=1e-5)
 
 
-def test_smooth():
+@pytest.mark.parametrize("function", [smooth, regress_cpu.smooth], ids=["torch", "numba"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_smooth(function, dtype):
     nan = float("nan")
-    before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]])
-    torch.testing.assert_close(smooth(before, now, 0.25), torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
-    assert smooth(None, now, 0.5) is now
-    assert smooth(before, now, 1.0) is now
+    before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]], dtype=dtype)
+    memory, shown = function(before, now, 0.25)
+    torch.testing.assert_close(memory, torch.tensor([[[1.5, 4.0, 2.0, nan]]]), equal_nan=True)
+    torch.testing.assert_close(shown, torch.tensor([[[1.5, 4.0, nan, nan]]], dtype=dtype), equal_nan=True)
 
 
 def test_sample_is_seeded_uniform_and_valid():

@@ -25,6 +25,7 @@ class Backend:
     correspond: Callable[..., Any]
     fuse: Callable[..., Any]
     regress_image: Callable[..., Any]
+    smooth: Callable[..., Any]
 
 
 TORCH = Backend(
@@ -34,6 +35,7 @@ TORCH = Backend(
     _correspond.correspond,
     _fuse.fuse,
     _regress.regress_image,
+    _regress.smooth,
 )
 
 
@@ -75,6 +77,7 @@ def _numba_backend() -> Backend:
         correspond_cpu.correspond,
         fuse_cpu.fuse,
         regress_cpu.regress_image,
+        regress_cpu.smooth,
     )
 
 

@@ -92,7 +92,7 @@ def check_frame(
     fault = _first(_pose_fault(T, deviation, rotation_tolerance), _intrinsics_fault(K), plain.device)
     fine = fault == 0
 
-    use = plain.isfinite() & (plain > 0) & fine[:, None, None]
+    use = (plain > 0) & (plain < torch.inf) & fine[:, None, None]  # NaN is neither
     for variance in (a, e):
         if variance is not None:
             use = use & variance.detach().isfinite() & (variance.detach() >= 0)

@@ -65,13 +65,15 @@ def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tenso
 
     Args:
         mixture_cam: [B, K] in the camera frame.
-        depth: [B, H, W] [m]; pixels that are not finite give NaN.
+        depth: [B, H, W] [m]; pixels that are not finite and positive give NaN.
         intrinsics: [B, 3, 3] [px].
     """
     b, height, width = depth.shape
     result = regress(mixture_cam, unproject(depth, intrinsics).flatten(1, 2), config)
     shape = (b, height, width)
-    return Regression(result.disagreement.view(shape), result.features.view(*shape, -1))
+    seen = (depth > 0) & (depth < torch.inf)
+    disagreement = torch.where(seen, result.disagreement.view(shape), torch.nan)
+    return Regression(disagreement, torch.where(seen[..., None], result.features.view(*shape, -1), torch.nan))
 
 
 def _densities(mixture: GaussianMixture, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -116,20 +118,23 @@ def _near(mixture: GaussianMixture, offset: Tensor, config: UfMStarConfig) -> Te
     return torch.where(near.any(-1, keepdim=True), near, gap <= config.far_radius)
 
 
-def smooth(previous: Tensor | None, current: Tensor, alpha: float) -> Tensor:
+def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
     """Exponential moving average of the dense map, M_i <- (1-alpha) M_(i-1) + alpha M_i.
 
-    NaN marks a pixel without a value: where only one of the two maps has one, that one is kept.
+    NaN marks a pixel without a value: where only one of the two maps has one, the memory keeps that one.
 
     Args:
-        previous: [B, H, W] [m^2] or None at the first frame.
-        current: [B, H, W] [m^2].
-        alpha: in (0, 1]; 1 switches the average off.
+        previous: [B, H, W] or [B, n] [m^2], the memory; all NaN at the first frame.
+        current: like ``previous``, in any dtype.
+        alpha: in (0, 1].
+
+    Returns:
+        The new memory in the dtype of ``previous``, and what to show: NaN where ``current`` has no value, in its dtype.
     """
-    if previous is None or alpha == 1.0:
-        return current
-    mixed = (1 - alpha) * previous + alpha * current
-    return torch.where(current.isnan(), previous, torch.where(previous.isnan(), current, mixed))
+    now = current.to(previous.dtype)
+    mixed = (1 - alpha) * previous + alpha * now
+    memory = torch.where(now.isnan(), previous, torch.where(previous.isnan(), now, mixed))
+    return memory, torch.where(now.isnan(), torch.nan, memory).to(current.dtype)
 
 
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,7 @@ from ufmstar_torch.frame import FRAME_FAULTS, FrameInput
 from ufmstar_torch.fuse import append
 from ufmstar_torch.gaussian import pixel_footprint
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression, regress, smooth
+from ufmstar_torch.regress import Regression, regress
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ def step(
 
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
     result = _read_out(mixture_cam, frame, config, backend, pixels)
-    disagreement, smoothed = _average(
-        state.smoothed, result.disagreement, frame, config, pixels, average, state.mixture.mean.dtype
-    )
+    disagreement, smoothed = result.disagreement, state.smoothed
+    if average and config.ema_alpha < 1.0:
+        disagreement, smoothed = _average(state, disagreement, frame, config, backend, pixels)
 
     statistics = FrameStatistics(
         components=mixture.components,
@@ -236,51 +236,39 @@ def _pad_pairs(pairs: Correspondence, capacity: int) -> Correspondence:
 
 
 def _read_out(
-    mixture_cam: GaussianMixture,
+    mixture_cam: GaussianMixture, frame: FrameInput, config: UfMStarConfig, backend: Backend, pixels: Tensor | None
+) -> Regression:
+    """Step 5 at every pixel, or at some; NaN where not valid, which is where the checked depth is 0."""
+    if pixels is None:
+        return backend.regress_image(mixture_cam, frame.depth, frame.intrinsics, config)
+    points = unproject(frame.depth, frame.intrinsics).flatten(1, 2)
+    chosen = torch.gather(points, 1, pixels[..., None].expand(*pixels.shape, 3))
+    result = regress(mixture_cam, chosen, config)
+    valid = torch.gather(frame.valid.flatten(1), 1, pixels)
+    features = torch.where(valid[..., None], result.features, torch.nan)
+    return replace(result, disagreement=torch.where(valid, result.disagreement, torch.nan), features=features)
+
+
+def _average(
+    state: UfMStarState,
+    disagreement: Tensor,
     frame: FrameInput,
     config: UfMStarConfig,
     backend: Backend,
     pixels: Tensor | None,
-) -> Regression:
-    """Step 5 at every pixel, or at some; NaN where not valid."""
-    if pixels is None:
-        result = backend.regress_image(mixture_cam, frame.depth, frame.intrinsics, config)
-        valid = frame.valid
-    else:
-        points = unproject(frame.depth, frame.intrinsics).flatten(1, 2)
-        chosen = torch.gather(points, 1, pixels[..., None].expand(*pixels.shape, 3))
-        result = regress(mixture_cam, chosen, config)
-        valid = torch.gather(frame.valid.flatten(1), 1, pixels)
-    nan = torch.full_like(result.disagreement, torch.nan)
-    features = torch.where(valid[..., None], result.features, nan[..., None])
-    return replace(result, disagreement=torch.where(valid, result.disagreement, nan), features=features)
-
-
-def _average(
-    smoothed: Tensor | None,
-    disagreement: Tensor,
-    frame: FrameInput,
-    config: UfMStarConfig,
-    pixels: Tensor | None,
-    average: bool,
-    dtype: torch.dtype,
-) -> tuple[Tensor, Tensor | None]:
+) -> tuple[Tensor, Tensor]:
     """The moving average for output (NaN where not valid now) and for the state.
 
     It is kept in the state's dtype, so that a saved run goes on as it was, and restarts when the image size
     changes. On a subset the dense map serves as memory at those pixels.
     """
-    if not average or config.ema_alpha == 1.0:
-        return disagreement, smoothed
-    if smoothed is not None and smoothed.shape[1:] != frame.size:
-        smoothed = None
-    shown_dtype = disagreement.dtype
+    memory = state.smoothed
+    if memory is None or memory.shape[1:] != frame.size:
+        dtype = state.mixture.mean.dtype
+        memory = torch.full(frame.depth.shape, torch.nan, dtype=dtype, device=frame.depth.device)
     if pixels is None:
-        mixed = smooth(smoothed, disagreement.to(dtype), config.ema_alpha)
-        return torch.where(frame.valid, mixed, torch.nan).to(shown_dtype), mixed
-    memory = torch.full(frame.depth.shape, torch.nan, dtype=dtype, device=frame.depth.device)
-    memory = (memory if smoothed is None else smoothed).flatten(1)
-    mixed = smooth(torch.gather(memory, 1, pixels), disagreement.to(dtype), config.ema_alpha)
-    valid = torch.gather(frame.valid.flatten(1), 1, pixels)
-    shown = torch.where(valid, mixed, torch.nan).to(shown_dtype)
-    return shown, memory.scatter(1, pixels, mixed).view(frame.depth.shape)
+        memory, shown = backend.smooth(memory, disagreement, config.ema_alpha)
+        return shown, memory
+    flat = memory.flatten(1)
+    mixed, shown = backend.smooth(torch.gather(flat, 1, pixels), disagreement, config.ema_alpha)
+    return shown, flat.scatter(1, pixels, mixed).view(memory.shape)

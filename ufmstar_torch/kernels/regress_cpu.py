@@ -65,6 +65,25 @@ def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tenso
     return Regression(torch.from_numpy(maps), torch.from_numpy(features))
 
 
+def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
+    """As :func:`ufmstar_torch.regress.smooth`, for CPU tensors, in one pass."""
+    memory, shown = torch.empty_like(previous), torch.empty_like(current)
+    _smooth(
+        *(t.detach().contiguous().view(-1).numpy() for t in (previous, current)),
+        alpha,
+        *(t.view(-1).numpy() for t in (memory, shown)),
+    )
+    return memory, shown
+
+
+@compiled
+def _smooth(previous, current, alpha, memory, shown):
+    for i in range(previous.size):
+        before, now = previous[i], memory.dtype.type(current[i])
+        memory[i] = before if now != now else now if before != before else (1 - alpha) * before + alpha * now
+        shown[i] = now if now != now else memory[i]
+
+
 def _share_out(kernel: Any, *arguments: Any) -> None:
     """Run ``kernel`` on as many threads as torch may use, each on its share of the image.
 
