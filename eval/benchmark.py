@@ -24,7 +24,7 @@ _TARGETS = {
     "long_run_ratio": 1.2,
 }
 _TARGET_SIZE = 224
-_WARM_UP, _TORCH_ROUNDS = 3, 5
+_WARM_UP, _TORCH_ROUNDS = 3, 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--backends", nargs="+", choices=["numba", "torch"], default=["numba", "torch"], help="kernels to time"
     )
-    parser.add_argument("--frames", type=int, default=40, help="timed frames (the torch backend: at most 5)")
+    parser.add_argument("--frames", type=int, default=40, help="timed frames (the torch backend: at most 3)")
     parser.add_argument("--in-view", type=int, default=100, help="components in view from which on frames are timed")
     parser.add_argument("--history", type=int, default=400, help="frames that may pass before that at most")
     parser.add_argument("--boxes", type=int, default=40, help="things in the rendered room")
@@ -122,7 +122,6 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
             progress(f"long run of {options.long} frames")
             backend = config.replace(backend=options.backends[0])
             report["long_run"] = measure_long_run(source, backend, size=_TARGET_SIZE, frames=options.long)
-        report["hardware"]["numba_threading_layer"] = machine.threading_layer()
     report["load_average"]["after"] = machine.load_average()
     report["targets"] = targets(report)
     return report

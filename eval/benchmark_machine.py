@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +41,6 @@ def available_cores() -> int:
 def load_average() -> float | None:
     """Processes that ran or waited to over the last minute, None where the system does not tell."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-
-
-def threading_layer() -> str | None:
-    """What runs numba's parallel loops, None before the first of them has run or without numba."""
-    if find_spec("numba") is None:
-        return None
-    try:
-        return str(import_module("numba").threading_layer())
-    except ValueError:  # numba's way to say that nothing has run yet
-        return None
 
 
 def cpu_model() -> str:

@@ -326,7 +326,7 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert report["settings"]["config"]["eta"] == 0.5
     assert report["settings"]["source"]["kind"] == "rendered room"
     assert set(report["versions"]) >= {"ufmstar_torch", "torch", "numba", "numpy", "python"}
-    assert set(report["hardware"]) >= {"cpu", "cores", "platform", "numba_threading_layer"}
+    assert set(report["hardware"]) >= {"cpu", "cores", "platform", "environment"}
     assert set(report["load_average"]) == {"before", "after"}
     assert [(r["size"], r["backend"]) for r in report["results"]] == [(64, "numba"), (64, "torch")]
     for result in report["results"]:
