@@ -81,6 +81,23 @@ def test_culling_keeps_its_bound(monkeypatch, epsilon):
         assert error > 1e-9  # something was left out, or the test tests nothing
 
 
+@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-13), (torch.float32, 5e-5)])
+def test_the_kernel_at_points_agrees_with_the_reference(config, dtype, tolerance):
+    m = mixture(2, 30, 3, features=2)
+    points = unproject(torch.cat([rendered(0), rendered(3)]), K.expand(2, 3, 3)).flatten(1, 2)
+    points[1, 5, 0] = torch.inf
+    reference, fast = regress(m, points, config), regress_cpu.regress(m, points.to(dtype), config)
+    finite = points.isfinite().all(-1)
+    assert fast.disagreement.dtype == dtype
+    torch.testing.assert_close(
+        fast.disagreement[finite].double(), reference.disagreement[finite], rtol=0, atol=tolerance
+    )
+    torch.testing.assert_close(fast.features[finite].double(), reference.features[finite], rtol=0, atol=tolerance)
+    if config is EXACT:
+        assert fast.disagreement[~finite].isnan().all()
+
+
 def test_far_away_the_prior_rules():
     m = mixture(1, 8, 1)
     far = torch.full((1, 3, 3), 50.0, dtype=torch.float64)

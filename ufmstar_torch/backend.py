@@ -24,6 +24,7 @@ class Backend:
     floor_covariance: Callable[..., Any]
     correspond: Callable[..., Any]
     fuse: Callable[..., Any]
+    regress: Callable[..., Any]
     regress_image: Callable[..., Any]
     smooth: Callable[..., Any]
 
@@ -34,6 +35,7 @@ TORCH = Backend(
     _gaussian.floor_covariance,
     _correspond.correspond,
     _fuse.fuse,
+    _regress.regress,
     _regress.regress_image,
     _regress.smooth,
 )
@@ -76,6 +78,7 @@ def _numba_backend() -> Backend:
         fuse_cpu.floor_covariance,
         correspond_cpu.correspond,
         fuse_cpu.fuse,
+        regress_cpu.regress,
         regress_cpu.regress_image,
         regress_cpu.smooth,
     )

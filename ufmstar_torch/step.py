@@ -19,7 +19,7 @@ from ufmstar_torch.frame import FRAME_FAULTS, FrameInput
 from ufmstar_torch.fuse import append
 from ufmstar_torch.gaussian import pixel_footprint
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression, regress
+from ufmstar_torch.regress import Regression
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ def _read_out(
         return backend.regress_image(mixture_cam, frame.depth, frame.intrinsics, config)
     points = unproject(frame.depth, frame.intrinsics).flatten(1, 2)
     chosen = torch.gather(points, 1, pixels[..., None].expand(*pixels.shape, 3))
-    result = regress(mixture_cam, chosen, config)
+    result = backend.regress(mixture_cam, chosen, config)
     valid = torch.gather(frame.valid.flatten(1), 1, pixels)
     features = torch.where(valid[..., None], result.features, torch.nan)
     return replace(result, disagreement=torch.where(valid, result.disagreement, torch.nan), features=features)

@@ -28,6 +28,7 @@ from torch import Tensor
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
+from ufmstar_torch.regress import regress as regress_reference
 
 compiled: Any = njit(cache=True, nogil=True)
 
@@ -63,6 +64,49 @@ def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tenso
         radii = (config.neighbourhood_sigmas, config.near_radius, config.far_radius)
         _share_out(_neighbourhood, *arguments, *prior, *radii, maps, features)
     return Regression(torch.from_numpy(maps), torch.from_numpy(features))
+
+
+def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Regression:
+    """As :func:`ufmstar_torch.regress.regress`, for CPU tensors; components are left out where they add less
+    than eps pi_0 / K to the denominator, so that the error is at most eps max(m_k, mu_0)."""
+    if config.regression != "exact":
+        return regress_reference(mixture, points, config)
+    out = torch.empty(points.shape[:2], dtype=points.dtype)
+    out_f = torch.empty(*points.shape[:2], mixture.features.shape[2], dtype=points.dtype)
+    fields = (mixture.mean, mixture.covariance, mixture.weight, mixture.disagreement, mixture.features)
+    _at_points(
+        points.detach().contiguous().numpy(), *(value.detach().double().contiguous().numpy() for value in fields),
+        config.prior_weight, config.prior_mean, EPSILON[points.dtype], out.numpy(), out_f.numpy(),
+    )  # fmt: skip
+    return Regression(out, out_f)
+
+
+@compiled
+def _at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
+    for b in range(points.shape[0]):
+        index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
+        limit = math.log(epsilon * prior_weight / max(index.size, 1))
+        sums = np.zeros(features.shape[2])
+        for p in range(points.shape[1]):
+            x, y, z = np.float64(points[b, p, 0]), np.float64(points[b, p, 1]), np.float64(points[b, p, 2])
+            evidence, total = prior_weight, prior_weight * prior_mean
+            sums[:] = 0
+            for j in range(index.size):
+                k, W = index[j], whitening[j]
+                dx, dy, dz = x - mean[b, k, 0], y - mean[b, k, 1], z - mean[b, k, 2]
+                y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
+                exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
+                if exponent < limit:
+                    continue
+                w = math.exp(exponent)  # NaN comes through, for points that are not finite
+                evidence += w
+                total += w * m[b, k]
+                for g in range(sums.size):
+                    sums[g] += w * features[b, k, g]
+            known = x + y + z
+            out[b, p] = total / evidence if known - known == 0 else np.nan
+            for g in range(sums.size):
+                out_f[b, p, g] = sums[g] / evidence if known - known == 0 else np.nan
 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
