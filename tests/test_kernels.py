@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import threading
 import warnings
@@ -153,15 +151,3 @@ def test_threads_share_the_image_and_leave_torchs_number_alone(config):
     for other in results[1:]:
         assert torch.equal(other.disagreement, results[0].disagreement)
         assert torch.equal(other.features, results[0].features)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_process_can_use_the_kernels():
-    code = (
-        "import multiprocessing as mp, torch; from ufmstar_torch import UfMStar\n"
-        "def step(_): return float(UfMStar()(torch.full((1, 160, 160), 2.0), torch.eye(4), K).depth.mean())\n"
-        "K = torch.tensor([[100.0, 0, 80], [0, 100, 80], [0, 0, 1]])\n"
-        "step(0); pool = mp.get_context('fork').Pool(1); print(pool.map(step, [0])); pool.close(); pool.join()"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.stdout.strip() == "[2.0]", done.stderr

@@ -132,7 +132,7 @@ def _share_out(kernel: Any, *arguments: Any) -> None:
     """Run ``kernel`` on as many threads as torch may use, each on its share of the image.
 
     Threads of our own and not numba's parallel loops: those start OpenMP, which puts torch's number of
-    threads back to all cores, and which a forked process cannot use. The kernels release the GIL.
+    threads back to all cores. The kernels release the GIL.
     """
     depth = arguments[0]
     shares = max(1, min(torch.get_num_threads(), depth[0].size // _SHARE))
