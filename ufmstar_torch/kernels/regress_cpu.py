@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,7 @@ def _share_out(kernel: Any, *arguments: Any) -> None:
         kernel(*arguments, 0, 1)
         return
     with ThreadPoolExecutor(shares - 1) as pool:
-        others = [pool.submit(kernel, *arguments, first, shares) for first in range(1, shares)]
+        others = [pool.submit(partial(kernel, *arguments, first, shares)) for first in range(1, shares)]
         kernel(*arguments, 0, shares)
         for other in others:
             other.result()
