@@ -22,3 +22,25 @@ class DepthNetwork(nn.Module, ABC):
     @abstractmethod
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it."""
+
+
+class Backbone(DepthNetwork):
+    """An encoder and decoder that uncertainty heads can be put on.
+
+    Depth is read from the decoder's last features, and so is everything that a head adds. The two steps are
+    separate so that a head shares the features without computing them twice.
+    """
+
+    feature_channels: int
+
+    @abstractmethod
+    def features(self, image: Tensor) -> Tensor:
+        """The decoder's last features [B, feature_channels, H, W] at the resolution of ``image`` [B, 3, H, W]."""
+
+    @abstractmethod
+    def depth(self, features: Tensor) -> Tensor:
+        """Depth [B, H, W] [m] from :meth:`features`."""
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; no variances."""
+        return DepthPrediction(self.depth(self.features(image)))

@@ -1,0 +1,73 @@
+"""What a network with an uncertainty head says of a pixel before it becomes depth and variances.
+
+The losses need the parameters of the distribution, UfM* its moments (``DepthPrediction``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from ufmstar_torch.prediction import DepthPrediction
+
+
+@dataclass(frozen=True)
+class PointDepth:
+    """Depth alone.
+
+    Attributes:
+        depth: [B, H, W] [m].
+    """
+
+    depth: Tensor
+
+    def prediction(self) -> DepthPrediction:
+        """No variances."""
+        return DepthPrediction(self.depth)
+
+
+@dataclass(frozen=True)
+class GaussianDepth:
+    """N(depth, exp(log_variance)) (Kendall and Gal 2017).
+
+    Attributes:
+        depth: [B, H, W] mean [m].
+        log_variance: [B, H, W] natural logarithm of the variance [m^2]; the logarithm, because the loss
+            is stable in it and any real number is a valid one.
+    """
+
+    depth: Tensor
+    log_variance: Tensor
+
+    def prediction(self) -> DepthPrediction:
+        """A = exp(log_variance)."""
+        return DepthPrediction(self.depth, aleatoric_variance=self.log_variance.exp())
+
+
+@dataclass(frozen=True)
+class EvidentialDepth:
+    """Normal-Inverse-Gamma evidence (Amini et al. 2020, Eq. 4 and 5).
+
+    The depth's mean and variance are themselves unknown: variance ~ Inverse-Gamma(alpha, beta) and
+    mean | variance ~ N(depth, variance / nu).
+
+    Attributes:
+        depth: [B, H, W] gamma [m].
+        nu: [B, H, W] > 0, virtual observations of the mean.
+        alpha: [B, H, W] > 1, half the virtual observations of the variance.
+        beta: [B, H, W] > 0 [m^2].
+    """
+
+    depth: Tensor
+    nu: Tensor
+    alpha: Tensor
+    beta: Tensor
+
+    def prediction(self) -> DepthPrediction:
+        """A = E[variance] = beta / (alpha - 1) and E = Var[mean] = beta / (nu (alpha - 1))."""
+        aleatoric = self.beta / (self.alpha - 1)
+        return DepthPrediction(self.depth, aleatoric, aleatoric / self.nu)
+
+
+DepthDistribution = PointDepth | GaussianDepth | EvidentialDepth

@@ -1,0 +1,95 @@
+"""Uncertainty heads: one more convolution on a backbone's last features.
+
+Aleatoric: Gaussian depth and log-variance (Kendall and Gal 2017). Evidential: the four parameters of a
+Normal-Inverse-Gamma distribution (Amini et al. 2020). Depth stays the backbone's own, so that pretrained
+weights keep their meaning when a head is added.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth
+from ufmstar_torch.models.network import Backbone, DepthNetwork
+from ufmstar_torch.prediction import DepthPrediction
+
+# [log m^2] Standard deviations from 1 mm to 1 km: none that a depth network could mean lies outside, and
+# within them neither exp(s) nor exp(-s) times a squared depth leaves single precision.
+LOG_VARIANCE_RANGE = (math.log(1e-6), math.log(1e6))
+# [1] Smallest nu and alpha - 1, so that both evidential variances stay finite: softplus reaches 0 in
+# single precision from about -104 on.
+EVIDENCE_FLOOR = 1e-4
+# [m^2] Smallest beta: (1 mm)^2, as for the Gaussian head.
+BETA_FLOOR = 1e-6
+
+
+class UncertaintyNetwork(DepthNetwork):
+    """A backbone with a head.
+
+    Args:
+        backbone: whose features and depth are used; its ``preprocess`` is this network's.
+    """
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.preprocess = backbone.preprocess
+
+    @abstractmethod
+    def distribution(self, image: Tensor) -> DepthDistribution:
+        """The parameters that the losses need, each [B, H, W], of ``image`` [B, 3, H, W]."""
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m] and the head's variances [m^2] of ``image`` as ``preprocess`` returns it."""
+        return self.distribution(image).prediction()
+
+
+class DepthOnlyNetwork(UncertaintyNetwork):
+    """No head: depth without a variance ("DepthOnly")."""
+
+    def distribution(self, image: Tensor) -> PointDepth:
+        """The backbone's depth."""
+        return PointDepth(self.backbone.depth(self.backbone.features(image)))
+
+
+class AleatoricNetwork(UncertaintyNetwork):
+    """Depth and a learned data variance ("Aleatoric")."""
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__(backbone)
+        self.head = nn.Conv2d(backbone.feature_channels, 1, 3, padding=1)
+
+    def distribution(self, image: Tensor) -> GaussianDepth:
+        """Depth and log-variance within :data:`LOG_VARIANCE_RANGE`."""
+        features = self.backbone.features(image)
+        return GaussianDepth(self.backbone.depth(features), soft_range(self.head(features)[:, 0], *LOG_VARIANCE_RANGE))
+
+
+class EvidentialNetwork(UncertaintyNetwork):
+    """Depth with learned data and model variance from one inference ("Evidential")."""
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__(backbone)
+        self.head = nn.Conv2d(backbone.feature_channels, 3, 3, padding=1)
+
+    def distribution(self, image: Tensor) -> EvidentialDepth:
+        """gamma is the backbone's depth; nu, alpha - 1 and beta are softplus of the head's channels."""
+        features = self.backbone.features(image)
+        nu, alpha, beta = F.softplus(self.head(features)).unbind(1)
+        return EvidentialDepth(
+            self.backbone.depth(features), nu + EVIDENCE_FLOOR, alpha + (1 + EVIDENCE_FLOOR), beta + BETA_FLOOR
+        )
+
+
+def soft_range(x: Tensor, low: float, high: float) -> Tensor:
+    """x, bent smoothly into (low, high): equal to x well inside, with a gradient everywhere.
+
+    low + softplus(x - low) from below, and the same mirrored from above. Unlike a clamp it cannot leave a
+    pixel without a gradient.
+    """
+    x = low + F.softplus(x - low)
+    return high - F.softplus(high - x)
