@@ -32,6 +32,8 @@ from ufmstar_torch.regress import Regression
 from ufmstar_torch.regress import regress as regress_reference
 
 compiled: Any = njit(cache=True, nogil=True)
+# The innermost loop, with multiply and add joined where the processor can: one rounding less, not one more.
+contracted: Any = njit(cache=True, nogil=True, fastmath={"contract"})
 
 # Share of the denominator that culling may leave out at each of the two levels: about the rounding of a
 # sum in the dtype, so that culling is no coarser than the arithmetic itself.
@@ -274,7 +276,7 @@ def _points(depth, K, v0, v1, u0, u1, origin, x, y, z):
     return i
 
 
-@compiled
+@contracted
 def _accumulate(coefficient, x, y, z, evidence, total, density):
     """Add one component to n points: its density to ``evidence``, times m to ``total``.
 
