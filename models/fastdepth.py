@@ -10,6 +10,7 @@ The channel widths are data, because the published network is pruned to irregula
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,16 +21,23 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.dropout import DecoderDropout
+from ufmstar_torch.models.network import Backbone
 from ufmstar_torch.models.onnx_weights import ConvLayer, read_conv_chain
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction
 
 MULTIPLE = 32  # [px] five halvings
 # Strides of the encoder's stem and 13 blocks.
 _STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
 # Decoder layer -> the encoder block (at 1/8, 1/4, 1/2 of the resolution) added to its doubled output.
 _SKIPS = {1: 5, 2: 3, 3: 1}
+# [m] Depth that an untrained network predicts: typical of rooms, and where a ReLU has a gradient.
+INITIAL_DEPTH = 2.5
+# The last activation, and what it turns into INITIAL_DEPTH.
+_POSITIVE: dict[str, tuple[type[nn.Module], float]] = {
+    "relu": (nn.ReLU, INITIAL_DEPTH),
+    "softplus": (nn.Softplus, math.log(math.expm1(INITIAL_DEPTH))),
+}
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,24 @@ class FastDepthWidths:
         """The widths that NetAdapt left of the network trained on NYU Depth V2."""
         encoder = (16, 56, 88, 120, 144, 256, 408, 376, 272, 288, 296, 328, 480, 512)
         return cls(encoder, (200, 256, 120, 56, 16))
+
+    @classmethod
+    def scaled(cls, multiplier: float) -> FastDepthWidths:
+        """:meth:`full` times MobileNet's width multiplier: multiples of 8, never less than .9 of the exact width.
+
+        Raises:
+            ValueError: the multiplier is not positive.
+        """
+        if not 0 < multiplier < float("inf"):
+            raise ValueError(f"the width multiplier must be positive, got {multiplier}")
+
+        def scale(width: int) -> int:
+            exact = width * multiplier
+            rounded = max(8, int(exact + 4) // 8 * 8)
+            return rounded if rounded >= 0.9 * exact else rounded + 8
+
+        full = cls.full()
+        return cls(tuple(map(scale, full.encoder)), tuple(map(scale, full.decoder)))
 
     @classmethod
     def of_state_dict(cls, state: Mapping[str, Tensor]) -> FastDepthWidths:
@@ -108,7 +134,7 @@ class SeparableUnit(nn.Module):
         return self.pointwise(self.depthwise(x))
 
 
-class FastDepth(DepthNetwork):
+class FastDepth(Backbone):
     """Monocular metric depth at 224 x 224 for small computers.
 
     ``preprocess`` makes its input: the centre crop of NYU's validation, RGB in [0, 1]. The weights are
@@ -118,12 +144,35 @@ class FastDepth(DepthNetwork):
         widths: channels of every layer.
         norm: batch norm after every convolution; False for weights that have it folded in, which can be
             trained on, but as plain convolutions with a bias.
+        dropout: probability of decoder dropout, after the convolutions of every decoder layer.
+        positive: what keeps depth positive, "relu" as published or "softplus". A ReLU can leave a pixel at 0
+            without a gradient, so softplus suits a start from scratch; weights mean one or the other.
+        size: (height, width) [px], multiples of 32, that ``preprocess`` makes.
+
+    Raises:
+        ValueError: an argument is out of range.
     """
 
-    def __init__(self, widths: FastDepthWidths | None = None, *, norm: bool = True) -> None:
+    def __init__(
+        self,
+        widths: FastDepthWidths | None = None,
+        *,
+        norm: bool = True,
+        dropout: float = 0.0,
+        positive: str = "relu",
+        size: tuple[int, int] = (224, 224),
+    ) -> None:
         super().__init__()
+        if positive not in _POSITIVE:
+            raise ValueError(f"positive must be one of {list(_POSITIVE)}, got {positive!r}")
+        if any(side % MULTIPLE for side in size):
+            raise ValueError(f"size must be multiples of {MULTIPLE} px, got {size}")
         self.widths = widths or FastDepthWidths.full()
-        self.preprocess = Preprocess.nyu()
+        self.feature_channels = self.widths.decoder[-1]
+        self.dropout = dropout
+        self.positive = positive
+        self.size = size
+        self.preprocess = Preprocess.nyu(size)
         e, d = self.widths.encoder, (self.widths.encoder[-1], *self.widths.decoder)
         stem = ConvUnit(3, e[0], 3, stride=_STRIDES[0], relu6=True, norm=norm)
         self.encoder = nn.ModuleList([stem])
@@ -132,7 +181,11 @@ class FastDepth(DepthNetwork):
         self.decoder = nn.ModuleList(
             SeparableUnit(inputs, outputs, 5, relu6=False, norm=norm) for inputs, outputs in pairwise(d)
         )
+        self.dropouts = nn.ModuleList(DecoderDropout(dropout) for _ in self.decoder)
         self.head = ConvUnit(d[-1], 1, 1, relu6=False, norm=norm)
+        activation, start = _POSITIVE[positive]
+        self.head.activation = activation()
+        nn.init.constant_(_bias(self.head), start)
 
     def features(self, image: Tensor) -> Tensor:
         """The decoder's output, from which the head reads depth.
@@ -152,16 +205,15 @@ class FastDepth(DepthNetwork):
             x = block(x)
             if i in _SKIPS.values():
                 skips[i] = x
-        for i, block in enumerate(self.decoder):
-            x = F.interpolate(block(x), scale_factor=2.0, mode="nearest")
+        for i, (block, dropout) in enumerate(zip(self.decoder, self.dropouts, strict=True)):
+            x = F.interpolate(dropout(block(x)), scale_factor=2.0, mode="nearest")
             if i in _SKIPS:
                 x = x + skips[_SKIPS[i]]
         return x
 
-    def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m], at least 0 (where the last ReLU cuts off, a pixel has no depth), of ``image``
-        as in :meth:`features`; no variances."""
-        return DepthPrediction(self.head(self.features(image))[:, 0])
+    def depth(self, features: Tensor) -> Tensor:
+        """Depth [B, H, W] [m] from :meth:`features`, at least 0 (where a last ReLU cuts off, a pixel has none)."""
+        return self.head(features)[:, 0]
 
     @classmethod
     def from_onnx(cls, path: str | Path) -> FastDepth:
@@ -193,7 +245,8 @@ class FastDepth(DepthNetwork):
     def folded(self) -> FastDepth:
         """A copy for inference with every batch norm folded into its convolution, in eval mode: the same
         function up to rounding in about three quarters of the time on a CPU."""
-        network = FastDepth(self.widths, norm=False)
+        network = FastDepth(self.widths, norm=False, dropout=self.dropout, positive=self.positive, size=self.size)
+        network.preprocess = self.preprocess
         for (_, source), (_, target) in zip(self._units(), network._units(), strict=True):
             conv, norm = source.conv, source.norm
             if isinstance(norm, nn.BatchNorm2d):
@@ -251,6 +304,13 @@ class FastDepth(DepthNetwork):
             else:
                 state[f"{name}.conv.bias"] = bias
         self.load_state_dict(state, strict=True)
+
+
+def _bias(unit: ConvUnit) -> Tensor:
+    """What is added before the activation."""
+    bias = unit.norm.bias if isinstance(unit.norm, nn.BatchNorm2d) else unit.conv.bias
+    assert isinstance(bias, Tensor)
+    return bias
 
 
 def _check_image(image: Tensor) -> None:

@@ -1,0 +1,142 @@
+"""MC-Dropout in the decoder (Gal and Ghahramani 2016; only the decoder, as in Poggi et al. 2020).
+
+While training, dropout acts as always. At test time it samples as well, while everything else, batch norm
+above all, stays in eval mode: every pass is then one draw from the network's approximate posterior.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.models.heads import UncertaintyNetwork
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.pipeline import combine
+from ufmstar_torch.prediction import DepthPrediction
+
+SAMPLES = 10  # passes of the paper's multi-inference baseline
+
+
+class DecoderDropout(nn.Module):
+    """Zeroes single values with probability p and scales the others by 1 / (1 - p), in training mode or
+    while ``sampling``. Without parameters, so that weights load with and without it.
+
+    Args:
+        p: probability in [0, 1); 0 does nothing.
+
+    Raises:
+        ValueError: p is out of range.
+    """
+
+    def __init__(self, p: float) -> None:
+        super().__init__()
+        if not 0 <= p < 1:
+            raise ValueError(f"dropout must be a probability in [0, 1), got {p}")
+        self.p = p
+        self.sampling = False
+        self.generator: torch.Generator | None = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x [...] of any floating-point type; the same shape."""
+        if not self.p or not (self.training or self.sampling):
+            return x
+        if self.generator is None:
+            return F.dropout(x, self.p, training=True)
+        # torch's dropout takes no generator.
+        keep = torch.rand(x.shape, generator=self.generator, device=x.device) >= self.p
+        return x * keep.to(x.dtype) / (1 - self.p)
+
+    def extra_repr(self) -> str:
+        return f"p={self.p}, sampling={self.sampling}"
+
+
+def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None = None) -> int:
+    """Switch sampling in eval mode of every :class:`DecoderDropout` in ``module`` (with p > 0), in place.
+
+    Args:
+        module: a network.
+        on: whether they sample.
+        generator: source of the random numbers, on the network's device; None: torch's global one.
+
+    Returns:
+        How many layers there are.
+
+    Raises:
+        ValueError: there is none, so that nothing would be sampled.
+    """
+    layers = [m for m in module.modules() if isinstance(m, DecoderDropout) and m.p > 0]
+    if not layers:
+        raise ValueError(
+            f"{type(module).__name__} has no decoder dropout: build its backbone with dropout=0.2, for example"
+        )
+    for layer in layers:
+        layer.sampling, layer.generator = on, generator if on else None
+    return len(layers)
+
+
+class MonteCarloDropout(DepthNetwork):
+    """A network with decoder dropout that samples in eval mode ("MC-Dropout").
+
+    With one sample a pass is one draw, which ``UncertainDepth`` alternates: the single-inference form. With
+    more, every call runs that many passes, the multi-inference baseline: predictive mean, mean aleatoric
+    variance, and the variance between the passes as epistemic variance.
+
+    Args:
+        network: used as it is, not copied; from now on its dropout samples also in eval mode, which
+            ``set_sampling(network, False)`` takes back. Its weights are trained as without this wrapper.
+        samples: passes per call.
+        batched: whether the passes run as one batch, faster on a device with memory for it.
+        generator: source of the random numbers, on the network's device; None: torch's global one.
+
+    Raises:
+        ValueError: the network has no decoder dropout, or ``samples`` is not positive.
+    """
+
+    def __init__(
+        self,
+        network: DepthNetwork,
+        samples: int = 1,
+        *,
+        batched: bool = False,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if samples < 1:
+            raise ValueError(f"samples must be at least 1, got {samples}")
+        set_sampling(network, True, generator)
+        self.network = network
+        self.preprocess = network.preprocess
+        self.samples = samples
+        self.batched = batched
+
+    def distribution(self, image: Tensor) -> DepthDistribution:
+        """One pass, for the losses.
+
+        Raises:
+            TypeError: the network predicts depth without declaring a distribution.
+        """
+        if not isinstance(self.network, UncertaintyNetwork):
+            raise TypeError(f"{type(self.network).__name__} is no UncertaintyNetwork; put a head on it for training")
+        return self.network.distribution(image)
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W]; with one sample only what the
+        network itself predicts, otherwise E = the variance between the passes (+ their own mean E)."""
+        if self.samples == 1:
+            return self.network(image)
+        if not self.batched:
+            return combine([self.network(image) for _ in range(self.samples)])
+        together = self.network(image.repeat(self.samples, 1, 1, 1))
+        return combine(_passes(together, self.samples))
+
+
+def _passes(together: DepthPrediction, count: int) -> list[DepthPrediction]:
+    """The ``count`` predictions that lie behind each other in a batch."""
+
+    def split(value: Tensor | None) -> tuple[Tensor, ...] | list[None]:
+        return [None] * count if value is None else value.chunk(count)
+
+    maps = (together.depth.chunk(count), split(together.aleatoric_variance), split(together.epistemic_variance))
+    return [DepthPrediction(depth, a, e) for depth, a, e in zip(*maps, strict=True)]
