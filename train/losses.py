@@ -1,0 +1,173 @@
+"""Training losses: per-pixel negative log likelihoods and their mean over the valid pixels of a batch.
+
+Gaussian: Kendall and Gal 2017, Eq. 8. Evidential: Amini et al. 2020, Eq. 8 to 10; torch-uncertainty's ``DERLoss`` is
+not used, since on pixels it divides by the wrong number and knows no mask. Everything is computed at least in
+single precision, whatever autocast says: the square of an error leaves half precision at 256 m, and bfloat16 has
+three digits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth
+
+# [1] Weight of the evidence on wrong pixels: the regulariser's lambda.
+EVIDENCE_WEIGHT = 0.01
+# [log m^2] Beyond +-40 (2 nm and 500,000 km as standard deviations) the loss goes on as at the limit: there
+# exp(-s) times the square of an error of 10 km is still far from single precision's largest number.
+_LOG_VARIANCE_LIMIT = 40.0
+# [m^2] Added to squared errors before their logarithm; it is below the square of any distance in the world, and
+# far above single precision's smallest normal number.
+_SQUARE_FLOOR = 1e-30
+# [1] From here on the series of log Gamma(a + 1/2) - log Gamma(a) is exact to single precision (its next
+# term is below 5e-8); the difference of the functions is not: at a = 1e6 each is about 1e7.
+_SERIES_FROM = 8.0
+
+
+def loss_of(
+    distribution: DepthDistribution,
+    target: Tensor,
+    valid: Tensor,
+    *,
+    evidence_weight: float = EVIDENCE_WEIGHT,
+    beta_nll: float = 0.0,
+) -> Tensor:
+    """The distribution's loss, averaged over the pixels that have ground truth.
+
+    Depth alone: |error| [m]. Gaussian: negative log likelihood [nat]. Evidential: the same of its Student-t
+    marginal, and the evidence regulariser.
+
+    Args:
+        distribution: parameters, each [B, H, W].
+        target: [B, H, W] ground truth depth [m]; what stands at other pixels does not matter.
+        valid: [B, H, W] bool, True = use. Of these, pixels whose target is not finite and positive are
+            left out as well.
+        evidence_weight: lambda of :func:`evidential_loss`.
+        beta_nll: exponent of :func:`gaussian_nll`'s weight; 0 = the likelihood itself.
+
+    Returns:
+        A scalar. Without any valid pixel it is 0 and its gradient is 0 everywhere (and not absent: a
+        distributed run waits for every process's gradient).
+
+    Raises:
+        ValueError: shapes differ, ``valid`` is not bool, a weight is out of range.
+    """
+    total, count = loss_sums(distribution, target, valid, evidence_weight=evidence_weight, beta_nll=beta_nll)
+    return total / count.clamp(min=1)
+
+
+def loss_sums(
+    distribution: DepthDistribution,
+    target: Tensor,
+    valid: Tensor,
+    *,
+    evidence_weight: float = EVIDENCE_WEIGHT,
+    beta_nll: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """The sum of the loss over valid pixels and their number (int64); arguments as :func:`loss_of`.
+
+    Processes that share a batch have unequal numbers of valid pixels, so the mean of their means is not the
+    mean over the batch. With ``total`` the sum of all processes' counts, ``world`` their number, and
+    gradients averaged over processes (as DistributedDataParallel does), ``sum * world / total`` as each process's
+    loss gives the gradient of one process that sees the whole batch.
+    """
+    _check(distribution, target, valid, evidence_weight, beta_nll)
+    usable = valid & target.isfinite() & (target > 0)
+
+    def at_valid(values: Tensor, elsewhere: float = 1.0) -> Tensor:
+        # Before the loss, not behind it: a gradient of NaN times 0 is NaN.
+        return torch.where(usable, values.to(torch.promote_types(values.dtype, torch.float32)), elsewhere)
+
+    with torch.autocast(target.device.type, enabled=False):
+        goal = at_valid(target)
+        depth = at_valid(distribution.depth)
+        if isinstance(distribution, GaussianDepth):
+            loss = gaussian_nll(depth, at_valid(distribution.log_variance, 0.0), goal, beta=beta_nll)
+        elif isinstance(distribution, EvidentialDepth):
+            nu, beta = at_valid(distribution.nu), at_valid(distribution.beta)
+            loss = evidential_loss(depth, nu, at_valid(distribution.alpha, 2.0), beta, goal, evidence_weight)
+        else:
+            loss = depth_l1(depth, goal)
+        return torch.where(usable, loss, 0.0).sum(), usable.sum()
+
+
+def depth_l1(depth: Tensor, target: Tensor) -> Tensor:
+    """|target - depth| [m] per pixel, FastDepth's loss."""
+    return (target - depth).abs()
+
+
+def gaussian_nll(depth: Tensor, log_variance: Tensor, target: Tensor, *, beta: float = 0.0) -> Tensor:
+    """-log N(target; depth, exp(s)) = ((target - depth)^2 exp(-s) + s + log 2 pi) / 2 per pixel [nat].
+
+    Args:
+        depth: [...] mean [m].
+        log_variance: [...] s, of the variance in m^2. Beyond +-40 value and gradient are those at +-40.
+        target: [...] [m].
+        beta: weighs each pixel with variance^beta, which gets no gradient (Seitzer et al. 2022, who
+            suggest 0.5): pixels with a large variance then no longer learn their depth more slowly. The result is
+            then no likelihood.
+    """
+    s = log_variance + (log_variance.clamp(-_LOG_VARIANCE_LIMIT, _LOG_VARIANCE_LIMIT) - log_variance).detach()
+    nll = 0.5 * ((target - depth).square() * (-s).exp() + s + math.log(2 * math.pi))
+    return nll * (beta * s.detach()).exp() if beta else nll
+
+
+def evidential_nll(depth: Tensor, nu: Tensor, alpha: Tensor, beta: Tensor, target: Tensor) -> Tensor:
+    """-log of the Student-t marginal of the Normal-Inverse-Gamma, per pixel [nat] (Amini et al. 2020, Eq. 8).
+
+    St(target; depth, scale^2 = beta (1 + nu) / (nu alpha), 2 alpha degrees of freedom). With Omega = 2 beta (1 + nu)
+    and e the error, Eq. 8 is rewritten so that nothing cancels or overflows:
+
+        (log pi - log nu + log Omega) / 2 + (alpha + 1/2) log(1 + e^2 nu / Omega)
+        + log Gamma(alpha) - log Gamma(alpha + 1/2)
+
+    Args:
+        depth: [...] gamma [m].
+        nu, alpha: [...] positive.
+        beta: [...] positive [m^2].
+        target: [...] [m].
+    """
+    log_omega = math.log(2) + beta.log() + nu.log1p()
+    log_ratio = ((target - depth).square() + _SQUARE_FLOOR).log() + nu.log() - log_omega
+    scale = 0.5 * (math.log(math.pi) - nu.log() + log_omega)
+    return scale + (alpha + 0.5) * F.softplus(log_ratio) - _log_gamma_half_step(alpha)
+
+
+def evidential_loss(
+    depth: Tensor, nu: Tensor, alpha: Tensor, beta: Tensor, target: Tensor, evidence_weight: float = EVIDENCE_WEIGHT
+) -> Tensor:
+    """:func:`evidential_nll` + evidence_weight |target - depth| (2 nu + alpha) per pixel (Eq. 9 and 10).
+
+    The regulariser takes evidence away where the depth is wrong, which the likelihood alone does not do.
+    """
+    evidence = (target - depth).abs() * (2 * nu + alpha)
+    return evidential_nll(depth, nu, alpha, beta, target) + evidence_weight * evidence
+
+
+def _log_gamma_half_step(a: Tensor) -> Tensor:
+    """log Gamma(a + 1/2) - log Gamma(a), a > 0, also where both are so large that nothing of the difference is left."""
+    large = a > _SERIES_FROM
+    big, small = torch.where(large, a, _SERIES_FROM), torch.where(large, 1.0, a)
+    r = 1 / big
+    series = 0.5 * big.log() - r / 8 + r**3 / 192
+    return torch.where(large, series, torch.lgamma(small + 0.5) - torch.lgamma(small))
+
+
+def _check(distribution: DepthDistribution, target: Tensor, valid: Tensor, evidence: float, beta: float) -> None:
+    if not isinstance(distribution, PointDepth | GaussianDepth | EvidentialDepth):
+        raise ValueError(f"distribution must be a DepthDistribution, got {type(distribution).__name__}")
+    if valid.dtype != torch.bool:
+        raise ValueError(f"valid must be bool (True = use), got {valid.dtype}")
+    shape = distribution.depth.shape
+    if target.shape != shape or valid.shape != shape:
+        raise ValueError(
+            f"target and valid must have the depth's shape {tuple(shape)}, got {tuple(target.shape)} and "
+            f"{tuple(valid.shape)}"
+        )
+    if not evidence >= 0 or not 0 <= beta <= 1:
+        raise ValueError(f"evidence_weight must be >= 0 and beta_nll in [0, 1], got {evidence} and {beta}")
