@@ -6,7 +6,8 @@ size (each axis by its own factor). Intrinsics follow by ``camera.resize_intrins
 centres. UfM* works at the network's resolution, so predictions need no way back.
 
 Colour is resampled linearly with antialiasing, as Pillow does and therefore the field's loaders did
-(FastDepth was trained and validated on Pillow's bilinear filter); depth takes the nearest pixel, since a
+(FastDepth was trained and validated on Pillow's bilinear filter), or cubically where a network was trained
+so (Depth Anything); depth takes the nearest pixel, since a
 mean over a depth edge is a place where nothing is.
 """
 
@@ -47,9 +48,13 @@ class Preprocess:
             into an image of that height, it is resized larger, to the smallest size that holds the crop.
         crop: (height, width) [px] of the centre crop, None = everything.
         size: (height, width) [px] of the network's input, None = as it is by then.
+        aspect_multiple: [px] keep the aspect: of the two factors that ``size`` asks for, both sides take the
+            one that changes the image less, and the result is rounded to this multiple (a vision
+            transformer's patch). ``size`` then tells roughly how large the input is. None = exactly ``size``.
         value_range: what white becomes: 1 for networks trained on [0, 1], 255 for those on bytes.
         mean, std: per channel (R, G, B), in units of ``value_range``: input = (value - mean) / std.
         antialias: whether shrinking averages over all pixels that fall into one.
+        cubic: resample with cubic instead of linear interpolation; where it overshoots, colours are clipped.
 
     Raises:
         ValueError: a field is out of range.
@@ -58,10 +63,12 @@ class Preprocess:
     resize_height: int | None = None
     crop: tuple[int, int] | None = None
     size: tuple[int, int] | None = None
+    aspect_multiple: int | None = None
     value_range: float = 1.0
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     antialias: bool = True
+    cubic: bool = False
 
     def __post_init__(self) -> None:
         for name in ("crop", "size"):
@@ -70,6 +77,9 @@ class Preprocess:
                 raise ValueError(f"Preprocess.{name} must be (height, width) in pixels, got {value}")
         if self.resize_height is not None and self.resize_height < 1:
             raise ValueError(f"Preprocess.resize_height must be positive, got {self.resize_height}")
+        multiple = self.aspect_multiple
+        if multiple is not None and (multiple < 1 or multiple != int(multiple) or self.size is None):
+            raise ValueError(f"Preprocess.aspect_multiple must be positive pixels and goes with size, got {multiple}")
         if not self.value_range > 0:
             raise ValueError(f"Preprocess.value_range must be positive, got {self.value_range}")
         if len(self.mean) != 3 or len(self.std) != 3 or not min(self.std) > 0:
@@ -121,7 +131,15 @@ class Preprocess:
             )
         cropped = self.crop or resized
         top, left = (resized[0] - cropped[0]) // 2, (resized[1] - cropped[1]) // 2
-        return Geometry((height, width), resized, top, left, cropped, self.size or cropped)
+        return Geometry((height, width), resized, top, left, cropped, self._final(cropped))
+
+    def _final(self, cropped: tuple[int, int]) -> tuple[int, int]:
+        if self.size is None or self.aspect_multiple is None:
+            return self.size or cropped
+        factor = min((self.size[0] / cropped[0], self.size[1] / cropped[1]), key=lambda f: abs(1 - f))
+        multiple = self.aspect_multiple
+        final = [max(1, round(factor * side / multiple)) * multiple for side in cropped]
+        return final[0], final[1]
 
     def __call__(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
         """The network's input and its intrinsics.
@@ -179,7 +197,9 @@ class Preprocess:
     def _resize(self, x: Tensor, size: tuple[int, int]) -> Tensor:
         if x.shape[-2:] == size:
             return x
-        return F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=self.antialias)
+        mode = "bicubic" if self.cubic else "bilinear"
+        resized = F.interpolate(x, size, mode=mode, align_corners=False, antialias=self.antialias)
+        return resized.clamp(0, 1) if self.cubic else resized
 
 
 def _unit_range(image: Tensor) -> Tensor:

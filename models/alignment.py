@@ -1,0 +1,309 @@
+"""Relative depth made metric, on purpose: scale and shift fitted to sparse measurements.
+
+Relative networks (MiDaS, Depth Anything without "Metric") predict inverse depth up to a scale and a shift,
+1/d = scale x + shift; others predict depth itself so, d = scale x + shift (scale alone: shift = 0). Either
+is metric only together with these two numbers, which come from measured depth here, or from the camera's
+height above the ground (``camera_height``).
+
+UfM* compares views, so one alignment has to hold for all of them: fit it on the first frames
+(``pooled=True``) and keep it. An alignment per frame moves every frame's points by its own error, which is
+then seen as disagreement, or hides the network's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.models.robust_fit import least_squares, robust_fit
+
+KINDS = ("inverse", "affine")
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """What makes a relative prediction x metric: 1/d or d is scale x + shift.
+
+    Attributes:
+        kind: "inverse" (1/d, units 1/m) or "affine" (d, units m).
+        scale: [] for all images, or [B] for each of a batch; > 0. Numbers are taken too.
+        shift: as ``scale``.
+        max_depth: [m] farther pixels are invalid; None = no limit. Where inverse depth is nearly 0 (sky), the
+            smallest error of the shift moves a pixel by kilometres.
+
+    Raises:
+        ValueError: another kind, values that are not finite, a scale that is not positive, different shapes.
+    """
+
+    kind: str
+    scale: Tensor
+    shift: Tensor
+    max_depth: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"Alignment.kind must be one of {KINDS}, got {self.kind!r}")
+        for name in ("scale", "shift"):
+            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            object.__setattr__(self, name, value)
+            if not value.isfinite().all():
+                raise ValueError(f"Alignment.{name} must be finite, got {value.tolist()}")
+        if self.scale.dim() > 1 or self.scale.shape != self.shift.shape:
+            shapes = f"{tuple(self.scale.shape)} and {tuple(self.shift.shape)}"
+            raise ValueError(f"Alignment.scale and .shift must both be numbers or both [B], got {shapes}")
+        if not (self.scale > 0).all():
+            raise ValueError(f"Alignment.scale must be positive, got {self.scale.tolist()}")
+        if self.max_depth is not None and not self.max_depth > 0:
+            raise ValueError(f"Alignment.max_depth must be positive metres, got {self.max_depth}")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Alignment:
+        """From JSON.
+
+        Raises:
+            ValueError: an unknown or missing key, or a value out of range.
+        """
+        known = {f.name for f in fields(cls)}
+        if unknown := sorted(set(values) - known):
+            raise ValueError(f"an alignment has no {unknown}; it has {sorted(known)}")
+        if missing := sorted(known - {"max_depth"} - set(values)):
+            raise ValueError(f"an alignment needs {missing}")
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, exactly."""
+        return {
+            "kind": self.kind,
+            "scale": self.scale.tolist(),
+            "shift": self.shift.tolist(),
+            "max_depth": self.max_depth,
+        }
+
+    def depth(self, prediction: Tensor) -> Tensor:
+        """Depth [B, H, W] [m]; 0, which UfM* takes as no prediction, where it is not :meth:`valid`.
+
+        Args:
+            prediction: [B, H, W] floating-point, as the network returns it.
+
+        Raises:
+            ValueError: another shape, or as many images as there are alignments were expected.
+        """
+        value = self._line(prediction)
+        depth = value if self.kind == "affine" else 1 / torch.where(value > 0, value, 1)
+        return torch.where(self._possible(value, depth), depth, 0)
+
+    def valid(self, prediction: Tensor) -> Tensor:
+        """[B, H, W] where the aligned depth is finite, positive and at most ``max_depth``; errors as :meth:`depth`.
+
+        ``(~alignment.valid(x)).sum((1, 2))`` counts what an image loses: many mean that the shift is wrong.
+        """
+        return self.depth(prediction) > 0
+
+    def _line(self, prediction: Tensor) -> Tensor:
+        require_maps("prediction", prediction)
+        scale, shift = self.scale, self.shift
+        if scale.dim():
+            if len(scale) != len(prediction):
+                raise ValueError(f"prediction must have the alignment's {len(scale)} images, got {len(prediction)}")
+            scale, shift = (v.to(prediction.device, prediction.dtype)[:, None, None] for v in (scale, shift))
+        return scale * prediction + shift  # tensors without dimensions are numbers, on every device
+
+    def _possible(self, value: Tensor, depth: Tensor) -> Tensor:
+        possible = (value > 0) & (depth < torch.inf)
+        return possible if self.max_depth is None else possible & (depth <= self.max_depth)
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentFit:
+    """An alignment with what supports it; [] instead of [B] where the images were pooled.
+
+    Attributes:
+        alignment: the result.
+        points: [B] usable measurements.
+        inliers: [B] those that the final fit used.
+        residual: [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m].
+        sums: for going on with further images.
+    """
+
+    alignment: Alignment
+    points: Tensor
+    inliers: Tensor
+    residual: Tensor
+    sums: AlignmentSums
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentSums:
+    """Weighted sums over measurements (x, y), which add up over a stream: ``total = total + fit.sums``.
+
+    Attributes:
+        kind: of the alignment.
+        values: [..., 5] sums of w, w x, w y, w x^2, w x y.
+    """
+
+    kind: str
+    values: Tensor
+
+    def __add__(self, other: AlignmentSums) -> AlignmentSums:
+        if self.kind != other.kind:
+            raise ValueError(f"cannot add sums for {other.kind!r} to sums for {self.kind!r}")
+        return AlignmentSums(self.kind, self.values + other.values)
+
+    def alignment(self, *, shift: float | None = None, max_depth: float | None = None) -> Alignment:
+        """The weighted least-squares alignment of everything summed; ``shift`` as :func:`fit_inverse_depth`.
+
+        Raises:
+            ValueError: the sums do not determine it, or the scale is not positive.
+        """
+        w, wx, wy, wxx, wxy = self.values.unbind(-1)
+        if shift is None:
+            # Centred: sum w (x - mean)^2; the same in one pass loses digits only where x hardly varies.
+            spread = wxx - wx * wx / w
+            if not (spread > 1e-10 * wxx).all():
+                raise ValueError("the predictions at the measurements hardly differ: no shift can be told; give it")
+            scale = (wxy - wx * wy / w) / spread
+            return Alignment(self.kind, scale, (wy - scale * wx) / w, max_depth)
+        if not (wxx > 0).all():
+            raise ValueError("the predictions at the measurements are all 0: no scale can be told")
+        return Alignment(self.kind, (wxy - shift * wx) / wxx, torch.full_like(w, shift), max_depth)
+
+
+def fit_inverse_depth(
+    prediction: Tensor,
+    depth: Tensor,
+    valid: Tensor | None = None,
+    *,
+    weights: Tensor | None = None,
+    shift: float | None = None,
+    pooled: bool = False,
+    robust: bool = True,
+    min_points: int = 10,
+    max_depth: float | None = None,
+    seed: int = 0,
+) -> AlignmentFit:
+    """Scale and shift with 1/depth = scale prediction + shift, by least squares in inverse depth.
+
+    Args:
+        prediction: [B, H, W] inverse depth up to scale and shift.
+        depth: [B, H, W] measured depth [m] at the same pixels (LiDAR, SLAM points, a depth sensor); pixels without a
+            finite positive value are not used.
+        valid: [B, H, W] bool, True = use; None = all measured.
+        weights: [B, H, W] inverse variances of 1/depth up to a factor, 0 = do not use; None = equal, which fits
+            stereo and structured light. For an error of constant size in depth, depth**4.
+        shift: [1/m] if it is known (0: the prediction is inverse depth up to scale); None = fitted.
+        pooled: one alignment for all images, as UfM* needs it, instead of one for each.
+        robust: find and leave out outliers, of which there may be almost half; False = plain least squares.
+        min_points: fewer usable measurements (of an image, or in all if pooled) are an error.
+        max_depth: [m] of the resulting alignment.
+        seed: of the robust fit's samples; the result is reproducible.
+
+    Raises:
+        ValueError: wrong shapes or types, too few measurements, predictions that hardly differ, or a scale that
+            comes out negative, as for a network that predicts depth; the image is named.
+    """
+    return _fit("inverse", prediction, depth, valid, weights, shift, pooled, robust, min_points, max_depth, seed)
+
+
+def fit_affine_depth(
+    prediction: Tensor,
+    depth: Tensor,
+    valid: Tensor | None = None,
+    *,
+    weights: Tensor | None = None,
+    shift: float | None = 0.0,
+    pooled: bool = False,
+    robust: bool = True,
+    min_points: int = 10,
+    max_depth: float | None = None,
+    seed: int = 0,
+) -> AlignmentFit:
+    """Scale (and shift) with depth = scale prediction + shift [m], by least squares in depth.
+
+    As :func:`fit_inverse_depth`, for networks whose output grows with distance. ``shift`` is in metres and 0
+    unless asked for (None = fitted): most such networks miss the scale alone.
+    """
+    return _fit("affine", prediction, depth, valid, weights, shift, pooled, robust, min_points, max_depth, seed)
+
+
+def _fit(
+    kind: str,
+    prediction: Tensor,
+    depth: Tensor,
+    valid: Tensor | None,
+    weights: Tensor | None,
+    shift: float | None,
+    pooled: bool,
+    robust: bool,
+    min_points: int,
+    max_depth: float | None,
+    seed: int,
+) -> AlignmentFit:
+    unknowns = 2 if shift is None else 1
+    if min_points < unknowns:
+        raise ValueError(f"min_points must be at least {unknowns}, got {min_points}")
+    x, measured, use, weight = _points(prediction, depth, valid, weights, pooled)
+    count = use.sum(1)
+    require_each(count >= min_points, count, f"needs at least {min_points} measurements with a prediction, has")
+    y = measured if kind == "affine" else 1 / measured
+    design = torch.stack([x, torch.ones_like(x)], -1)[..., :unknowns]
+    target = y if shift is None else y - shift
+    if robust:
+        fit = robust_fit(design, target, use, weight, seed=seed)
+        inlier, determined, theta = fit.inlier, fit.determined, fit.theta
+    else:
+        inlier = use
+        theta, determined = least_squares(design, target, weight * use)
+    require_each(
+        determined, count, "has predictions that hardly differ, so nothing can be told from them; measurements:"
+    )
+    grows = "distance" if kind == "affine" else "nearness"
+    require_each(
+        theta[:, 0] > 0, theta[:, 0], f"does not grow with {grows}, as kind {kind!r} says it does; the fitted scale is"
+    )
+    b = theta[:, 1] if shift is None else torch.full_like(theta[:, 0], shift)
+    w = weight * inlier
+    sums = torch.stack([v.sum(1) for v in (w, w * x, w * y, w * x * x, w * x * y)], -1)
+    residual = y - theta[:, :1] * x - b[:, None]
+    rms = ((residual.square() * inlier).sum(1) / inlier.sum(1)).sqrt()
+    a, b, count, used, rms, sums = (v[0] if pooled else v for v in (theta[:, 0], b, count, inlier.sum(1), rms, sums))
+    return AlignmentFit(Alignment(kind, a, b, max_depth), count, used, rms, AlignmentSums(kind, sums))
+
+
+def _points(
+    prediction: Tensor, depth: Tensor, valid: Tensor | None, weights: Tensor | None, pooled: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """x, depth, use and weight, float64 [B, P] ([1, P] if pooled), harmless where not used."""
+    require_maps("prediction", prediction)
+    require_maps("depth", depth)
+    if valid is not None and valid.dtype != torch.bool:
+        raise ValueError(f"valid must be bool, got {valid.dtype}")
+    for name, value in (("depth", depth), ("valid", valid), ("weights", weights)):
+        if value is not None and value.shape != prediction.shape:
+            raise ValueError(f"{name} must be {tuple(prediction.shape)} as prediction, got {tuple(value.shape)}")
+    shape = (1, -1) if pooled else (len(prediction), -1)
+    x, measured = prediction.detach().double().reshape(shape), depth.detach().double().reshape(shape)
+    use = x.isfinite() & (measured > 0) & (measured < torch.inf)
+    if valid is not None:
+        use = use & valid.reshape(shape)
+    weight = torch.ones_like(x) if weights is None else weights.detach().double().reshape(shape)
+    if not ((weight >= 0) & (weight < torch.inf)).all():
+        raise ValueError("weights must be finite and not negative")
+    use = use & (weight > 0)
+    return torch.where(use, x, 1), torch.where(use, measured, 1), use, weight
+
+
+def require_maps(name: str, value: Tensor) -> None:
+    """Raises ValueError unless ``value`` is floating-point [B, H, W]."""
+    if value.dim() != 3 or not value.is_floating_point() or not value.numel():
+        raise ValueError(f"{name} must be floating-point [B, H, W], got {value.dtype} {tuple(value.shape)}")
+
+
+def require_each(fine: Tensor, value: Tensor, sentence: str) -> None:
+    """Raises ValueError for the first image b that is not ``fine`` [B]: "image b SENTENCE value[b]"."""
+    if not fine.all():
+        image = int((~fine).nonzero()[0])
+        raise ValueError(f"image {image} {sentence} {value[image].item():.6g}")
