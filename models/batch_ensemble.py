@@ -1,0 +1,265 @@
+"""BatchEnsemble (Wen, Tran and Ba, ICLR 2020): an ensemble in one network, whose members share their
+weights but for two vectors per layer.
+
+Batch norms are shared by all members, statistics and all: a member then costs three vectors per layer, and
+the statistics stay those of a whole batch where it is split among the members.
+
+Why not torch-uncertainty (0.13): its ``batch_ensemble(convert_layers=True)`` crashes on nested modules,
+and its layers divide every batch among all members, so that one image cannot be given to one member.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.models.batch_layer import BatchLayer, Selection
+from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.models.heads import UncertaintyNetwork
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.pipeline import combine
+from ufmstar_torch.prediction import DepthPrediction
+
+INITS = ("normal", "sign")
+# [1] Spread of the factors around 1 for init="normal": the members start near the weights they are given,
+# which may be pretrained. The paper's random signs suit a start from scratch; they undo trained weights.
+INIT_STD = 0.1
+_PLAIN = (nn.Conv2d, nn.Linear)
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def convert(
+    network: Network,
+    members: int,
+    *,
+    init: str = "normal",
+    std: float = INIT_STD,
+    generator: torch.Generator | None = None,
+) -> Network:
+    """A copy of a network in which every ``Conv2d`` and ``Linear`` is a :class:`BatchLayer`.
+
+    Weights are copied and every member starts with the layer's bias. Layers are found wherever the network
+    keeps them, also twice, or in plain lists and dicts beside its registered modules.
+
+    Args:
+        network: not changed.
+        members: N.
+        init: of the factors: "normal" (1 +- ``std``) or "sign" (+1 or -1).
+        std: [1] of "normal"; 0 starts all members equal.
+        generator: of the random numbers, on the CPU; None = torch's.
+
+    Raises:
+        ValueError: nothing to convert, an option out of range, a network that is converted already, or a
+            module that is kept in a plain list only (its weights would be neither trained nor saved).
+        TypeError: a layer of a derived class or with weights of another kind (weight norm), whose
+            computation is not known here.
+        RuntimeError: not all of the layers were converted.
+    """
+    if members < 2 or init not in INITS or not std >= 0:
+        raise ValueError(f"need members >= 2, init in {list(INITS)} and std >= 0, got {members}, {init!r}, {std}")
+    if converted_layers(network):
+        raise ValueError(f"{type(network).__name__} is converted already")
+    for name, module in network.named_modules():
+        _check_layer(name, module)
+    expected = sum(isinstance(module, _PLAIN) for module in network.modules())
+    if not expected:
+        raise ValueError(f"{type(network).__name__} has no Conv2d and no Linear: nothing to convert")
+    result, selection = copy.deepcopy(network), Selection()
+    new = {m: BatchLayer(m, members, selection) for m in result.modules() if isinstance(m, _PLAIN)}
+    result = _replace(result, dict(new))
+    layers = converted_layers(result)
+    left = sum(isinstance(module, _PLAIN) for module in result.modules()) - len(layers)  # each has one inside
+    if len(layers) != expected or left:
+        raise RuntimeError(f"{len(layers)} of {expected} layers were converted, {left} stayed as they were")
+    for layer in layers:
+        _draw(layer.r, init, std, generator)
+        _draw(layer.s, init, std, generator)
+    return result
+
+
+def converted_layers(network: nn.Module) -> list[BatchLayer]:
+    """The layers that :func:`convert` made, each once."""
+    return [module for module in network.modules() if isinstance(module, BatchLayer)]
+
+
+class BatchEnsemble(DepthNetwork):
+    """An ensemble whose members share their weights ("BatchEnsemble").
+
+    Called as a network it is the multi-inference baseline: all members in one batched pass, combined.
+    :meth:`all_members` are the single-inference form, which ``UncertainDepth`` alternates.
+
+    Args:
+        network: converted into a copy; see :func:`convert` for it and the other arguments, and for errors.
+    """
+
+    def __init__(
+        self,
+        network: UncertaintyNetwork,
+        members: int,
+        *,
+        init: str = "normal",
+        std: float = INIT_STD,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.network = convert(network, members, init=init, std=std, generator=generator)
+        self.preprocess = network.preprocess
+        self.members = members
+
+    def distribution(self, image: Tensor, member: int | None = None, *, repeat: bool = True) -> DepthDistribution:
+        """What the members say, for the losses.
+
+        Args:
+            image: [B, 3, H, W] as ``preprocess`` returns it.
+            member: n: that one alone, [B, H, W]. None: all of them.
+            repeat: all members see every image, [N B, H, W] with member 0's B maps first; False: the batch
+                is split among the members, [B, H, W] with image b by member floor(b N / B), B at least N.
+
+        Raises:
+            IndexError: no such member.
+            ValueError: a batch that is too small to be split.
+        """
+        count = len(image)
+        if member is not None:
+            turns = torch.full((count,), self._checked(member), device=image.device)
+        elif repeat:
+            turns = torch.arange(self.members, device=image.device).repeat_interleave(count)
+            image = image.repeat(self.members, 1, 1, 1)
+        elif count < self.members:
+            raise ValueError(f"a batch of {count} cannot be split among {self.members} members")
+        else:
+            turns = torch.arange(count, device=image.device) * self.members // count
+        with self._turns(turns):
+            return self.network.distribution(image)
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """The members' mixture of ``image`` [B, 3, H, W]: mean depth [B, H, W] [m], mean A and the variance
+        between the members as E [m^2], from one pass with a batch of N B."""
+        together = self.distribution(image)
+        maps = zip(*(getattr(together, f.name).chunk(self.members) for f in fields(together)), strict=True)
+        return combine([type(together)(*parts).prediction() for parts in maps])
+
+    def member(self, n: int) -> BatchEnsembleMember:
+        """Member n as a network, with the weights of this one: nothing is copied.
+
+        Raises:
+            IndexError: no such member.
+        """
+        return BatchEnsembleMember(self, self._checked(n))
+
+    def all_members(self) -> list[BatchEnsembleMember]:
+        """:meth:`member` of each."""
+        return [self.member(n) for n in range(self.members)]
+
+    def folded(self, n: int) -> UncertaintyNetwork:
+        """Member n as a plain network with its own weights W_n: the same function up to rounding, as fast as
+        the network that was converted, and independent of this one.
+
+        Raises:
+            IndexError: no such member.
+        """
+        self._checked(n)
+        network = copy.deepcopy(self.network)
+        return _replace(network, {layer: layer.plain(n) for layer in converted_layers(network)})
+
+    def factors(self) -> list[nn.Parameter]:
+        """r and s of every layer. Weight decay would pull them to 0, where a member ends, instead of to the
+        shared weights: leave them out of it."""
+        return [factor for layer in converted_layers(self.network) for factor in (layer.r, layer.s)]
+
+    def _checked(self, member: int) -> int:
+        if not 0 <= member < self.members:
+            raise IndexError(f"member must be from 0 to {self.members - 1}, got {member}")
+        return member
+
+    @contextmanager
+    def _turns(self, turns: Tensor) -> Iterator[None]:
+        """Tell every layer whose turn it is, in this thread, for the length of a call."""
+        selection = converted_layers(self.network)[0].selection
+        selection.members = turns
+        try:
+            yield
+        finally:
+            selection.members = None
+
+
+class BatchEnsembleMember(DepthNetwork):
+    """One member of a :class:`BatchEnsemble`, made by its ``member``.
+
+    It holds on to the whole ensemble as a module of its own, so that all members stay one through ``.to()``,
+    ``deepcopy`` (of a list of them) and ``load_state_dict``. A state_dict repeats the shared tensors' names
+    for every member, but not the tensors.
+    """
+
+    def __init__(self, ensemble: BatchEnsemble, n: int) -> None:
+        super().__init__()
+        self.ensemble = ensemble
+        self.n = n
+        self.preprocess = ensemble.preprocess
+        self.training = ensemble.training
+
+    def distribution(self, image: Tensor) -> DepthDistribution:
+        """[B, H, W] each, of ``image`` [B, 3, H, W]."""
+        return self.ensemble.distribution(image, self.n)
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W]: one inference."""
+        return self.distribution(image).prediction()
+
+    def extra_repr(self) -> str:
+        """Which one."""
+        return f"n={self.n}"
+
+
+def _check_layer(name: str, module: nn.Module) -> None:
+    """Raises TypeError where a layer computes something else than its plain class does."""
+    plain = isinstance(module, _PLAIN)
+    if plain and (type(module) not in _PLAIN or set(module._parameters) != {"weight", "bias"}):
+        held = ", ".join(module._parameters)
+        raise TypeError(f"{name or 'the network'} cannot be converted: it is a {type(module).__name__} of {held}")
+
+
+def _draw(factor: nn.Parameter, init: str, std: float, generator: torch.Generator | None) -> None:
+    """Random values into a parameter; drawn on the CPU in float32, so that they depend on the seed alone."""
+    if init == "sign":
+        values = torch.randint(0, 2, factor.shape, generator=generator) * 2.0 - 1.0
+    else:
+        values = 1 + std * torch.randn(factor.shape, generator=generator)
+    with torch.no_grad():
+        factor.copy_(values)
+
+
+def _replace(root: Network, new: Mapping[nn.Module, nn.Module]) -> Any:
+    """``root`` with modules replaced wherever its modules keep them, in place; or what replaces ``root``.
+
+    Raises:
+        ValueError: a module that is no registered part of ``root`` is kept in a plain list or dict.
+    """
+    modules = list(root.modules())
+    known = {id(module): new.get(module, module) for module in modules}
+    for module in modules:
+        for name, value in list(vars(module).items()):
+            vars(module)[name] = _replaced(value, known, f"{type(module).__name__}.{name}")
+    return known[id(root)]
+
+
+def _replaced(value: Any, known: Mapping[int, nn.Module], where: str) -> Any:
+    """``value`` with modules replaced, dicts and lists in place."""
+    if isinstance(value, nn.Module):
+        if id(value) not in known:
+            raise ValueError(f"{where} keeps a {type(value).__name__} that is not registered: use nn.ModuleList")
+        return known[id(value)]
+    if isinstance(value, dict):
+        value.update({key: _replaced(item, known, where) for key, item in value.items()})
+    elif isinstance(value, list):
+        value[:] = [_replaced(item, known, where) for item in value]
+    elif type(value) is tuple:
+        return tuple(_replaced(item, known, where) for item in value)
+    return value

@@ -1,0 +1,149 @@
+"""A trainable network as plain values: what is written beside its weights, and what builds it again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from ufmstar_torch.models.batch_ensemble import BatchEnsemble
+from ufmstar_torch.models.heads import AleatoricNetwork, DepthOnlyNetwork, EvidentialNetwork, UncertaintyNetwork
+from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models.preprocess import Preprocess
+
+ARCHITECTURES = ("fastdepth", "monodepth2")
+METHODS = ("depth", "aleatoric", "evidential", "mc_dropout", "batch_ensemble")
+_MULTIPLE = 32  # [px] both architectures halve the image five times
+_CHOICES = {
+    "architecture": ARCHITECTURES,
+    "method": METHODS,
+    "layers": (18, 34, 50),
+    "strides": ("v1", "v1.5"),
+    "preprocess": ("nyu", "resize"),
+    "positive": ("relu", "softplus"),
+}
+# Fields that say something of one architecture only; elsewhere they must keep their defaults, so that
+# two specs of the same network are equal.
+_ONLY = {"widths": "fastdepth", "positive": "fastdepth", "layers": "monodepth2", "strides": "monodepth2"}
+
+
+@dataclass(frozen=True)
+class NetworkSpec:
+    """Everything that decides what :func:`build_network` builds, apart from the weights.
+
+    An ensemble is several "aleatoric" networks of one spec; how many, its files say.
+
+    Attributes:
+        architecture: "fastdepth" or "monodepth2".
+        method: "depth" (no variance), "aleatoric", "evidential", "mc_dropout" (aleatoric, sampled by its
+            decoder's dropout) or "batch_ensemble" (aleatoric, ``members`` in one).
+        widths: of FastDepth: "full", "pruned", or a multiple of the full ones.
+        positive: how FastDepth's depth is kept from being negative: "relu" as published, or "softplus",
+            which leaves no pixel without depth and gradient.
+        layers: of monodepth2's ResNet.
+        strides: of monodepth2's ResNet: "v1" (in a bottleneck's first convolution) or "v1.5" (in its second).
+        dropout: [1] share of the decoder's features that are dropped in training (and where "mc_dropout" samples).
+        members: of "batch_ensemble"; 1 for every other method.
+        size: (height, width) [px] of the input, multiples of 32.
+        preprocess: how a camera image comes to that size: "nyu" (the centre crop of NYU's validation)
+            or "resize" (the whole image, each axis by its own factor).
+
+    Raises:
+        ValueError: a value that cannot be, or fields that contradict each other.
+    """
+
+    architecture: str = "fastdepth"
+    method: str = "aleatoric"
+    widths: str | float = "full"
+    positive: str = "relu"
+    layers: int = 50
+    strides: str = "v1.5"
+    dropout: float = 0.0
+    members: int = 1
+    size: tuple[int, int] = (224, 224)
+    preprocess: str = "nyu"
+
+    def __post_init__(self) -> None:
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"NetworkSpec.{name} must be one of {list(choices)}, got {getattr(self, name)!r}")
+        if not _is_width(self.widths):
+            raise ValueError(f"NetworkSpec.widths must be 'full', 'pruned' or a positive number, got {self.widths!r}")
+        if not _is_number(self.dropout) or not 0 <= self.dropout < 1:
+            raise ValueError(f"NetworkSpec.dropout must lie in [0, 1), got {self.dropout!r}")
+        if self.method == "mc_dropout" and not self.dropout:
+            raise ValueError("NetworkSpec.dropout must be positive for 'mc_dropout', which samples by it")
+        several = self.method == "batch_ensemble"
+        if type(self.members) is not int or (self.members < 2 if several else self.members != 1):
+            wanted = "at least 2 for 'batch_ensemble'" if several else f"1 for {self.method!r}"
+            raise ValueError(f"NetworkSpec.members must be {wanted}, got {self.members!r}")
+        size = self.size
+        if type(size) is not tuple or len(size) != 2 or any(type(s) is not int or s < 1 or s % _MULTIPLE for s in size):
+            raise ValueError(f"NetworkSpec.size must be (height, width) in multiples of {_MULTIPLE} px, got {size!r}")
+        for f in fields(self):
+            if _ONLY.get(f.name, self.architecture) != self.architecture and getattr(self, f.name) != f.default:
+                raise ValueError(f"NetworkSpec.{f.name} is of {_ONLY[f.name]!r} only, not of {self.architecture!r}")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> NetworkSpec:
+        """From JSON: lists become tuples, what is missing takes its default.
+
+        Raises:
+            ValueError: an unknown key, or a value that cannot be.
+        """
+        known = [f.name for f in fields(cls)]
+        if unknown := sorted(set(values) - set(known)):
+            raise ValueError(f"NetworkSpec has no {unknown}; it has {known}")
+        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**plain)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as plain values for JSON."""
+        return {**asdict(self), "size": list(self.size)}
+
+    def input(self) -> Preprocess:
+        """What brings a camera image to the network's input."""
+        return Preprocess.nyu(self.size) if self.preprocess == "nyu" else Preprocess(size=self.size)
+
+
+def build_backbone(spec: NetworkSpec) -> Backbone:
+    """The encoder and decoder of ``spec``, with random weights from torch's generator."""
+    options: dict[str, Any] = {"dropout": spec.dropout} if spec.dropout else {}
+    backbone: Backbone
+    if spec.architecture == "fastdepth":
+        from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
+
+        named = {"full": FastDepthWidths.full, "pruned": FastDepthWidths.pruned}
+        widths = FastDepthWidths.scaled(spec.widths) if spec.widths not in named else named[spec.widths]()
+        backbone = FastDepth(widths, positive=spec.positive, **options)
+    else:
+        from ufmstar_torch.models.monodepth2 import MonodepthResNet
+
+        backbone = MonodepthResNet(layers=spec.layers, strides=spec.strides, **options)
+    backbone.preprocess = spec.input()
+    return backbone
+
+
+def build_network(spec: NetworkSpec, backbone: Backbone | None = None) -> UncertaintyNetwork | BatchEnsemble:
+    """The network that ``spec`` describes, for training; "mc_dropout" does not sample by itself yet
+    (``MonteCarloDropout`` makes it do so).
+
+    Args:
+        spec: what to build.
+        backbone: with pretrained weights, as :func:`build_backbone` makes it; it becomes part of the
+            network (a "batch_ensemble" takes a copy). None: random weights.
+    """
+    backbone = build_backbone(spec) if backbone is None else backbone
+    heads: dict[str, type[UncertaintyNetwork]] = {"depth": DepthOnlyNetwork, "evidential": EvidentialNetwork}
+    network = heads.get(spec.method, AleatoricNetwork)(backbone)
+    return BatchEnsemble(network, spec.members) if spec.method == "batch_ensemble" else network
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_width(value: object) -> bool:
+    if isinstance(value, str):
+        return value in ("full", "pruned")
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")
