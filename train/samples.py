@@ -1,0 +1,184 @@
+"""Training samples: where frames come from, what the network gets of them, and what happens to broken files."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypedDict
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.train.augment import Augmentation
+
+_LOG = logging.getLogger(__name__)
+
+
+class SampleError(Exception):
+    """A sample's file is missing, truncated, or does not hold what it should.
+
+    Attributes:
+        name: the file.
+        reason: what is wrong with it.
+    """
+
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(name, reason)  # both in args, so that it survives pickling by a worker
+        self.name = name
+        self.reason = reason
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason}"
+
+
+class Sample(TypedDict):
+    """One training sample at the network's size; a loader stacks them along a first dimension.
+
+    image [3, H, W] float32 as the network's ``Preprocess`` returns it; depth [H, W] float32 [m], 0 = none;
+    valid [H, W] bool, True = has ground truth; intrinsics [3, 3] float64 [px].
+    """
+
+    image: Tensor
+    depth: Tensor
+    valid: Tensor
+    intrinsics: Tensor
+
+
+class SampleKey(NamedTuple):
+    """Which frame in which epoch: what a sampler yields, so that augmentation differs between epochs and is
+    the same for any number of workers."""
+
+    epoch: int
+    index: int
+
+
+@dataclass(frozen=True, eq=False)
+class RawSample:
+    """A frame with depth registered to its image, at the size it is stored in.
+
+    Attributes:
+        image: [3, H, W] uint8 RGB.
+        depth: [H, W] float32 [m]; 0 or not finite = none.
+        intrinsics: [3, 3] float64 [px].
+    """
+
+    image: Tensor
+    depth: Tensor
+    intrinsics: Tensor
+
+
+class FrameSource(Protocol):
+    """Frames by number."""
+
+    def __len__(self) -> int: ...
+
+    def name(self, index: int) -> str:
+        """What to call frame ``index`` when it is broken: its file."""
+        ...
+
+    def load(self, index: int) -> RawSample:
+        """Decodes frame ``index``; raises :class:`SampleError` where its file is broken."""
+        ...
+
+
+class SampleDataset(Dataset[Sample]):
+    """The frames of a source as samples for a network.
+
+    Args:
+        source: where frames come from.
+        preprocess: the network's.
+        augmentation: None = none, as for validation.
+        seed: of the augmentation.
+        on_bad_file: "raise": the first broken file stops the run. "skip": the next readable frame takes its
+            place (after the last comes the first), whoever asks and in whatever order. For training, that frame
+            is then seen twice in an epoch; for validation (``evaluate``), it counts once: its copy has no valid
+            pixel.
+        evaluate: see ``on_bad_file``.
+
+    Raises:
+        ValueError: an empty source, another word for ``on_bad_file``.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        preprocess: Preprocess,
+        augmentation: Augmentation | None = None,
+        *,
+        seed: int = 0,
+        on_bad_file: str = "raise",
+        evaluate: bool = False,
+    ) -> None:
+        if on_bad_file not in ("raise", "skip"):
+            raise ValueError(f"on_bad_file must be 'raise' or 'skip', got {on_bad_file!r}")
+        if len(source) < 1:
+            raise ValueError("source must hold at least one frame, got none")
+        self.source, self.preprocess, self.augmentation = source, preprocess, augmentation
+        self.seed, self.on_bad_file, self.evaluate = seed, on_bad_file, evaluate
+        # Shared memory, so that what a worker process finds is known to the one that asks.
+        self._bad = torch.zeros(len(source), dtype=torch.bool).share_memory_()
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, key: int | SampleKey) -> Sample:
+        """The sample of a frame.
+
+        Args:
+            key: (epoch, index) as :class:`~ufmstar_torch.train.batches.EpochBatches` yields it; an index
+                alone is of epoch 0.
+
+        Raises:
+            IndexError: no such frame.
+            SampleError: a broken file with ``on_bad_file="raise"``, or none that can be read.
+        """
+        epoch, index = key if isinstance(key, tuple) else SampleKey(0, key)
+        if not 0 <= index < len(self):
+            raise IndexError(f"index must lie in [0, {len(self)}), got {index}")
+        raw, found = self._readable(index)
+        sample = make_sample(raw, self.preprocess, self.augmentation, (self.seed, epoch, index))
+        if self.evaluate and found != index:
+            sample["valid"] = torch.zeros_like(sample["valid"])
+        return sample
+
+    def bad_files(self) -> tuple[str, ...]:
+        """The broken files met so far, in this process and in the workers of its loaders."""
+        return tuple(self.source.name(index) for index in self._bad.nonzero()[:, 0].tolist())
+
+    def _readable(self, index: int) -> tuple[RawSample, int]:
+        """Frame ``index``, or else the next that can be read, and its number."""
+        for step in range(len(self)):
+            candidate = (index + step) % len(self)
+            if self._bad[candidate]:
+                continue
+            try:
+                return self.source.load(candidate), candidate
+            except SampleError as error:
+                if self.on_bad_file == "raise":
+                    raise
+                self._bad[candidate] = True
+                _LOG.warning("skipped a broken file: %s", error)
+        raise SampleError(self.source.name(index), f"and all others of {len(self)} files are broken")
+
+
+def make_sample(
+    raw: RawSample, preprocess: Preprocess, augmentation: Augmentation | None, seed: tuple[int, ...]
+) -> Sample:
+    """A stored frame as the network sees it: augmented, then preprocessed.
+
+    Args:
+        raw: the frame.
+        preprocess: the network's.
+        augmentation: or None.
+        seed: of the augmentation: the same numbers give the same sample.
+    """
+    image = raw.image.to(torch.float32)[None] / 255
+    depth = torch.where(raw.depth.isfinite() & (raw.depth > 0), raw.depth, 0.0).to(torch.float32)
+    K = raw.intrinsics.to(torch.float64)
+    if augmentation is not None:
+        image, depth, K = augmentation(image, depth, K, seed)
+    x, K_network = preprocess(image, K)
+    depth = preprocess.apply_depth(depth)
+    return Sample(image=x[0], depth=depth.contiguous(), valid=depth > 0, intrinsics=K_network)
