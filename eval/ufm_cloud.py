@@ -1,0 +1,208 @@
+"""The points of UfM and what one frame does to them: a pure function per stream.
+
+UfM (Sudhakar, Karaman, Sze, "Uncertainty from Motion for DNN Monocular Depth Estimation", ICRA 2022) keeps every
+predicted pixel as a point with a mean, a covariance and a count. Two differences from the authors' release, both on
+purpose: the points stay in the frame of the first camera, where the release moves all of them into each
+new camera and lets rotations that are not quite orthonormal add up; and off-diagonal entries of the covariance keep their sign,
+where the release sets every negative one to zero through a mistyped threshold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# The covariance is symmetric: six of its entries are stored, row by row from the diagonal on.
+_ROW, _COLUMN = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
+# x, y, z and the six entries above.
+MOMENTS = 9
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The N points of one stream in the order in which they were added, oldest first.
+
+    Attributes:
+        moments: [N, 9] mean x, y, z [m] and covariance xx, xy, xz, yy, yz, zz [m^2], in one frame (the caller's).
+        count: [N] int32 n, observations fused into the point.
+    """
+
+    moments: Tensor
+    count: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """[N, 3] [m]."""
+        return self.moments[:, :3]
+
+    @property
+    def covariance(self) -> Tensor:
+        """[N, 3, 3] [m^2]."""
+        full = self.moments.new_empty(len(self.count), 3, 3)
+        for entry, (i, j) in enumerate(zip(_ROW, _COLUMN, strict=True)):
+            full[:, i, j] = full[:, j, i] = self.moments[:, 3 + entry]
+        return full
+
+    @property
+    def bytes_per_point(self) -> int:
+        """9 numbers and a count: 40 in float32, 76 in float64."""
+        return MOMENTS * self.moments.element_size() + self.count.element_size()
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera predicts, in one stream.
+
+    Attributes:
+        depth: [H, W] [m], 0 where not valid.
+        variance: [H, W] s^2 [m^2] that the network itself states, 0 where it states none.
+        valid: [H, W] bool, True = use.
+        intrinsics: [3, 3] float64 [px].
+        R_first_cam: [3, 3] float64 rotation from this camera into the first one.
+        t_first_cam: [3] float64 this camera's position in the first one [m].
+    """
+
+    depth: Tensor
+    variance: Tensor
+    valid: Tensor
+    intrinsics: Tensor
+    R_first_cam: Tensor
+    t_first_cam: Tensor
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A frame taken in.
+
+    Attributes:
+        cloud: afterwards.
+        variance: [H, W] [m^2], NaN where not valid.
+        fused: [] points that met a valid pixel.
+        new: [] pixels appended.
+        dropped: [] points pruned.
+    """
+
+    cloud: Cloud
+    variance: Tensor
+    fused: Tensor
+    new: Tensor
+    dropped: Tensor
+
+
+def take_in(cloud: Cloud, view: View, max_points: int | None) -> Taken:
+    """Steps 1 to 5 of a frame: correspond, fuse, read out, append, prune.
+
+    A point corresponds to the pixel that it is projected into, whatever lies in between: no occlusion, no test of the depth.
+    Points that land on an invalid pixel are left as they are.
+
+    Args:
+        cloud: in the frame of the first camera; not modified.
+        view: its depth's dtype need not be the cloud's, in which all is computed.
+        max_points: the oldest points out of view are dropped beyond it, then the oldest of all; None = never.
+    """
+    pixel, seen = _landing(cloud, view)
+    observed = _observations(view, cloud.moments.dtype)
+    valid = view.valid.flatten()
+    met = (seen & valid.index_select(0, pixel)).nonzero()[:, 0]
+    pixel = pixel[met]
+    fused = _fused(cloud, met, observed.index_select(0, pixel))
+    variance, hit = _read_out(fused.moments.index_select(0, met), pixel, view)
+    fresh = (valid & ~hit).nonzero()[:, 0]
+    cloud = Cloud(
+        torch.cat([fused.moments, observed.index_select(0, fresh)]),
+        torch.cat([fused.count, torch.ones_like(fresh, dtype=torch.int32)]),
+    )
+    keep = _kept(torch.cat([seen, torch.ones_like(fresh, dtype=torch.bool)]), max_points)
+    if keep is not None:
+        cloud = Cloud(cloud.moments.index_select(0, keep), cloud.count.index_select(0, keep))
+    before = len(seen) + len(fresh)
+    counts = (torch.tensor(n, device=pixel.device) for n in (len(met), len(fresh), before - len(cloud.count)))
+    return Taken(cloud, variance, *counts)
+
+
+def _landing(cloud: Cloud, view: View) -> tuple[Tensor, Tensor]:
+    """Step 1: the pixel [N] into which each point is projected (0 if none), and whether it is in view [N].
+
+    u = round(fx x/z + cx), half to even. A point in the camera's plane, z = 0, has no pixel.
+    """
+    height, width = view.depth.shape
+    dtype = cloud.moments.dtype
+    K, R, t = (value.to(dtype) for value in (view.intrinsics, view.R_first_cam, view.t_first_cam))
+    # Column by column: three numbers a point are too few for a matrix product to pay.
+    offset = [cloud.moments[:, axis] - t[axis] for axis in range(3)]
+    x, y, z = (offset[0] * R[0, i] + offset[1] * R[1, i] + offset[2] * R[2, i] for i in range(3))
+    u = torch.round(K[0, 0] * x / z + K[0, 2])
+    v = torch.round(K[1, 1] * y / z + K[1, 2])
+    seen = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    pixel = torch.where(seen, v * width + u, torch.zeros_like(u))
+    return pixel.long(), seen
+
+
+def _observations(view: View, dtype: torch.dtype) -> Tensor:
+    """[H*W, 9] each pixel as a point in the first camera's frame: p = z r + t and A = s^2 r r^T with
+    r = R ((u-cx)/fx, (v-cy)/fy, 1)."""
+    height, width = view.depth.shape
+    K, R, t = (value.to(dtype) for value in (view.intrinsics, view.R_first_cam, view.t_first_cam))
+    device = view.depth.device
+    x = (torch.arange(width, dtype=dtype, device=device) - K[0, 2]) / K[0, 0]
+    y = (torch.arange(height, dtype=dtype, device=device) - K[1, 2]) / K[1, 1]
+    ray = [x * R[i, 0] + y[:, None] * R[i, 1] + R[i, 2] for i in range(3)]
+    # 0 where not valid: a NaN there must not travel through 0 * NaN.
+    depth = torch.where(view.valid, view.depth, torch.zeros_like(view.depth)).to(dtype)
+    s2 = torch.where(view.valid, view.variance, torch.zeros_like(view.variance)).to(dtype)
+    points = [depth * ray[i] + t[i] for i in range(3)]
+    spread = [s2 * (ray[i] * ray[j]) for i, j in zip(_ROW, _COLUMN, strict=True)]
+    return torch.stack([*points, *spread], dim=-1).flatten(0, 1)
+
+
+def _fused(cloud: Cloud, met: Tensor, observed: Tensor) -> Cloud:
+    """Step 2 at the points ``met`` [P], each with the pixel it landed on, ``observed`` [P, 9]; M = n + 1:
+
+    mu' = mu + (p - mu)/M and S' = (M-1)/M S + A/M + (M-1)/M^2 (p - mu)(p - mu)^T.
+    """
+    old = cloud.moments.index_select(0, met)
+    M = cloud.count.index_select(0, met) + 1
+    share = M.to(old.dtype).reciprocal()[:, None]
+    step = observed - old
+    new = old + step * share
+    scaled = step[:, :3] * (share - share.square())  # (M-1)/M^2 = 1/M - 1/M^2
+    for entry, (i, j) in enumerate(zip(_ROW, _COLUMN, strict=True)):
+        new[:, 3 + entry].addcmul_(scaled[:, i], step[:, j])
+    return Cloud(cloud.moments.index_copy(0, met, new), cloud.count.index_copy(0, met, M))
+
+
+def _read_out(met: Tensor, pixel: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Step 3: s^2 everywhere, S'_zz of this camera where a point landed, the newest of several.
+
+    Args:
+        met: [P, 9] fused points, oldest first.
+        pixel: [P] on which they landed.
+        view: the camera.
+
+    Returns:
+        variance [H, W] [m^2], NaN where not valid, and hit [H*W].
+    """
+    axis = view.R_first_cam[:, 2].to(met.dtype)
+    weight = torch.stack([axis[i] * axis[j] * (1 if i == j else 2) for i, j in zip(_ROW, _COLUMN, strict=True)])
+    along_z = (met[:, 3:] * weight).sum(1).clamp_min(0)  # not below 0 by rounding
+    # The largest position is the newest point, in whatever order a device writes.
+    newest = torch.full((view.depth.numel(),), -1, dtype=torch.int64, device=pixel.device)
+    newest = newest.scatter_reduce(0, pixel, torch.arange(len(pixel), device=pixel.device), "amax")
+    hit = newest >= 0
+    variance = torch.where(view.valid, view.variance.to(met.dtype), torch.nan).flatten()
+    if len(pixel):
+        variance = torch.where(hit, along_z.index_select(0, newest.clamp_min(0)), variance)
+    return variance.view(view.depth.shape), hit
+
+
+def _kept(seen: Tensor, max_points: int | None) -> Tensor | None:
+    """Step 5: indices of the points to keep, given which of them [N] are in view; None = all."""
+    excess = 0 if max_points is None else len(seen) - max_points
+    if excess <= 0:
+        return None
+    unseen = ~seen
+    keep = seen | (unseen.cumsum(0) > excess)
+    excess -= int(unseen.sum().clamp_max(excess))
+    return keep.nonzero()[excess:, 0]
