@@ -11,7 +11,7 @@ import os
 import pickle
 import secrets
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ class CheckpointError(ValueError):
     """A file of weights is broken, holds something else, or does not fit the network; names the file."""
 
 
-def load_state_dict_file(path: str | Path) -> dict[str, Tensor]:
+def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
     """The weights in a file, on the CPU, by key.
 
     Containers ("state_dict", "model", ...) are opened and prefixes that every key shares ("module.",
@@ -51,6 +51,7 @@ def load_state_dict_file(path: str | Path) -> dict[str, Tensor]:
 
     Args:
         path: .pth, .pt, .ckpt, .bin, .tar (all as ``torch.save`` writes them) or .safetensors.
+        ignore: keys of plain values that the file may hold beside the weights.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -58,7 +59,7 @@ def load_state_dict_file(path: str | Path) -> dict[str, Tensor]:
             another suffix.
         ModuleNotFoundError: a .safetensors file without the package safetensors.
     """
-    return _without_prefixes(_read(Path(path)))
+    return _without_prefixes(_read(Path(path), ignore))
 
 
 def load_weights(module: nn.Module, path: str | Path) -> None:
@@ -71,9 +72,23 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
             keys are missing or unexpected, shapes differ, or values are not finite. The module is unchanged then.
     """
     path = Path(path)
-    state, expected = _read(path), module.state_dict()
-    if set(state) != set(expected):  # a network may itself have a part called "model"
-        state = _without_prefixes(state, keep=set(expected))
+    state, expected = _read(path), set(module.state_dict())
+    if set(state) != expected:  # a network may itself have a part called "model"
+        state = _without_prefixes(state, keep=expected)
+    fill(module, state, str(path))
+
+
+def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
+    """Fill a module from tensors, in place; all keys and shapes have to match.
+
+    Args:
+        source: where they come from, for the message.
+
+    Raises:
+        CheckpointError: keys are missing or unexpected, shapes differ, or values are not finite. The module is
+            unchanged then.
+    """
+    expected = module.state_dict()
     missing, unexpected = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
     shapes = [
         f"{key} is {tuple(state[key].shape)}, expected {tuple(expected[key].shape)}"
@@ -85,8 +100,39 @@ def load_weights(module: nn.Module, path: str | Path) -> None:
     faults.append(("with NaN or infinity", not_finite))
     texts = [f"{len(keys)} {what}: {_some(keys)}" for what, keys in faults if keys]
     if texts:
-        raise CheckpointError(f"{path} does not fit {type(module).__name__} ({len(expected)} keys): {'; '.join(texts)}")
+        fit = f"{source} does not fit {type(module).__name__} ({len(expected)} keys)"
+        raise CheckpointError(f"{fit}: {'; '.join(texts)}")
     module.load_state_dict(state, strict=True)
+
+
+def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[str, Tensor], Any]:
+    """A part of a .safetensors file, without reading the rest.
+
+    Args:
+        path: the file.
+        prefix: of the tensors that are read; None: of none.
+
+    Returns:
+        The tensors by their keys without the prefix, and the metadata that :func:`save_checkpoint` stored
+        (None: there is none).
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: it is no safetensors file, or cut off or damaged.
+        ModuleNotFoundError: safetensors is not installed.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no file of weights {path}")
+    safetensors = _safetensors()
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get("metadata", "null")
+            names = file.keys()
+            keys = [] if prefix is None else [name for name in names if name.startswith(prefix)]
+            tensors = {key[len(prefix or "") :]: file.get_tensor(key) for key in keys}
+        return tensors, json.loads(text)
+    except (safetensors.Error, json.JSONDecodeError) as error:
+        raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
 
 
 def save_checkpoint(
@@ -130,7 +176,7 @@ def _write(file: Any, path: Path, state: dict[str, Tensor], metadata: str) -> No
         raise _unknown_suffix(path)
 
 
-def _read(path: Path) -> dict[str, Tensor]:
+def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
     """The tensors of a file with its keys as they are, containers opened."""
     if not path.is_file():
         raise FileNotFoundError(f"no file of weights {path}")
@@ -142,7 +188,7 @@ def _read(path: Path) -> dict[str, Tensor]:
             raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
     if path.suffix not in _TORCH_SUFFIXES:
         raise _unknown_suffix(path)
-    return _weights_in(_read_torch(path), path)
+    return _weights_in(_read_torch(path), path, ignore)
 
 
 def _read_torch(path: Path) -> Any:
@@ -161,13 +207,14 @@ def _read_torch(path: Path) -> Any:
         raise CheckpointError(f"{path} is damaged or not a file of torch.save: {error}") from error
 
 
-def _weights_in(content: Any, path: Path) -> dict[str, Tensor]:
+def _weights_in(content: Any, path: Path, ignore: Collection[str]) -> dict[str, Tensor]:
     for name in _CONTAINERS:
         if isinstance(content, Mapping) and isinstance(content.get(name), Mapping):
             content = content[name]
             break
     if not isinstance(content, Mapping) or not content:
         raise CheckpointError(f"{path} holds no weights but {type(content).__name__}")
+    content = {key: value for key, value in content.items() if key not in ignore}
     others = [key for key, value in content.items() if not isinstance(value, Tensor) or not isinstance(key, str)]
     if others:
         raise CheckpointError(f"{path} holds more than named tensors: {_some(others)}")
@@ -198,10 +245,10 @@ class _safetensors:
 
     def __init__(self) -> None:
         try:
-            from safetensors import SafetensorError
+            from safetensors import SafetensorError, safe_open
             from safetensors.torch import load_file, save
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(
                 "a .safetensors file needs the package safetensors: pip install safetensors"
             ) from error
-        self.Error, self.load_file, self.save = SafetensorError, load_file, save
+        self.Error, self.load_file, self.save, self.safe_open = SafetensorError, load_file, save, safe_open

@@ -14,6 +14,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 ARCHITECTURES = ("fastdepth", "monodepth2")
 METHODS = ("depth", "aleatoric", "evidential", "mc_dropout", "batch_ensemble")
 _MULTIPLE = 32  # [px] both architectures halve the image five times
+_SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
 _CHOICES = {
     "architecture": ARCHITECTURES,
     "method": METHODS,
@@ -24,7 +25,8 @@ _CHOICES = {
 }
 # Fields that say something of one architecture only; elsewhere they must keep their defaults, so that
 # two specs of the same network are equal.
-_ONLY = {"widths": "fastdepth", "positive": "fastdepth", "layers": "monodepth2", "strides": "monodepth2"}
+_ONLY = {"widths": "fastdepth", "norm": "fastdepth", "positive": "fastdepth"}
+_ONLY |= {"layers": "monodepth2", "strides": "monodepth2"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class NetworkSpec:
         method: "depth" (no variance), "aleatoric", "evidential", "mc_dropout" (aleatoric, sampled by its
             decoder's dropout) or "batch_ensemble" (aleatoric, ``members`` in one).
         widths: of FastDepth: "full", "pruned", or a multiple of the full ones.
+        norm: whether FastDepth has its batch norms, or has them folded into its convolutions.
         positive: how FastDepth's depth is kept from being negative: "relu" as published, or "softplus",
             which leaves no pixel without depth and gradient.
         layers: of monodepth2's ResNet.
@@ -55,6 +58,7 @@ class NetworkSpec:
     architecture: str = "fastdepth"
     method: str = "aleatoric"
     widths: str | float = "full"
+    norm: bool = True
     positive: str = "relu"
     layers: int = 50
     strides: str = "v1.5"
@@ -69,6 +73,8 @@ class NetworkSpec:
                 raise ValueError(f"NetworkSpec.{name} must be one of {list(choices)}, got {getattr(self, name)!r}")
         if not _is_width(self.widths):
             raise ValueError(f"NetworkSpec.widths must be 'full', 'pruned' or a positive number, got {self.widths!r}")
+        if type(self.norm) is not bool:
+            raise ValueError(f"NetworkSpec.norm must be true or false, got {self.norm!r}")
         if not _is_number(self.dropout) or not 0 <= self.dropout < 1:
             raise ValueError(f"NetworkSpec.dropout must lie in [0, 1), got {self.dropout!r}")
         if self.method == "mc_dropout" and not self.dropout:
@@ -78,8 +84,10 @@ class NetworkSpec:
             wanted = "at least 2 for 'batch_ensemble'" if several else f"1 for {self.method!r}"
             raise ValueError(f"NetworkSpec.members must be {wanted}, got {self.members!r}")
         size = self.size
-        if type(size) is not tuple or len(size) != 2 or any(type(s) is not int or s < 1 or s % _MULTIPLE for s in size):
-            raise ValueError(f"NetworkSpec.size must be (height, width) in multiples of {_MULTIPLE} px, got {size!r}")
+        smallest = _SMALLEST[self.architecture]
+        if type(size) is not tuple or len(size) != 2 or not all(_is_side(side, smallest) for side in size):
+            wanted = f"multiples of {_MULTIPLE} px from {smallest} px on"
+            raise ValueError(f"NetworkSpec.size must be (height, width) in {wanted}, got {size!r}")
         for f in fields(self):
             if _ONLY.get(f.name, self.architecture) != self.architecture and getattr(self, f.name) != f.default:
                 raise ValueError(f"NetworkSpec.{f.name} is of {_ONLY[f.name]!r} only, not of {self.architecture!r}")
@@ -103,23 +111,28 @@ class NetworkSpec:
 
     def input(self) -> Preprocess:
         """What brings a camera image to the network's input."""
-        return Preprocess.nyu(self.size) if self.preprocess == "nyu" else Preprocess(size=self.size)
+        statistics: dict[str, Any] = {}
+        if self.architecture == "monodepth2":
+            from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD
+
+            statistics = {"mean": IMAGENET_MEAN, "std": IMAGENET_STD}
+        nyu = self.preprocess == "nyu"
+        return Preprocess.nyu(self.size, **statistics) if nyu else Preprocess(size=self.size, **statistics)
 
 
 def build_backbone(spec: NetworkSpec) -> Backbone:
     """The encoder and decoder of ``spec``, with random weights from torch's generator."""
-    options: dict[str, Any] = {"dropout": spec.dropout} if spec.dropout else {}
     backbone: Backbone
     if spec.architecture == "fastdepth":
         from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
 
         named = {"full": FastDepthWidths.full, "pruned": FastDepthWidths.pruned}
-        widths = FastDepthWidths.scaled(spec.widths) if spec.widths not in named else named[spec.widths]()
-        backbone = FastDepth(widths, positive=spec.positive, **options)
+        widths = named[spec.widths]() if isinstance(spec.widths, str) else FastDepthWidths.scaled(spec.widths)
+        backbone = FastDepth(widths, norm=spec.norm, dropout=spec.dropout, positive=spec.positive, size=spec.size)
     else:
         from ufmstar_torch.models.monodepth2 import MonodepthResNet
 
-        backbone = MonodepthResNet(layers=spec.layers, strides=spec.strides, **options)
+        backbone = MonodepthResNet(spec.layers, strides=spec.strides, dropout=spec.dropout, size=spec.size)
     backbone.preprocess = spec.input()
     return backbone
 
@@ -147,3 +160,7 @@ def _is_width(value: object) -> bool:
     if isinstance(value, str):
         return value in ("full", "pruned")
     return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")
+
+
+def _is_side(value: object, smallest: int) -> bool:
+    return type(value) is int and value >= smallest and not value % _MULTIPLE

@@ -1,0 +1,145 @@
+"""Ensembles (Lakshminarayanan et al. 2017): all members at once as the multi-inference baseline, and
+members that are loaded when their turn comes and need not stay on the device."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from ufmstar_torch.models.checkpoints import CheckpointError
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.pipeline import combine
+from ufmstar_torch.prediction import DepthPrediction
+
+
+class Ensemble(DepthNetwork):
+    """All members on every image ("Ensemble", the multi-inference baseline). ``UncertainDepth(members)``
+    alternates them instead.
+
+    Args:
+        members: networks that want the same input.
+
+    Raises:
+        ValueError: fewer than two members, or they want different inputs.
+    """
+
+    def __init__(self, members: Sequence[DepthNetwork]) -> None:
+        super().__init__()
+        if len(members) < 2:
+            raise ValueError(f"members must be at least two networks, got {len(members)}")
+        wanted = [member.preprocess for member in members]
+        if any(other != wanted[0] for other in wanted):
+            raise ValueError(f"members must want the same input, got {wanted}")
+        self.members = nn.ModuleList(members)
+        self.preprocess = wanted[0]
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Mean depth [B, H, W] [m], mean A, and the variance between the members (+ mean E) as E [m^2] of
+        ``image`` [B, 3, H, W]; one inference after the other."""
+        return combine([member(image) for member in self.members])
+
+
+class LazyMember(DepthNetwork):
+    """A network that is loaded when it is first called. For inference.
+
+    ``.to()`` decides where and in which type it will run, before and after loading. Its weights are no part of
+    its state_dict, whether loaded or not: they are in its file. A copy loads them anew.
+
+    Args:
+        load: returns the network, on the CPU; called once, again after it raised.
+        preprocess: the network's, which is needed before it is loaded.
+        name: for error messages.
+        offload: keep the weights in host memory and copy them to the device for the length of a call only.
+            On the CPU there is nothing to copy.
+    """
+
+    _where: Tensor
+
+    def __init__(
+        self, load: Callable[[], DepthNetwork], preprocess: Preprocess, *, name: str = "member", offload: bool = False
+    ) -> None:
+        super().__init__()
+        self.preprocess = preprocess
+        self.name = name
+        self.offload = offload
+        self._load = load
+        # In a dict, so that nn.Module does not count it among its parts.
+        self._held: dict[str, DepthNetwork] = {}
+        self._lock = threading.Lock()
+        self.register_buffer("_where", torch.zeros(0), persistent=False)
+        self.eval()
+
+    @property
+    def loaded(self) -> bool:
+        """Whether the weights are in memory."""
+        return bool(self._held)
+
+    def network(self) -> DepthNetwork:
+        """The network itself, loaded now if it has not been: on the device, or with ``offload`` on the CPU.
+
+        Raises:
+            CheckpointError: it cannot be loaded; the message has its name and the reason.
+        """
+        with self._lock:  # a second thread waits instead of loading it twice
+            if not self._held:
+                self._held["network"] = self._placed(self._loaded())
+            return self._held["network"]
+
+    def _loaded(self) -> DepthNetwork:
+        try:
+            network = self._load()
+        except (OSError, RuntimeError, ValueError) as error:
+            raise CheckpointError(f"{self.name} cannot be loaded: {error}") from error
+        if not isinstance(network, DepthNetwork):
+            raise CheckpointError(f"{self.name} must be a DepthNetwork, got {type(network).__name__}")
+        if network.preprocess != self.preprocess:
+            raise CheckpointError(f"{self.name} wants the input {network.preprocess}, declared was {self.preprocess}")
+        return network.train(self.training)
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """What the network returns.
+
+        Raises:
+            CheckpointError: it cannot be loaded.
+        """
+        network, device = self.network(), self._where.device
+        if not self.offload or device.type == "cpu":
+            return network(image)
+        tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
+        # Copies for this call: nothing has to be copied back, and none is left behind by an error.
+        there = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
+        return functional_call(network, there, (image,))
+
+    def train(self, mode: bool = True) -> LazyMember:
+        """Also for a network that is loaded later."""
+        super().train(mode)
+        for network in self._held.values():
+            network.train(mode)
+        return self
+
+    def _placed(self, network: DepthNetwork) -> DepthNetwork:
+        device = "cpu" if self.offload else self._where.device
+        return network.to(device=device, dtype=self._where.dtype)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> LazyMember:
+        super()._apply(fn, recurse)
+        for network in self._held.values():
+            self._placed(network)
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and pickles: without the lock, and not loaded."""
+        return {**self.__dict__, "_held": {}, "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__({**state, "_lock": threading.Lock()})
+
+    def extra_repr(self) -> str:
+        """Whether it is loaded."""
+        return f"{self.name!r}, loaded={self.loaded}, offload={self.offload}"

@@ -1,0 +1,225 @@
+"""Trained networks in one file: tensors in the safetensors format, and beside them, as JSON, what builds the
+networks again (``NetworkSpec``) and how they were trained.
+
+Member n's tensors have the prefix "member.<n>."; a BatchEnsemble, whose members share theirs, is one network.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.models.batch_ensemble import BatchEnsemble
+from ufmstar_torch.models.checkpoints import CheckpointError, fill, read_safetensors, save_checkpoint
+from ufmstar_torch.models.dropout import MonteCarloDropout
+from ufmstar_torch.models.ensemble import LazyMember
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.spec import NetworkSpec, build_network
+
+FORMAT = "ufmstar_torch trained networks"
+VERSION = 1
+_HALF = torch.finfo(torch.float16)
+_KEYS = {"format", "version", "spec", "networks", "info"}
+
+
+@dataclass(frozen=True)
+class TrainedInfo:
+    """What a file says of itself.
+
+    Attributes:
+        path: of the file.
+        spec: of every network in it.
+        networks: how many there are (a BatchEnsemble is one).
+        info: what was given to :func:`save_trained`: the training's command, data, figures.
+    """
+
+    path: Path
+    spec: NetworkSpec
+    networks: int
+    info: dict[str, Any]
+
+    @property
+    def members(self) -> int:
+        """How many networks :func:`load_trained` makes of it."""
+        return self.networks * self.spec.members
+
+
+def save_trained(
+    path: str | Path,
+    networks: DepthNetwork | Sequence[DepthNetwork],
+    spec: NetworkSpec,
+    *,
+    half: bool = False,
+    info: Mapping[str, Any] | None = None,
+) -> None:
+    """Write trained networks, so that the file is either the old one or the whole new one.
+
+    Args:
+        path: .safetensors.
+        networks: as ``build_network(spec)`` made them, or within a ``MonteCarloDropout``; several are the
+            members of an ensemble.
+        spec: what builds them again.
+        half: weights in half precision. Tensors that it cannot hold (values beyond 65504; variances of a
+            batch norm below 6e-5, where its resolution ends) stay as they are.
+        info: plain values (JSON) that say where the weights come from.
+
+    Raises:
+        ValueError: no network, one that does not fit ``spec``, another suffix, or weights that are not finite.
+        TypeError: ``info`` holds something that JSON cannot.
+    """
+    path = Path(path)
+    members = [networks] if isinstance(networks, DepthNetwork) else list(networks)
+    if path.suffix != ".safetensors" or not members:
+        raise ValueError(f"need a file .safetensors and at least one network, got {path.name} and {len(members)}")
+    expected = {key: value.shape for key, value in _empty(spec).state_dict().items()}
+    state: dict[str, Tensor] = {}
+    for n, member in enumerate(members):
+        own = (member.network if isinstance(member, MonteCarloDropout) else member).state_dict()
+        if {key: value.shape for key, value in own.items()} != expected:
+            raise ValueError(f"network {n} ({type(member).__name__}) is not what its spec describes: {spec}")
+        state |= {f"member.{n}.{key}": value for key, value in own.items()}
+    if broken := [key for key, value in state.items() if not torch.isfinite(value).all()]:
+        raise ValueError(f"{broken[0]} has NaN or infinity ({len(broken)} such tensors): training diverged")
+    if half:
+        state = {key: value.half() if _fits_half(key, value) else value for key, value in state.items()}
+    metadata = {"format": FORMAT, "version": VERSION, "spec": spec.to_dict(), "networks": len(members)}
+    save_checkpoint(path, state, {**metadata, "info": dict(info or {})})
+
+
+def read_info(path: str | Path) -> TrainedInfo:
+    """What a file says of itself, without reading its weights.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: it is damaged, of another format or of a newer version.
+        ModuleNotFoundError: safetensors is not installed.
+    """
+    return _TrainedFile(Path(path)).info
+
+
+def load_trained(
+    path: str | Path | Iterable[str | Path], *, lazy: bool = False, offload: bool = False
+) -> list[DepthNetwork]:
+    """The networks in one or several files, in eval mode and on the CPU, as ``UncertainDepth`` alternates them.
+
+    "mc_dropout" comes as :class:`MonteCarloDropout`, "batch_ensemble" as its members, which share their weights.
+    Weights are float32, however they were stored.
+
+    Args:
+        path: a file, or several, whose networks follow each other.
+        lazy: read a network's weights when it is first called; what the files say of themselves is read now.
+        offload: as :class:`LazyMember` has it.
+
+    Raises:
+        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`read_info`; and where weights are
+            missing, unexpected, of another shape or not finite. With ``lazy`` that comes with the first call.
+    """
+    paths = [path] if isinstance(path, str | Path) else list(path)
+    members: list[DepthNetwork] = []
+    for file in [_TrainedFile(Path(p)) for p in paths]:
+        if not lazy and not offload:
+            members += [file.member(n) for n in range(file.info.members)]
+            continue
+        preprocess = file.info.spec.input()
+        later = [
+            LazyMember(_MemberOf(file, n), preprocess, name=f"{file.path}, member {n}", offload=offload)
+            for n in range(file.info.members)
+        ]
+        for member in later if not lazy else []:
+            member.network()
+        members += later
+    return members
+
+
+class _TrainedFile:
+    """One file, whose networks are read one by one. What they share is read once.
+
+    Raises:
+        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`read_info`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.info = _parse(path, read_safetensors(path, prefix=None)[1])
+        self._shared: dict[int, BatchEnsemble] = {}
+        self._lock = threading.Lock()
+
+    def member(self, n: int) -> DepthNetwork:
+        """Network n of :func:`load_trained`, in eval mode.
+
+        Raises:
+            CheckpointError: its weights are damaged or do not fit; names the file and the member.
+        """
+        method = self.info.spec.method
+        if method == "batch_ensemble":
+            index, turn = divmod(n, self.info.spec.members)
+            return self._batch_ensemble(index).member(turn)
+        network = self._read(n)
+        return MonteCarloDropout(network).eval() if method == "mc_dropout" else network
+
+    def __reduce__(self) -> tuple[type[_TrainedFile], tuple[Path]]:
+        return _TrainedFile, (self.path,)  # a copy reads the file again
+
+    def _batch_ensemble(self, index: int) -> BatchEnsemble:
+        with self._lock:
+            if index not in self._shared:
+                network = self._read(index)
+                assert isinstance(network, BatchEnsemble)
+                self._shared[index] = network
+            return self._shared[index]
+
+    def _read(self, index: int) -> DepthNetwork:
+        with torch.random.fork_rng(devices=[]):  # weights that are overwritten must not use up the caller's seed
+            network = build_network(self.info.spec)
+        fill(network, read_safetensors(self.path, f"member.{index}.")[0], f"{self.path}, member {index},")
+        return network.eval()
+
+
+@dataclass(frozen=True)
+class _MemberOf:
+    """Reads one member: a loader for :class:`LazyMember` that can be copied and pickled."""
+
+    file: _TrainedFile
+    n: int
+
+    def __call__(self) -> DepthNetwork:
+        return self.file.member(self.n)
+
+
+def _parse(path: Path, metadata: Any) -> TrainedInfo:
+    """What a file says of itself, checked."""
+    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+        raise CheckpointError(f"{path} holds no trained networks of this package (it does not name the format)")
+    version = metadata.get("version")
+    if version != VERSION:
+        newer = isinstance(version, int) and version > VERSION
+        advice = "written by a newer release of this package: update it" if newer else "which never was"
+        raise CheckpointError(f"{path} is of version {version!r}, {advice} (this one reads {VERSION})")
+    count, info = metadata.get("networks"), metadata.get("info")
+    if set(metadata) != _KEYS or type(count) is not int or count < 1 or not isinstance(info, dict):
+        raise CheckpointError(f"{path} has damaged metadata: {sorted(metadata)}, networks {count!r}")
+    try:
+        spec = NetworkSpec.from_dict(metadata["spec"])
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{path} has a spec that cannot be built: {error}") from error
+    return TrainedInfo(path, spec, count, info)
+
+
+def _empty(spec: NetworkSpec) -> DepthNetwork:
+    """The network's structure, without memory for weights."""
+    with torch.device("meta"):
+        return build_network(spec)
+
+
+def _fits_half(key: str, value: Tensor) -> bool:
+    """Whether half precision holds a tensor: small weights may become 0, a variance that is divided by may not."""
+    if value.dtype not in (torch.float32, torch.float64) or not value.numel():
+        return False
+    tiny = key.endswith("running_var") and value.min() < _HALF.tiny
+    return not tiny and bool(value.abs().max() <= _HALF.max)
