@@ -15,9 +15,24 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.checkpoints import load_state_dict_file as load_state_dict_file
     from ufmstar_torch.models.checkpoints import load_weights as load_weights
     from ufmstar_torch.models.checkpoints import save_checkpoint as save_checkpoint
+    from ufmstar_torch.models.distribution import DepthDistribution as DepthDistribution
+    from ufmstar_torch.models.distribution import EvidentialDepth as EvidentialDepth
+    from ufmstar_torch.models.distribution import GaussianDepth as GaussianDepth
+    from ufmstar_torch.models.distribution import PointDepth as PointDepth
+    from ufmstar_torch.models.dropout import DecoderDropout as DecoderDropout
+    from ufmstar_torch.models.dropout import MonteCarloDropout as MonteCarloDropout
+    from ufmstar_torch.models.dropout import set_sampling as set_sampling
     from ufmstar_torch.models.fastdepth import FastDepth as FastDepth
     from ufmstar_torch.models.fastdepth import FastDepthWidths as FastDepthWidths
+    from ufmstar_torch.models.heads import AleatoricNetwork as AleatoricNetwork
+    from ufmstar_torch.models.heads import DepthOnlyNetwork as DepthOnlyNetwork
+    from ufmstar_torch.models.heads import EvidentialNetwork as EvidentialNetwork
+    from ufmstar_torch.models.heads import UncertaintyNetwork as UncertaintyNetwork
+    from ufmstar_torch.models.heads import with_head as with_head
     from ufmstar_torch.models.load import load_network as load_network
+    from ufmstar_torch.models.monodepth2 import MonodepthResNet as MonodepthResNet
+    from ufmstar_torch.models.monodepth2_import import load_monodepth2 as load_monodepth2
+    from ufmstar_torch.models.network import Backbone as Backbone
     from ufmstar_torch.models.network import DepthNetwork as DepthNetwork
     from ufmstar_torch.models.onnx_network import OnnxNetwork as OnnxNetwork
     from ufmstar_torch.models.onnx_network import OnnxSpec as OnnxSpec
@@ -25,19 +40,34 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.preprocess import Preprocess as Preprocess
 
 _HOME = {
+    "AleatoricNetwork": "heads",
+    "Backbone": "network",
     "CheckpointError": "checkpoints",
+    "DecoderDropout": "dropout",
+    "DepthDistribution": "distribution",
     "DepthNetwork": "network",
+    "DepthOnlyNetwork": "heads",
+    "EvidentialDepth": "distribution",
+    "EvidentialNetwork": "heads",
     "FastDepth": "fastdepth",
     "FastDepthWidths": "fastdepth",
+    "GaussianDepth": "distribution",
+    "MonodepthResNet": "monodepth2",
+    "MonteCarloDropout": "dropout",
     "OnnxNetwork": "onnx_network",
     "OnnxSpec": "onnx_network",
     "OutputSpec": "outputs",
+    "PointDepth": "distribution",
     "Preprocess": "preprocess",
+    "UncertaintyNetwork": "heads",
     "WrappedNetwork": "any_network",
+    "load_monodepth2": "monodepth2_import",
     "load_network": "load",
     "load_state_dict_file": "checkpoints",
     "load_weights": "checkpoints",
     "save_checkpoint": "checkpoints",
+    "set_sampling": "dropout",
+    "with_head": "heads",
     "wrap_network": "any_network",
 }
 

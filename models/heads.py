@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -53,7 +54,7 @@ class DepthOnlyNetwork(UncertaintyNetwork):
 
     def distribution(self, image: Tensor) -> PointDepth:
         """The backbone's depth."""
-        return PointDepth(self.backbone.depth(self.backbone.features(image)))
+        return PointDepth(_single(self.backbone.depth(self.backbone.features(image))))
 
 
 class AleatoricNetwork(UncertaintyNetwork):
@@ -66,7 +67,8 @@ class AleatoricNetwork(UncertaintyNetwork):
     def distribution(self, image: Tensor) -> GaussianDepth:
         """Depth and log-variance within :data:`LOG_VARIANCE_RANGE`."""
         features = self.backbone.features(image)
-        return GaussianDepth(self.backbone.depth(features), soft_range(self.head(features)[:, 0], *LOG_VARIANCE_RANGE))
+        log_variance = soft_range(_single(self.head(features)[:, 0]), *LOG_VARIANCE_RANGE)
+        return GaussianDepth(_single(self.backbone.depth(features)), log_variance)
 
 
 class EvidentialNetwork(UncertaintyNetwork):
@@ -79,17 +81,40 @@ class EvidentialNetwork(UncertaintyNetwork):
     def distribution(self, image: Tensor) -> EvidentialDepth:
         """gamma is the backbone's depth; nu, alpha - 1 and beta are softplus of the head's channels."""
         features = self.backbone.features(image)
-        nu, alpha, beta = F.softplus(self.head(features)).unbind(1)
-        return EvidentialDepth(
-            self.backbone.depth(features), nu + EVIDENCE_FLOOR, alpha + (1 + EVIDENCE_FLOOR), beta + BETA_FLOOR
-        )
+        nu, alpha, beta = F.softplus(_single(self.head(features))).unbind(1)
+        depth = _single(self.backbone.depth(features))
+        return EvidentialDepth(depth, nu + EVIDENCE_FLOOR, alpha + (1 + EVIDENCE_FLOOR), beta + BETA_FLOOR)
+
+
+HEADS: dict[str, type[UncertaintyNetwork]] = {
+    "depth": DepthOnlyNetwork,
+    "aleatoric": AleatoricNetwork,
+    "evidential": EvidentialNetwork,
+}
+
+
+def with_head(backbone: Backbone, method: str) -> UncertaintyNetwork:
+    """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential".
+
+    Raises:
+        ValueError: another method.
+    """
+    if method not in HEADS:
+        raise ValueError(f"method must be one of {list(HEADS)}, got {method!r}")
+    return HEADS[method](backbone)
 
 
 def soft_range(x: Tensor, low: float, high: float) -> Tensor:
-    """x, bent smoothly into (low, high): equal to x well inside, with a gradient everywhere.
+    """x, bent smoothly into [low, high]: equal to x well inside, never decreasing.
 
-    low + softplus(x - low) from below, and the same mirrored from above. Unlike a clamp it cannot leave a
-    pixel without a gradient.
+    low + softplus(x - low) from below, and the same mirrored from above. Unlike a clamp it keeps a gradient
+    outside, which falls as exp(-distance): in single precision it is 0 only some 100 beyond an end.
     """
     x = low + F.softplus(x - low)
     return high - F.softplus(high - x)
+
+
+def _single(x: Tensor) -> Tensor:
+    """At least single precision: in half precision 1 + EVIDENCE_FLOOR is 1 and exp(LOG_VARIANCE_RANGE[1])
+    infinite, and a depth in bfloat16 has steps of more than a centimetre from 2 m on."""
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x

@@ -1,0 +1,250 @@
+"""ResNet50-Monodepth2: a ResNet encoder with Monodepth2's U-Net decoder (Godard et al., ICCV 2019), predicting
+metric depth.
+
+Written from the paper (section 3 and the supplementary's table of layers): five levels of 3x3 convolution,
+ELU, doubling by repeating pixels, concatenation with the encoder's features and another 3x3 convolution, with
+reflected borders. Where Monodepth2 ends in a sigmoid disparity at four scales, one convolution and a softplus
+give depth in metres at full resolution.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ufmstar_torch.models.checkpoints import CheckpointError, load_state_dict_file
+from ufmstar_torch.models.dropout import DecoderDropout
+from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models.preprocess import Preprocess
+
+MULTIPLE = 32  # [px] five halvings
+SMALLEST = 64  # [px] borders cannot be reflected in a map of a single pixel
+LEVELS = 5
+LAYERS = (18, 34, 50)
+STRIDES = ("v1.5", "v1")
+# Channels of the decoder's levels, from full resolution down to 1/16 (Godard et al., supplementary).
+DECODER_WIDTHS = (16, 32, 64, 128, 256)
+# ImageNet's colour statistics, for RGB in [0, 1].
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+# [m] About the depth that an untrained network predicts: typical of rooms.
+INITIAL_DEPTH = 2.5
+
+
+class ResNetEncoder(nn.Module):
+    """torchvision's ResNet without its classifier, under torchvision's own keys.
+
+    Args:
+        layers: 18, 34 or 50.
+        strides: where the bottlenecks that halve the resolution do so: "v1.5", in their 3x3 convolution, as in
+            torchvision, or "v1", in the 1x1 before it, as in the original paper. Weights were trained for one of
+            the two and cannot tell which. Without bottlenecks (18, 34) there is no such difference.
+
+    Raises:
+        ValueError: other layers or strides.
+        ModuleNotFoundError: torchvision is not installed.
+    """
+
+    def __init__(self, layers: int = 50, strides: str = "v1.5") -> None:
+        super().__init__()
+        if layers not in LAYERS:
+            raise ValueError(f"layers must be one of {LAYERS}, got {layers}")
+        if strides not in STRIDES:
+            raise ValueError(f"strides must be one of {STRIDES}, got {strides!r}")
+        resnet = getattr(_torchvision_models(), f"resnet{layers}")(weights=None)
+        self.conv1, self.bn1 = resnet.conv1, resnet.bn1
+        self.layer1, self.layer2, self.layer3, self.layer4 = resnet.layer1, resnet.layer2, resnet.layer3, resnet.layer4
+        # At 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution.
+        self.channels = (64, *(resnet.fc.in_features // 2**i for i in (3, 2, 1, 0)))
+        if strides == "v1" and layers >= 50:
+            for stage in (self.layer2, self.layer3, self.layer4):
+                stage[0].conv1.stride, stage[0].conv2.stride = stage[0].conv2.stride, stage[0].conv1.stride
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Five maps [B, channels[i], H / 2^(i+1), W / 2^(i+1)] of ``image`` [B, 3, H, W]."""
+        maps = [F.relu(self.bn1(self.conv1(image)))]
+        x = F.max_pool2d(maps[0], 3, stride=2, padding=1)
+        for stage in (self.layer1, self.layer2, self.layer3, self.layer4):
+            x = stage(x)
+            maps.append(x)
+        return maps
+
+
+class UpConvolution(nn.Module):
+    """One level of the decoder: convolve, double, concatenate with the skip, convolve."""
+
+    def __init__(self, inputs: int, skip: int, outputs: int, dropout: float) -> None:
+        super().__init__()
+        self.before = _convolution(inputs, outputs)
+        self.after = _convolution(outputs + skip, outputs)
+        self.dropout = DecoderDropout(dropout)
+
+    def forward(self, x: Tensor, skip: Tensor | None) -> Tensor:
+        x = F.interpolate(F.elu(self.before(x)), scale_factor=2.0, mode="nearest")
+        x = x if skip is None else torch.cat([x, skip], 1)
+        return self.dropout(F.elu(self.after(x)))
+
+
+class MonodepthResNet(Backbone):
+    """Monocular metric depth with a ResNet encoder and Monodepth2's decoder.
+
+    ``preprocess`` makes its input: NYU's crop, 224 x 224, normalised by ImageNet's colour statistics. The
+    weights are those of a start from scratch (depth about :data:`INITIAL_DEPTH` everywhere);
+    :meth:`imagenet`, ``load_monodepth2`` and ``checkpoints.load_weights`` fill in trained ones.
+
+    Args:
+        layers: of the encoder, 18, 34 or 50.
+        strides: of the encoder, "v1.5" or "v1": see :class:`ResNetEncoder`.
+        dropout: probability of decoder dropout, after each of the five levels.
+        decoder: channels of the five levels, full resolution first.
+        size: (height, width) [px], multiples of 32 and at least 64, that ``preprocess`` makes.
+
+    Raises:
+        ValueError: an argument is out of range.
+        ModuleNotFoundError: torchvision is not installed.
+    """
+
+    def __init__(
+        self,
+        layers: int = 50,
+        *,
+        strides: str = "v1.5",
+        dropout: float = 0.0,
+        decoder: tuple[int, ...] = DECODER_WIDTHS,
+        size: tuple[int, int] = (224, 224),
+    ) -> None:
+        super().__init__()
+        if len(decoder) != LEVELS or min(decoder) < 1:
+            raise ValueError(f"decoder must be {LEVELS} positive numbers of channels, got {decoder}")
+        if not _fits(*size):
+            raise ValueError(f"size must be multiples of {MULTIPLE} px, at least {SMALLEST}, got {size}")
+        self.layers, self.strides = layers, strides
+        self.preprocess = Preprocess.nyu(size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
+        self.feature_channels = decoder[0]
+        self.encoder = ResNetEncoder(layers, strides)
+        skips = (0, *self.encoder.channels[:-1])  # of levels 0 to 4
+        inputs = (*decoder[1:], self.encoder.channels[-1])
+        # levels[i] makes features at 1/2^i of the resolution; level 4 runs first.
+        self.levels = nn.ModuleList(
+            UpConvolution(inputs[i], skips[i], decoder[i], dropout=dropout) for i in range(LEVELS)
+        )
+        self.head = _convolution(decoder[0], 1)
+        assert self.head.bias is not None
+        nn.init.constant_(self.head.bias, math.log(math.expm1(INITIAL_DEPTH)))
+
+    def features(self, image: Tensor) -> Tensor:
+        """The decoder's output, from which the head reads depth.
+
+        Args:
+            image: [B, 3, H, W] normalised as ``preprocess`` does; H and W multiples of 32, at least 64.
+
+        Returns:
+            [B, decoder[0], H, W].
+
+        Raises:
+            ValueError: the image has another shape or type.
+        """
+        _check_image(image)
+        skips = self.encoder(image)
+        x = skips.pop()
+        for level in reversed(self.levels):
+            x = level(x, skips.pop() if skips else None)
+        return x
+
+    def depth(self, features: Tensor) -> Tensor:
+        """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, hence positive."""
+        return F.softplus(self.head(features))[:, 0]
+
+    @classmethod
+    def imagenet(
+        cls, weights: Any = None, layers: int = 50, *, strides: str = "v1.5", **options: Any
+    ) -> MonodepthResNet:
+        """The network with an encoder trained on ImageNet, the decoder untrained.
+
+        Args:
+            weights: a file (.pth, .safetensors, ...) of torchvision's keys, with or without classifier, of any
+                floating-point type (a batch norm's variance too large for half precision, stored as infinity,
+                is taken as half's largest number, 65504); or one of torchvision's weights enums, which it
+                downloads once; None: torchvision's default for these layers.
+            layers: 18, 34 or 50.
+            strides: what the weights were trained with; "v1.5" for all of torchvision's own.
+            options: other arguments of the class.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            CheckpointError: the file does not fit the encoder tensor by tensor.
+            ValueError: an argument is out of range, or torchvision's weights with strides "v1".
+        """
+        network = cls(layers, strides=strides, **options)
+        if weights is None:
+            weights = _torchvision_models().get_model_weights(f"resnet{layers}").DEFAULT
+        if isinstance(weights, str | Path):
+            state = load_state_dict_file(weights)
+        elif strides != "v1.5":
+            raise ValueError(f"torchvision's weights have strides 'v1.5', got strides={strides!r}")
+        else:
+            state = weights.get_state_dict(progress=False, check_hash=True)
+        _fill_encoder(network.encoder, state, str(weights))
+        return network
+
+
+def _fill_encoder(encoder: ResNetEncoder, state: Mapping[str, Tensor], source: str) -> None:
+    """Load every tensor of a classifier's weights but the classifier itself.
+
+    Raises:
+        CheckpointError: tensors are missing, unexpected, of another shape or not finite; the encoder is
+            unchanged then.
+    """
+    state = {key: _within_half(key, value) for key, value in state.items() if not key.startswith("fc.")}
+    expected = encoder.state_dict()
+    # Files older than PyTorch 0.4.1 do not count batches; nothing here reads the count.
+    missing = {key for key in expected if not key.endswith("num_batches_tracked")} - set(state)
+    wrong = sorted(missing | (set(state) - set(expected)))
+    wrong += [key for key in state if key in expected and state[key].shape != expected[key].shape]
+    wrong += [key for key in state if not torch.isfinite(state[key]).all()]
+    if wrong:
+        raise CheckpointError(
+            f"{source} does not fit the ResNet encoder: {len(wrong)} of its {len(expected)} tensors are missing, "
+            f"unexpected, of another shape or not finite, first {wrong[0]!r}"
+        )
+    encoder.load_state_dict(expected | state, strict=True)
+
+
+def _within_half(key: str, value: Tensor) -> Tensor:
+    """An overflowed variance as the largest one: as infinity it would turn its channel into a constant."""
+    if value.dtype != torch.float16 or not key.endswith("running_var"):
+        return value
+    return value.clamp(max=torch.finfo(torch.float16).max)
+
+
+def _convolution(inputs: int, outputs: int) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1, padding_mode="reflect")
+
+
+def _torchvision_models() -> Any:
+    """torchvision, imported when first needed: it takes seconds."""
+    try:
+        import torchvision.models
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("a ResNet encoder needs torchvision: pip install torchvision") from error
+    return torchvision.models
+
+
+def _fits(height: int, width: int) -> bool:
+    return not height % MULTIPLE and not width % MULTIPLE and min(height, width) >= SMALLEST
+
+
+def _check_image(image: Tensor) -> None:
+    if image.dim() != 4 or image.shape[1] != 3 or not torch.is_floating_point(image):
+        raise ValueError(f"image must be floating-point [B, 3, H, W], got {image.dtype} {tuple(image.shape)}")
+    if not _fits(*image.shape[-2:]):
+        raise ValueError(
+            f"image must have a height and width that are multiples of {MULTIPLE} px, at least {SMALLEST}, got "
+            f"{image.shape[-2]} x {image.shape[-1]}; MonodepthResNet.preprocess makes such images"
+        )
