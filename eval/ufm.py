@@ -224,12 +224,10 @@ class UfM(nn.Module):
     def _observation_variance(self, frame: FrameInput) -> Tensor:
         """[B, H, W] s^2 of one observation [m^2]: what the network states, 0 if it states nothing."""
         s2 = torch.zeros_like(frame.depth)
-        for value, wanted in (
-            (frame.aleatoric, self.config.add_aleatoric),
-            (frame.epistemic, self.config.add_epistemic),
-        ):
-            if value is not None and wanted:
-                s2 = s2 + value.detach()
+        if frame.aleatoric is not None and self.config.add_aleatoric:
+            s2 = s2 + frame.aleatoric.detach()
+        if frame.epistemic is not None and self.config.add_epistemic:
+            s2 = s2 + frame.epistemic.detach()
         return s2
 
     def _streams(self, frame: FrameInput) -> tuple[list[Cloud], dict[str, Tensor]]:

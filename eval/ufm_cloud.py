@@ -2,9 +2,9 @@
 
 UfM (Sudhakar, Karaman, Sze, "Uncertainty from Motion for DNN Monocular Depth Estimation", ICRA 2022) keeps every
 predicted pixel as a point with a mean, a covariance and a count. Two differences from the authors' release, both on
-purpose: the points stay in the frame of the first camera, where the release moves all of them into each
-new camera and lets rotations that are not quite orthonormal add up; and off-diagonal entries of the covariance keep their sign,
-where the release sets every negative one to zero through a mistyped threshold.
+purpose. The points stay in the frame of the first camera; the release moves all of them into each new
+camera, where rotations that are not quite orthonormal add up. And covariances keep negative entries, which the
+release sets to zero through a mistyped threshold.
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ class Taken:
 def take_in(cloud: Cloud, view: View, max_points: int | None) -> Taken:
     """Steps 1 to 5 of a frame: correspond, fuse, read out, append, prune.
 
-    A point corresponds to the pixel that it is projected into, whatever lies in between: no occlusion, no test of the depth.
-    Points that land on an invalid pixel are left as they are.
+    A point corresponds to the pixel that it is projected into, whatever lies in between: there is no test of
+    occlusion or depth. Points that land on an invalid pixel are left as they are.
 
     Args:
         cloud: in the frame of the first camera; not modified.

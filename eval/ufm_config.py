@@ -11,12 +11,13 @@ from typing import Any
 class UfMConfig:
     """Everything UfM can be told.
 
-    With an aleatoric network the defaults are its "aleatoric" mode, with the members of an ensemble in turn or with
-    a stochastic network its "ensemble" and "MC-dropout" modes, and with a network without variances "depth only": what differs
-    is what the network hands over. Its "full" mode is mean depth, A and E of several inferences.
+    The modes of the paper differ only in what a network hands over. "Aleatoric": depth and A. "Ensemble" and
+    "MC-dropout": the members in turn, or one stochastic pass. "Depth only": no variance, s^2 = 0. "Full": mean
+    depth, A and E of several inferences.
 
     Attributes:
         max_points: points kept per stream; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = all.
+            With fewer than an image has pixels, points are dropped before they are seen again.
         add_aleatoric: let A, where it is given, be part of s^2, the variance of a single observation.
         add_epistemic: likewise E.
         rotation_tolerance: max |R^T R - I| of a pose; less is removed by projection onto SO(3), more is a fault.

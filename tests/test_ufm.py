@@ -6,12 +6,12 @@ import copy
 import io
 
 import numpy as np
+import oracle_ufm
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import oracle_ufm
 import scenes
 from ufmstar_torch.eval.ufm import UfM, UfMConfig
 from ufmstar_torch.eval.ufm_cloud import Cloud
@@ -72,7 +72,7 @@ def agree(ufm, b, oracle, tolerance=1e-9):
 # ---- against the oracle ----
 
 
-@pytest.mark.parametrize("cap", [None, CAP, H * W // 2], ids=["all", "pruned", "first frame too large"])
+@pytest.mark.parametrize("cap", [None, CAP, H * W - 30], ids=["all", "pruned", "first frame too large"])
 def test_agrees_with_the_loops(cap):
     ufm, oracle = UfM(UfMConfig(max_points=cap), dtype=torch.float64), oracle_ufm.UfM(cap)
     pruned = 0
@@ -83,7 +83,7 @@ def test_agrees_with_the_loops(cap):
         pruned += int(out.statistics.dropped)
     agree(ufm, 0, oracle)
     assert (pruned > 0) == (cap is not None)
-    assert int(ufm.clouds()[0].count.max()) > 5, "points must have been seen again"
+    assert int(ufm.clouds()[0].count.max()) > 2, "points must have been seen again"
 
 
 def test_a_batch_of_streams_equals_each_stream_alone():
@@ -251,10 +251,8 @@ def test_points_out_of_view_are_pruned_first_and_the_oldest_of_them():
         out = ufm(plane(1.0), moved(x), K1)
     assert out.statistics.dropped.tolist() == [3]
     assert ufm.clouds()[0].mean[:, 0].tolist() == [3, 100, 101, 102, 103, 200, 201, 202, 203]
-    out = ufm(plane(1.0), moved(0.0), K1)  # the oldest is in view again, the others are not
-    assert ufm.clouds()[0].mean[:, 0].tolist() == [3, 102, 103, 200, 201, 202, 203, 0, 1, 2][0:1] + [
-        103, 200, 201, 202, 203, 0, 1, 2
-    ]  # fmt: skip
+    ufm(plane(1.0), moved(0.0), K1)  # the oldest is in view again, the others are not
+    assert ufm.clouds()[0].mean[:, 0].tolist() == [3, 103, 200, 201, 202, 203, 0, 1, 2]
 
 
 def test_pruning_takes_points_in_view_when_none_other_is_left():
