@@ -95,6 +95,8 @@ class EpochLoader:
         pin_memory: for copies to a GPU.
     """
 
+    batch_sampler: None = None  # Lightning asks for it wherever there is a ``sampler``
+
     def __init__(self, dataset: SampleDataset, batches: EpochBatches, *, workers: int = 0, pin_memory: bool = False):
         self.dataset, self.batches = dataset, batches
         self._loader: DataLoader[Sample] = DataLoader(
