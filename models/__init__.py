@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.checkpoints import load_state_dict_file as load_state_dict_file
     from ufmstar_torch.models.checkpoints import load_weights as load_weights
     from ufmstar_torch.models.checkpoints import save_checkpoint as save_checkpoint
-    from ufmstar_torch.models.distribution import DepthDistribution as DepthDistribution
     from ufmstar_torch.models.distribution import EvidentialDepth as EvidentialDepth
     from ufmstar_torch.models.distribution import GaussianDepth as GaussianDepth
     from ufmstar_torch.models.distribution import PointDepth as PointDepth
@@ -44,7 +43,6 @@ _HOME = {
     "Backbone": "network",
     "CheckpointError": "checkpoints",
     "DecoderDropout": "dropout",
-    "DepthDistribution": "distribution",
     "DepthNetwork": "network",
     "DepthOnlyNetwork": "heads",
     "EvidentialDepth": "distribution",

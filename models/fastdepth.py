@@ -216,13 +216,17 @@ class FastDepth(Backbone):
         return self.head(features)[:, 0]
 
     @classmethod
-    def from_onnx(cls, path: str | Path) -> FastDepth:
+    def from_onnx(cls, path: str | Path, *, dropout: float = 0.0, size: tuple[int, int] = (224, 224)) -> FastDepth:
         """The network with the weights of an ONNX export, in eval mode.
 
         The widths are read from the file; every convolution's place in the graph is compared with this
         network's, every initialiser must be used and every parameter filled. Batch norms stay batch norms
         (with their counters), so fine-tuning goes on as if from a checkpoint after ``.train()``; a file
         that has them folded gives a network without norm layers (``norm=False``).
+
+        Args:
+            path: the ONNX file.
+            dropout, size: as in the class.
 
         Raises:
             ModuleNotFoundError: ``onnx`` is not installed.
@@ -238,7 +242,7 @@ class FastDepth(Backbone):
             raise ValueError(f"{path} has batch norm after some convolutions only; export all or none folded")
         outputs = [layer.weight.shape[0] for layer in layers]
         encoder, decoder = (outputs[0], *outputs[2:27:2]), tuple(outputs[28:37:2])
-        network = cls(FastDepthWidths(encoder, decoder), norm=not folded.pop())
+        network = cls(FastDepthWidths(encoder, decoder), norm=not folded.pop(), dropout=dropout, size=size)
         network._fill(layers, str(path))
         return network.eval()
 

@@ -18,7 +18,9 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
         name: one of :func:`network_names`.
         weights: the file it is loaded from.
         options: what the network of that name takes:
-            fastdepth: none. ``weights``: an ONNX export, or a state_dict (.pth, .pt, .safetensors).
+            fastdepth: ``size``, ``dropout``, and ``positive`` with a state_dict. ``weights``: an ONNX export, or a
+                state_dict (.pth, .pt, .safetensors).
+            monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict.
             onnx: ``spec`` (an ``OnnxSpec``, a dict or a JSON file), ``threads``, ``providers``.
             torchscript, exported: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file).
 
@@ -39,18 +41,38 @@ def network_names() -> tuple[str, ...]:
     return tuple(sorted(_BUILDERS))
 
 
-def _fastdepth(weights: Path) -> DepthNetwork:
+def _fastdepth(
+    weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, positive: str = "relu"
+) -> DepthNetwork:
     from ufmstar_torch.models.checkpoints import load_state_dict_file, load_weights
     from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
 
     if weights.suffix == ".onnx":
-        return FastDepth.from_onnx(weights)
+        if positive != "relu":
+            raise ValueError(f"an ONNX export of FastDepth ends in a ReLU, got positive={positive!r}")
+        return FastDepth.from_onnx(weights, dropout=dropout, size=size)
     state = load_state_dict_file(weights)
     try:
         widths = FastDepthWidths.of_state_dict(state)
     except ValueError as error:
         raise ValueError(f"{weights}: {error}") from error
-    network = FastDepth(widths, norm="encoder.0.norm.weight" in state)
+    norm = "encoder.0.norm.weight" in state
+    network = FastDepth(widths, norm=norm, dropout=dropout, positive=positive, size=size)
+    load_weights(network, weights)
+    return network
+
+
+def _monodepth2(
+    weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, strides: str = "v1.5"
+) -> DepthNetwork:
+    from ufmstar_torch.models.checkpoints import load_state_dict_file, load_weights
+    from ufmstar_torch.models.monodepth2 import MonodepthResNet, shape_of_state_dict
+
+    try:
+        layers, decoder = shape_of_state_dict(load_state_dict_file(weights))
+    except ValueError as error:
+        raise ValueError(f"{weights}: {error}") from error
+    network = MonodepthResNet(layers, strides=strides, dropout=dropout, decoder=decoder, size=size)
     load_weights(network, weights)
     return network
 
@@ -98,6 +120,7 @@ def _declared(spec: Any) -> tuple[OutputSpec, Preprocess]:
 _BUILDERS: dict[str, Callable[..., DepthNetwork]] = {
     "exported": _exported,
     "fastdepth": _fastdepth,
+    "monodepth2": _monodepth2,
     "onnx": _onnx,
     "torchscript": _torchscript,
 }

@@ -194,6 +194,22 @@ class MonodepthResNet(Backbone):
         return network
 
 
+def shape_of_state_dict(state: Mapping[str, Tensor]) -> tuple[int, tuple[int, ...]]:
+    """(layers, decoder) of the :class:`MonodepthResNet` that a state_dict belongs to; strides it cannot tell.
+
+    Raises:
+        ValueError: a tensor that tells them is missing.
+    """
+    decoder = [f"levels.{i}.before.weight" for i in range(LEVELS)]
+    missing = [key for key in ("encoder.layer1.0.conv2.weight", *decoder) if key not in state]
+    if missing:
+        raise ValueError(f"not the weights of a MonodepthResNet: no {missing[0]!r} ({len(missing)} such keys missing)")
+    # Two, or three, blocks of two convolutions in the first stage; or three of three.
+    deep = 34 if "encoder.layer1.2.conv1.weight" in state else 18
+    layers = 50 if "encoder.layer1.0.conv3.weight" in state else deep
+    return layers, tuple(len(state[key]) for key in decoder)
+
+
 def _fill_encoder(encoder: ResNetEncoder, state: Mapping[str, Tensor], source: str) -> None:
     """Load every tensor of a classifier's weights but the classifier itself.
 
