@@ -174,11 +174,11 @@ def make_sample(
         augmentation: or None.
         seed: of the augmentation: the same numbers give the same sample.
     """
-    image = raw.image.to(torch.float32)[None] / 255
+    image = raw.image.to(torch.float32) / 255
     depth = torch.where(raw.depth.isfinite() & (raw.depth > 0), raw.depth, 0.0).to(torch.float32)
     K = raw.intrinsics.to(torch.float64)
     if augmentation is not None:
         image, depth, K = augmentation(image, depth, K, seed)
-    x, K_network = preprocess(image, K)
+    x, K_network = preprocess(image[None], K)
     depth = preprocess.apply_depth(depth)
     return Sample(image=x[0], depth=depth.contiguous(), valid=depth > 0, intrinsics=K_network)

@@ -1,0 +1,256 @@
+"""Augmentation: re-projection of known points, depth never mixed, seeds, colour as Pillow does it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageEnhance
+from torch import Tensor
+
+from ufmstar_torch.eval import synthetic
+from ufmstar_torch.train.augment import (
+    Augmentation,
+    AugmentationConfig,
+    Change,
+    apply_colour,
+    apply_geometry,
+    camera_change,
+    draw,
+)
+
+SIZE = (120, 160)
+# Pixels that are not square, a principal point far from the centre, and skew: nothing may hide in symmetry.
+K = torch.tensor([[130.0, 0.7, 70.0], [0.0, 141.0, 66.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+SIGMA = 3.0  # [px]
+
+CHANGES = {
+    "none": Change(),
+    "flip": Change(flip=True),
+    "zoom": Change(scale=1.5),
+    "roll": Change(angle=0.087),
+    "rollback": Change(angle=-0.087, flip=True),
+    "shift": Change(scale=1.3, shift=(11.0, -7.5)),
+    "all": Change(scale=1.4, angle=0.08, flip=True, shift=(-9.25, 6.5)),
+}
+
+
+def project(point: Tensor, intrinsics: Tensor) -> Tensor:
+    x = intrinsics @ point
+    return x[:2] / x[2]
+
+
+def seen_by_new_camera(point: Tensor, change: Change, zoom: str) -> Tensor:
+    """The point [3] in the changed camera's frame, from the words of the docstring: roll, mirror, come nearer."""
+    c, s = np.cos(change.angle), np.sin(change.angle)
+    x, y, z = point.tolist()
+    x, y = c * x - s * y, s * x + c * y
+    if change.flip:
+        x = -x
+    return torch.tensor([x, y, z / change.scale if zoom == "depth" else z], dtype=torch.float64)
+
+
+def blob(centre: Tensor) -> Tensor:
+    """[3, H, W] a Gaussian blob at ``centre`` (u, v)."""
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in SIZE), indexing="ij")
+    gauss = torch.exp(-0.5 * (((u - centre[0]) / SIGMA) ** 2 + ((v - centre[1]) / SIGMA) ** 2))
+    return gauss.expand(3, -1, -1)
+
+
+def centroid(image: Tensor) -> Tensor:
+    mass = image.sum(0)
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in SIZE), indexing="ij")
+    return torch.stack([(mass * u).sum(), (mass * v).sum()]) / mass.sum()
+
+
+@pytest.mark.parametrize("zoom", ["depth", "focal"])
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
+@pytest.mark.parametrize("pixel", [(80.0, 60.0), (65.0, 72.0), (96.0, 48.0)], ids=str)
+def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom):
+    """Image, depth and K' of one known 3D point agree; a blob's centre of mass to .02 px."""
+    point = torch.linalg.solve(K, torch.tensor([*pixel, 1.0], dtype=torch.float64)) * 2.5
+    depth = torch.full(SIZE, 2.5, dtype=torch.float64)
+    image, new_depth, new_K = apply_geometry(blob(torch.tensor(pixel)), depth, K, change, zoom)
+    there = seen_by_new_camera(point, change, zoom)
+    where = project(there, new_K)
+    torch.testing.assert_close(centroid(image), where, rtol=0, atol=0.02)
+    column, row = where.round().long().tolist()
+    assert new_depth[row, column].item() == pytest.approx(there[2].item(), abs=1e-12)
+
+
+@pytest.mark.parametrize("zoom", ["depth", "focal"])
+def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
+    """Ray-cast again with K' and the rolled pose, an exact depth image agrees off the edges (no flip: a mirrored
+    room is another room)."""
+    room, pose = synthetic.Room.furnished(25, 3), synthetic.look((0.2, 0.0, -0.1), 0.6, 0.1)
+    change = Change(scale=1.3, angle=0.08, shift=(5.0, 3.0))
+    camera = K.clone()
+    camera[0, 1] = 0.0  # the renderer knows no skew
+    depth = torch.from_numpy(synthetic.render(room, pose, camera.numpy(), *SIZE))
+    _, new_depth, new_K = apply_geometry(torch.zeros(3, *SIZE, dtype=torch.float64), depth, camera, change, zoom)
+    # Columns of the new camera's axes in the old one: points turn by +angle, so the axes turn by -angle.
+    roll = np.eye(4)
+    cos, sin = np.cos(change.angle), np.sin(change.angle)
+    roll[:2, :2] = [[cos, sin], [-sin, cos]]
+    optics = new_K.clone()
+    if zoom == "depth":  # the same pixels with the camera that explains them without moving points
+        optics[:2, :2] *= change.scale
+    exact = torch.from_numpy(synthetic.render(room, pose @ roll, optics.numpy(), *SIZE))
+    expected = exact / change.scale if zoom == "depth" else exact
+    valid = new_depth > 0
+    error = (new_depth - expected).abs()[valid] / expected[valid]
+    assert valid.float().mean() > 0.95
+    assert error.median() < 2e-3
+    assert (error < 0.02).float().mean() > 0.93  # what is left are edges, half a pixel wide
+
+
+def test_closed_forms_of_the_intrinsics():
+    """Flip: cx' = W - 1 - cx. Zoom about the principal point leaves K as it is, or scales f."""
+    height, width = SIZE
+    _, flipped = camera_change(K, Change(flip=True), height, width, "depth")
+    expected = K.clone()
+    expected[0, 2], expected[0, 1] = width - 1 - K[0, 2], -K[0, 1]
+    torch.testing.assert_close(flipped, expected)
+    centred = K.clone()
+    centred[:2, 2] = torch.tensor([(width - 1) / 2, (height - 1) / 2])
+    _, kept = camera_change(centred, Change(scale=1.5, angle=0.05), height, width, "depth")
+    torch.testing.assert_close(kept, centred)
+    _, longer = camera_change(centred, Change(scale=1.5), height, width, "focal")
+    torch.testing.assert_close(longer.diagonal(), centred.diagonal() * torch.tensor([1.5, 1.5, 1.0]))
+
+
+def test_the_flip_is_exact():
+    rng = torch.Generator().manual_seed(0)
+    image, depth = torch.rand(3, *SIZE, generator=rng), torch.rand(SIZE, generator=rng)
+    new_image, new_depth, _ = apply_geometry(image, depth, K, Change(flip=True))
+    torch.testing.assert_close(new_image, image.flip(-1), rtol=0, atol=1e-4)
+    assert torch.equal(new_depth, depth.flip(-1))
+
+
+def test_nothing_drawn_changes_nothing():
+    rng = torch.Generator().manual_seed(0)
+    image, depth = torch.rand(3, *SIZE, generator=rng), torch.rand(SIZE, generator=rng)
+    still = AugmentationConfig((1.0, 1.0), 0.0, 0.0, "random", "depth", 0.0, 0.0, 0.0)
+    new_image, new_depth, new_K = Augmentation(still)(image, depth, K, (1, 2, 3))
+    torch.testing.assert_close(new_image, image, rtol=0, atol=1e-4)
+    assert torch.equal(new_depth, depth)
+    torch.testing.assert_close(new_K, K)
+
+
+def test_depth_is_copied_and_never_mixed():
+    depth = torch.where(torch.arange(SIZE[1]) % 7 < 3, 1.0, 4.0).expand(SIZE)
+    change = Change(scale=1.37, angle=0.08)
+    _, new_depth, _ = apply_geometry(torch.zeros(3, *SIZE), depth, K, change, "focal")
+    assert set(new_depth.unique().tolist()) == {1.0, 4.0}
+    _, nearer, _ = apply_geometry(torch.zeros(3, *SIZE), depth, K, change, "depth")
+    torch.testing.assert_close(nearer, new_depth / 1.37)
+
+
+def test_the_rotation_is_applied_and_its_corners_have_no_depth():
+    """FastDepth's code discards its rotated image: here a rolled frame differs, and shows nothing in the corners."""
+    image, depth = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0)), torch.full(SIZE, 2.0)
+    rolled, new_depth, _ = apply_geometry(image, depth, K, Change(angle=0.087))
+    assert (rolled - image).abs().mean() > 0.1
+    assert new_depth[0, 0] == 0
+    assert rolled[:, 0, 0].max() == 0
+    assert (new_depth[40:80, 50:110] == 2).all()
+
+
+def test_holes_stay_holes():
+    depth = torch.full(SIZE, 2.0)
+    depth[50:70, 60:100] = 0
+    _, new_depth, _ = apply_geometry(torch.zeros(3, *SIZE), depth, K, Change(scale=1.2))
+    assert (new_depth[52:68, 62:98] == 0).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.tuples(*[st.integers(0, 2**40)] * 3), crop=st.sampled_from(["centre", "random"]))
+def test_draws_stay_in_their_ranges_and_inside_the_image(seed, crop):
+    config = AugmentationConfig(rotation=0.0, crop=crop)
+    change = draw(config, seed, *SIZE)
+    assert 1 <= change.scale <= 1.5
+    assert sorted(name for name, _ in change.colour) == ["brightness", "contrast", "saturation"]
+    assert all(0.6 <= factor <= 1.4 for _, factor in change.colour)
+    M, _ = camera_change(K, change, *SIZE, "depth")
+    corners = torch.tensor([[0.0, 0.0], [SIZE[1] - 1.0, SIZE[0] - 1.0]], dtype=torch.float64)
+    source = torch.linalg.solve(M[:, :2], (corners - M[:, 2]).mT).mT
+    # A pixel's centre lies half a pixel inside the border that zooming keeps.
+    assert (source >= -0.5).all()
+    assert (source <= torch.tensor([SIZE[1] - 0.5, SIZE[0] - 0.5])).all()
+
+
+def test_seeds_decide_and_the_global_generators_do_not():
+    image, depth = torch.rand(3, *SIZE), torch.rand(SIZE) + 1
+    augmentation = Augmentation(AugmentationConfig(crop="random"))
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    first = augmentation(image, depth, K, (7, 2, 40))
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(99)
+    again = augmentation(image, depth, K, (7, 2, 40))
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a, b)
+    for other in [(8, 2, 40), (7, 3, 40), (7, 2, 41), (2, 7, 40)]:
+        assert not torch.equal(augmentation(image, depth, K, other)[1], first[1])
+
+
+def test_arguments_are_left_alone():
+    image, depth, camera = torch.rand(3, *SIZE), torch.rand(SIZE), K.clone()
+    copies = [x.clone() for x in (image, depth, camera)]
+    Augmentation()(image, depth, camera, (0, 0, 0))
+    assert all(torch.equal(a, b) for a, b in zip((image, depth, camera), copies, strict=True))
+
+
+def test_all_values_of_the_ranges_come_up():
+    """Over 400 seeds: both flips equally often, and the whole range of scales and angles."""
+    changes = [draw(AugmentationConfig(), (0, 0, i), *SIZE) for i in range(400)]
+    assert 0.4 < np.mean([c.flip for c in changes]) < 0.6
+    scales, angles = np.array([c.scale for c in changes]), np.degrees([c.angle for c in changes])
+    assert scales.min() < 1.02
+    assert scales.max() > 1.48
+    assert angles.min() < -4.8
+    assert angles.max() > 4.8
+    assert abs(angles.mean()) < 0.5
+    assert len({tuple(name for name, _ in c.colour) for c in changes}) == 6
+
+
+@pytest.mark.parametrize("kind", ["brightness", "contrast", "saturation"])
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.4])
+def test_colour_is_changed_as_pillow_does(kind, factor):
+    """Pillow works in bytes and rounds the mean and the grey image: 2 of 255 apart at most."""
+    array = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
+    enhance = {"brightness": "Brightness", "contrast": "Contrast", "saturation": "Color"}[kind]
+    expected = np.asarray(getattr(ImageEnhance, enhance)(Image.fromarray(array)).enhance(factor))
+    got = apply_colour(torch.from_numpy(array).permute(2, 0, 1).float() / 255, ((kind, factor),))
+    assert np.abs(255 * got.permute(1, 2, 0).numpy() - expected).max() <= 2
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"scale": (0.5, 1.5)},
+        {"scale": (1.5, 1.0)},
+        {"scale": (1.0, float("inf"))},
+        {"scale": (1.0,)},
+        {"rotation": -1.0},
+        {"rotation": float("nan")},
+        {"flip": 1.5},
+        {"brightness": 1.1},
+        {"crop": "corner"},
+        {"zoom": "both"},
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_named(wrong):
+    with pytest.raises(ValueError, match=f"AugmentationConfig.{next(iter(wrong))}"):
+        AugmentationConfig(**wrong)
+
+
+def test_the_config_goes_through_json_and_refuses_unknown_keys():
+    config = AugmentationConfig(scale=(1.1, 1.2), crop="random")
+    plain = config.to_dict() | {"scale": [1.1, 1.2]}
+    assert AugmentationConfig.from_dict(plain) == config
+    with pytest.raises(ValueError, match="hue"):
+        AugmentationConfig.from_dict({"hue": 0.1})
