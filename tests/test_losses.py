@@ -1,0 +1,293 @@
+"""Losses: closed forms (SciPy), masks that nothing leaks through, sums that processes can share, extreme inputs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.special import gammaln
+from torch import Tensor
+
+from ufmstar_torch.models.distribution import EvidentialDepth, GaussianDepth, PointDepth
+from ufmstar_torch.models.heads import BETA_FLOOR, EVIDENCE_FLOOR, LOG_VARIANCE_RANGE
+from ufmstar_torch.train.losses import (
+    EVIDENCE_WEIGHT,
+    depth_l1,
+    evidential_loss,
+    evidential_nll,
+    gaussian_nll,
+    loss_of,
+    loss_sums,
+)
+
+SHAPE = (2, 5, 7)
+KINDS = ("point", "gaussian", "evidential")
+
+
+def uniform(low: float, high: float, seed: int, shape: tuple[int, ...] = SHAPE, dtype=torch.float64) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(shape, generator=generator, dtype=dtype) * (high - low) + low
+
+
+def parameters(kind: str, dtype=torch.float64) -> dict[str, Tensor]:
+    """Leaves that ask for gradients."""
+    made = {"depth": uniform(0.5, 8, 1)}
+    if kind == "gaussian":
+        made["log_variance"] = uniform(-6, 3, 2)
+    if kind == "evidential":
+        made |= {"nu": uniform(0.01, 5, 3), "alpha": uniform(1.01, 20, 4), "beta": uniform(0.01, 3, 5)}
+    return {name: value.to(dtype).requires_grad_() for name, value in made.items()}
+
+
+def distribution(kind: str, values: dict[str, Tensor]):
+    return {"point": PointDepth, "gaussian": GaussianDepth, "evidential": EvidentialDepth}[kind](**values)
+
+
+def per_pixel(kind: str, values: dict[str, Tensor], target: Tensor) -> Tensor:
+    function = {"point": depth_l1, "gaussian": gaussian_nll, "evidential": evidential_loss}[kind]
+    return function(**values, target=target)
+
+
+def test_gaussian_is_scipys():
+    depth, s, target = uniform(0.5, 8, 1), uniform(-6, 6, 2), uniform(0.5, 8, 3)
+    expected = -stats.norm.logpdf(target.numpy(), depth.numpy(), np.exp(s.numpy() / 2))
+    np.testing.assert_allclose(gaussian_nll(depth, s, target).numpy(), expected, rtol=1e-12)
+
+
+@settings(max_examples=200, deadline=None)
+@given(nu=st.floats(1e-4, 1e4), alpha=st.floats(1.0001, 1e5), beta=st.floats(1e-6, 1e4), error=st.floats(-100, 100))
+def test_evidential_is_scipys_student_t(nu, alpha, beta, error):
+    """In double precision to 1e-7, over the whole range of evidence (the series for large alpha is worth 5e-8)."""
+    tensors = [torch.tensor(x, dtype=torch.float64) for x in (3.0, nu, alpha, beta, 3.0 + error)]
+    scale = math.sqrt(beta * (1 + nu) / (nu * alpha))
+    expected = -stats.t.logpdf(tensors[4].item(), 2 * alpha, 3.0, scale)
+    assert evidential_nll(*tensors).item() == pytest.approx(expected, rel=1e-7, abs=1e-6)
+
+
+def test_evidential_is_aminis_equation_8():
+    """The paper's own form, term by term."""
+    p, target = parameters("evidential"), uniform(0.5, 8, 9)
+    gamma, nu, alpha, beta = (p[name].detach().numpy() for name in ("depth", "nu", "alpha", "beta"))
+    omega = 2 * beta * (1 + nu)
+    error = target.numpy() - gamma
+    nll = 0.5 * np.log(np.pi / nu) - alpha * np.log(omega) + (alpha + 0.5) * np.log(error**2 * nu + omega)
+    nll += gammaln(alpha) - gammaln(alpha + 0.5)
+    np.testing.assert_allclose(evidential_nll(*p.values(), target).detach().numpy(), nll, rtol=1e-7)
+    full = nll + 0.3 * np.abs(error) * (2 * nu + alpha)
+    np.testing.assert_allclose(evidential_loss(*p.values(), target, 0.3).detach().numpy(), full, rtol=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gradient_is_the_derivative(kind):
+    values, target = parameters(kind), uniform(0.5, 8, 9)
+    assert torch.autograd.gradcheck(
+        lambda *p: per_pixel(kind, dict(zip(values, p, strict=True)), target), [*values.values()]
+    )
+
+
+def test_beta_nll_weighs_with_the_detached_variance():
+    depth, s = uniform(0.5, 8, 1).requires_grad_(), uniform(-6, 6, 2).requires_grad_()
+    target = uniform(0.5, 8, 3)
+    plain, weighed = gaussian_nll(depth, s, target), gaussian_nll(depth, s, target, beta=0.5)
+    torch.testing.assert_close(weighed, plain * s.exp().sqrt())
+    expected = torch.autograd.grad(plain.sum(), s, retain_graph=True)[0] * s.detach().exp().sqrt()
+    torch.testing.assert_close(torch.autograd.grad(weighed.sum(), s)[0], expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_mean_is_over_the_valid_pixels(kind):
+    """Not over all pixels and not over the invalid ones; 3 of 70 are valid here."""
+    values, target = parameters(kind), uniform(0.5, 8, 9)
+    valid = torch.zeros(SHAPE, dtype=torch.bool)
+    valid[0, 1, 2] = valid[1, 4, 6] = valid[1, 0, 0] = True
+    expected = per_pixel(kind, values, target)[valid].mean()
+    torch.testing.assert_close(loss_of(distribution(kind, values), target, valid), expected)
+    total, count = loss_sums(distribution(kind, values), target, valid)
+    assert count.item() == 3
+    torch.testing.assert_close(total, 3 * expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_invalid_target_reaches_value_or_gradient(kind, bad, dtype):
+    values, target = parameters(kind, dtype), uniform(0.5, 8, 9, dtype=dtype)
+    valid = uniform(0, 1, 10) < 0.6
+    clean = loss_of(distribution(kind, values), target, valid)
+    gradients = torch.autograd.grad(clean, list(values.values()))
+    poisoned = loss_of(distribution(kind, values), torch.where(valid, target, bad), valid)
+    assert torch.equal(clean, poisoned)
+    for gradient, clean_one in zip(torch.autograd.grad(poisoned, list(values.values())), gradients, strict=True):
+        assert torch.equal(gradient, clean_one)
+        assert (gradient[~valid] == 0).all()
+        assert (gradient[valid] != 0).any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_target_that_is_no_depth_is_left_out_though_it_is_called_valid(kind):
+    values, target = parameters(kind), uniform(0.5, 8, 9)
+    target[0, 0, 0], target[0, 0, 1], target[0, 0, 2], target[0, 0, 3] = 0.0, math.nan, math.inf, -2.0
+    valid = torch.ones(SHAPE, dtype=torch.bool)
+    without = valid.clone()
+    without[0, 0, :4] = False
+    total, count = loss_sums(distribution(kind, values), target, valid)
+    assert count.item() == valid.numel() - 4
+    assert torch.equal(total, loss_sums(distribution(kind, values), target, without)[0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_broken_prediction_at_an_invalid_pixel_stays_there(kind):
+    """NaN times 0 is NaN: the gradient is cut before the loss, not behind it."""
+    values, target = parameters(kind), uniform(0.5, 8, 9)
+    broken = {name: value.detach().clone() for name, value in values.items()}
+    for value in broken.values():
+        value[0, 0, 0] = math.nan
+        value.requires_grad_()
+    valid = torch.ones(SHAPE, dtype=torch.bool)
+    valid[0, 0, 0] = False
+    loss = loss_of(distribution(kind, broken), target, valid)
+    assert loss.isfinite()
+    for gradient in torch.autograd.grad(loss, list(broken.values())):
+        assert gradient.isfinite().all()
+        assert gradient[0, 0, 0] == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_valid_pixels_value_and_gradient_are_zero(kind):
+    values, target = parameters(kind), torch.full(SHAPE, math.nan)
+    loss = loss_of(distribution(kind, values), target, torch.zeros(SHAPE, dtype=torch.bool))
+    assert loss.item() == 0
+    for gradient in torch.autograd.grad(loss, list(values.values())):
+        assert (gradient == 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_processes_with_unequal_counts_make_the_gradient_of_one(kind):
+    """The rule of loss_sums' docstring; the mean of the two means is off."""
+    values, target = parameters(kind), uniform(0.5, 8, 9)
+    valid = torch.ones(SHAPE, dtype=torch.bool)
+    valid[0, :, 1:] = False  # 5 valid pixels in the one, 35 in the other
+    whole = torch.autograd.grad(loss_of(distribution(kind, values), target, valid), list(values.values()))
+    halves = [loss_sums(distribution(kind, {k: v[i] for k, v in values.items()}), target[i], valid[i]) for i in (0, 1)]
+    world, total = 2, sum(count.item() for _, count in halves)
+    losses = [part * world / total for part, _ in halves]
+    averaged = torch.autograd.grad(sum(losses) / world, list(values.values()), retain_graph=True)
+    for one, two in zip(whole, averaged, strict=True):
+        torch.testing.assert_close(one, two)
+    naive = torch.autograd.grad(sum(part / count for part, count in halves) / world, list(values.values()))
+    assert any(not torch.allclose(one, two) for one, two in zip(whole, naive, strict=True))
+
+
+EXTREMES = {
+    "gaussian": [[s] for s in (*LOG_VARIANCE_RANGE, -1e4, 1e4, -88.0, 88.0)],
+    "evidential": [
+        [nu, alpha, beta]
+        for nu in (EVIDENCE_FLOOR, 1e-20, 1e6)
+        for alpha in (1 + EVIDENCE_FLOOR, 1 + 1e-6, 1e6)
+        for beta in (BETA_FLOOR, 1e-20, 1e8)
+    ],
+}
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "autocast"])
+@pytest.mark.parametrize("error", [0.0, 1e-20, 1e-6, 1.0, 1e4, -1e4])
+@pytest.mark.parametrize("kind", ["gaussian", "evidential"])
+def test_extreme_inputs_have_finite_values_and_gradients(kind, error, precision):
+    dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
+    names = ["log_variance"] if kind == "gaussian" else ["nu", "alpha", "beta"]
+    for extreme in EXTREMES[kind]:
+        values = {"depth": torch.full((1, 1, 1), 2e4 if error < 0 else 1.0)}
+        values |= {name: torch.full((1, 1, 1), x) for name, x in zip(names, extreme, strict=True)}
+        values = {name: x.to(dtype).requires_grad_() for name, x in values.items()}
+        target = values["depth"].detach().float() + error
+        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "autocast"):
+            loss = loss_of(distribution(kind, values), target, torch.ones(1, 1, 1, dtype=torch.bool))
+        assert loss.dtype == torch.float32
+        assert loss.isfinite(), (extreme, loss)
+        for name, gradient in zip(values, torch.autograd.grad(loss, list(values.values())), strict=True):
+            assert gradient.isfinite().all(), (extreme, name, gradient)
+
+
+@pytest.mark.parametrize("alpha", [1.0001, 7.999, 8.001, 1e3, 1e6])
+def test_single_precision_is_exact_for_much_evidence_too(alpha):
+    """lgamma(1e6) alone is 1.3e7, with a rounding error of 1 in single precision."""
+    values = [torch.tensor(x) for x in (3.0, 2.0, alpha, 0.5 * alpha, 3.4)]
+    scale = math.sqrt(0.5 * 3 / 2)
+    expected = -stats.t.logpdf(np.float32(3.4), 2 * np.float64(alpha), 3.0, scale)
+    assert evidential_nll(*values).item() == pytest.approx(expected, abs=2e-5, rel=1e-5)
+
+
+def test_beyond_its_limits_the_log_variance_is_still_pulled_back():
+    """A clamp would leave such a pixel without a gradient for ever."""
+    s = torch.tensor([-1e4, 1e4], requires_grad=True)
+    gradient = torch.autograd.grad(gaussian_nll(torch.zeros(2), s, torch.ones(2)).sum(), s)[0]
+    assert gradient[0] < -1
+    assert gradient[1] > 0.4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_half_precision_outputs_lose_nothing_in_the_loss(kind):
+    """bfloat16 parameters give the loss of the same numbers in single precision, also under autocast."""
+    values = {name: x.detach().to(torch.bfloat16) for name, x in parameters(kind).items()}
+    target, valid = uniform(0.5, 8, 9, dtype=torch.float32), uniform(0, 1, 10) < 0.6
+    with torch.autocast("cpu", torch.bfloat16):
+        got = loss_of(distribution(kind, values), target, valid)
+    wide = {name: x.float() for name, x in values.items()}
+    assert torch.equal(got, loss_of(distribution(kind, wide), target, valid))
+
+
+def test_minimisers():
+    """The Gaussian's is the sample's mean and variance; more evidence costs more where the depth is wrong."""
+    target = uniform(1, 3, 0, (400,))
+    depth, s = (
+        torch.zeros(1, dtype=torch.float64, requires_grad=True),
+        torch.zeros(1, dtype=torch.float64, requires_grad=True),
+    )
+    optimiser = torch.optim.LBFGS([depth, s], max_iter=60)
+
+    def closure():
+        optimiser.zero_grad()
+        loss = gaussian_nll(depth, s, target).mean()
+        loss.backward()
+        return loss
+
+    optimiser.step(closure)
+    assert depth.item() == pytest.approx(target.mean().item(), abs=1e-5)
+    assert s.exp().item() == pytest.approx(target.var(correction=0).item(), rel=1e-4)
+    one, nu = torch.ones(1), torch.ones(1, requires_grad=True)
+    weights = [torch.autograd.grad(evidential_loss(one, nu, 2 * one, one, 3 * one, w).sum(), nu)[0] for w in (0.0, 1.0)]
+    assert weights[1] - weights[0] == pytest.approx(2 * 2.0)
+
+
+def test_the_weights_reach_the_loss():
+    values, target = parameters("evidential"), uniform(0.5, 8, 9)
+    valid = torch.ones(SHAPE, dtype=torch.bool)
+    d = distribution("evidential", values)
+    nll = evidential_nll(*values.values(), target).mean()
+    torch.testing.assert_close(loss_of(d, target, valid, evidence_weight=0.0), nll)
+    evidence = ((target - values["depth"]).abs() * (2 * values["nu"] + values["alpha"])).mean()
+    torch.testing.assert_close(loss_of(d, target, valid), nll + EVIDENCE_WEIGHT * evidence)
+    values = parameters("gaussian")
+    weighed = gaussian_nll(**values, target=target, beta=0.5).mean()
+    torch.testing.assert_close(loss_of(distribution("gaussian", values), target, valid, beta_nll=0.5), weighed)
+
+
+def test_wrong_arguments_are_named():
+    d, target, valid = PointDepth(torch.ones(SHAPE)), torch.ones(SHAPE), torch.ones(SHAPE, dtype=torch.bool)
+    with pytest.raises(ValueError, match="valid must be bool"):
+        loss_of(d, target, valid.float())
+    with pytest.raises(ValueError, match="shape"):
+        loss_of(d, target[:1], valid)
+    with pytest.raises(ValueError, match="shape"):
+        loss_of(d, target, valid[..., :1])
+    with pytest.raises(ValueError, match="evidence_weight"):
+        loss_of(d, target, valid, evidence_weight=-1.0)
+    with pytest.raises(ValueError, match="beta_nll"):
+        loss_of(d, target, valid, beta_nll=2.0)
+    with pytest.raises(ValueError, match="distribution"):
+        loss_of(torch.ones(SHAPE), target, valid)
