@@ -81,6 +81,8 @@ def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: Sequenc
             config,
             spec=options["spec"],
             mode=options["mode"],
+            samples=options["samples"],
+            offload=options["offload"],
             threads=options["threads"],
             device=device,
         )

@@ -38,9 +38,11 @@ _GROUPS: dict[str, tuple[tuple[str, Any, Any, str], ...]] = {
         ("--depth-intrinsics", _WORDS, [], "of the sequence's own depth: a file, or fx fy cx cy [px]"),
     ),
     "depth from networks": (
-        ("--model", str, None, "fastdepth, onnx, torchscript or exported"),
+        ("--model", str, None, "fastdepth, trained (by ufmstar train), depth_anything, huggingface, onnx, torchscript or exported"),
         ("--weights", _WORDS, [], "file; several are the members of an ensemble"),
         ("--mode", ("alternate", "full"), "alternate", "ensemble: one member per image in turn, or all on every image"),
+        ("--samples", int, None, "passes per image of an mc_dropout network in mode full; default: 10"),
+        ("--offload", bool, False, "trained: keep the weights in host memory, only the member in turn on the device"),
         ("--spec", str, None, "JSON file that declares an ONNX file's or a saved program's inputs and outputs"),
     ),
     "depth that is there": (
@@ -132,14 +134,18 @@ def check_options(options: Mapping[str, Any]) -> None:
     if model is not None and not options["weights"]:
         raise ValueError(f"--model {model} needs --weights FILE")
     of_folder = [name for name in ("variance", "depth_scale", "map_intrinsics") if options[name] not in (None, [])]
-    needs_model = [name for name in ("weights", "spec") if options[name] and model is None]
+    needs_model = [name for name in ("weights", "spec", "samples", "offload") if options[name] and model is None]
+    needs_trained = [name for name in ("samples", "offload") if options[name] and model != "trained"]
     needs_depth = [*of_folder, *(["size"] if options["size"] is not None else [])] if depth is None else []
     needs_folder = of_folder if depth in OWN_DEPTH else []
-    for names, missing in ((needs_model, "--model"), (needs_depth, "--depth"), (needs_folder, "--depth DIR")):
+    wrong = ((needs_model, "--model"), (needs_trained, "--model trained"))
+    for names, missing in (*wrong, (needs_depth, "--depth"), (needs_folder, "--depth DIR")):
         if names:
             raise ValueError(f"--{names[0].replace('_', '-')} goes with {missing} only")
-    if options["mode"] == "full" and len(options["weights"]) < 2:
+    if options["mode"] == "full" and len(options["weights"]) < 2 and model != "trained":
         raise ValueError("--mode full needs several --weights")
+    if options["samples"] is not None and (options["samples"] < 2 or options["mode"] != "full"):
+        raise ValueError(f"--samples must be at least 2 and goes with --mode full, got {options['samples']}")
     if options["resume"] and options["overwrite"]:
         raise ValueError("--resume and --overwrite contradict each other")
 

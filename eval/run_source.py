@@ -21,7 +21,11 @@ from ufmstar_torch.eval.run_clock import Stopwatch
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
+from ufmstar_torch.models.dropout import SAMPLES, MonteCarloDropout, set_sampling
+from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.load import load_network
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.ufmstar import UfMStar
@@ -74,7 +78,7 @@ class NetworkSource(Source):
     """Depth from networks.
 
     Args:
-        pipeline: networks, alternation and UfM*.
+        pipeline: networks, alternation and UfM*. Decoder dropout gets a generator of this source.
         device: where they run.
         identity: see :class:`Source`.
     """
@@ -84,12 +88,16 @@ class NetworkSource(Source):
         self._pipeline = pipeline
         for network in pipeline.networks:
             self.clock.watch(network, "network")
+        self._dropout = torch.Generator(device)
+        for network in _stochastic(pipeline.networks):
+            set_sampling(network, True, self._dropout)
 
     def predict(self, frame: Frame) -> UncertainPrediction:
         """See :meth:`Source.predict`."""
         if frame.image is None:
             raise FrameError(frame.name, "no image")
         image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].to(self.device)
+        self._dropout.manual_seed(frame.index)  # of the frame alone: a resumed run draws the same
         # Pose and intrinsics stay on the host, where UfM* checks them without waiting for a device.
         pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
         return self._pipeline(image, pose, K)
@@ -162,6 +170,8 @@ def network_source(
     *,
     spec: str | Path | None = None,
     mode: str = "alternate",
+    samples: int | None = None,
+    offload: bool = False,
     threads: int | None = None,
     device: str = "cpu",
 ) -> NetworkSource:
@@ -169,16 +179,20 @@ def network_source(
 
     Args:
         model: a name that ``load_network`` knows.
-        weights: one file for each member.
+        weights: one file for each member; those of "trained" may hold several.
         config: of UfM*.
         spec: declares what an ONNX file or saved program does not say.
-        mode: "alternate" (one member per image in turn) or "full" (all of them on every image).
+        mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
+            passes of a network that samples).
+        samples: None: as many as the paper's baseline.
+        offload: of "trained": weights stay in host memory and come to the device for their turn only.
         threads: CPU threads of ONNX Runtime; None = its own choice.
         device: "cpu", "cuda", ...
 
     Raises:
         FileNotFoundError: a file is missing.
-        ValueError: unknown model, files that do not fit it, members that want different inputs.
+        ValueError: unknown model, files that do not fit it, members that want different inputs, mode "full"
+            of one network that does not sample, ``samples`` for any other.
     """
     files = [Path(file) for file in weights]
     for file in [*files, *([Path(spec)] if spec is not None else [])]:
@@ -187,21 +201,54 @@ def network_source(
     options: dict[str, Any] = {} if spec is None else {"spec": spec}
     if model == "onnx" and threads is not None:
         options["threads"] = threads
-    try:
-        members = [load_network(model, file, **options) for file in files]
-    except TypeError as error:
-        raise ValueError(f"model {model!r} does not take {sorted(options)}: {error}") from error
+    members = _members(model, files, options, offload)
     wanted = [member.preprocess for member in members]
     if any(other != wanted[0] for other in wanted[1:]):
         raise ValueError(f"weights: the members of an ensemble must want the same input, got {wanted}")
-    pipeline = UncertainDepth(members, config, mode=mode, preprocess=wanted[0])
+    samples = _passes(members, mode, samples)
+    pipeline = UncertainDepth(members, config, mode=mode, samples=samples, preprocess=wanted[0])
     identity = {
         "model": model,
         "weights": [{"name": file.name, "sha256": sha256(file)} for file in files],
         "mode": mode,
+        "samples": samples,
         "spec": None if spec is None else sha256(Path(spec)),
     }
     return NetworkSource(pipeline, torch.device(device), identity)
+
+
+def _members(model: str, files: list[Path], options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
+    """The networks in the files, in their order.
+
+    Raises:
+        ValueError: as :func:`network_source`.
+    """
+    if model == "trained" and not options:
+        return load_trained(files, offload=offload)
+    try:
+        return [load_network(model, file, **options) for file in files]
+    except TypeError as error:
+        raise ValueError(f"model {model!r} does not take {sorted(options)}: {error}") from error
+
+
+def _passes(members: list[DepthNetwork], mode: str, samples: int | None) -> int | None:
+    """Passes per image of a network that samples, None of others.
+
+    Raises:
+        ValueError: mode or samples ask for what the members cannot do.
+    """
+    alone = len(members) == 1 and mode == "full"
+    if alone and not _stochastic(members):
+        raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
+    if samples is not None and not alone:
+        raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
+    return (samples or SAMPLES) if alone else None
+
+
+def _stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:
+    """Those of the networks that sample."""
+    found = [network.network() if isinstance(network, LazyMember) else network for network in networks]
+    return [network for network in found if isinstance(network, MonteCarloDropout)]
 
 
 def folder_source(
