@@ -9,12 +9,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ufmstar_torch.models.aligned import AlignedNetwork as AlignedNetwork
+    from ufmstar_torch.models.alignment import Alignment as Alignment
+    from ufmstar_torch.models.alignment import AlignmentFit as AlignmentFit
+    from ufmstar_torch.models.alignment import AlignmentSums as AlignmentSums
+    from ufmstar_torch.models.alignment import fit_affine_depth as fit_affine_depth
+    from ufmstar_torch.models.alignment import fit_inverse_depth as fit_inverse_depth
     from ufmstar_torch.models.any_network import WrappedNetwork as WrappedNetwork
     from ufmstar_torch.models.any_network import wrap_network as wrap_network
+    from ufmstar_torch.models.camera_height import GroundFit as GroundFit
+    from ufmstar_torch.models.camera_height import align_to_camera_height as align_to_camera_height
     from ufmstar_torch.models.checkpoints import CheckpointError as CheckpointError
     from ufmstar_torch.models.checkpoints import load_state_dict_file as load_state_dict_file
     from ufmstar_torch.models.checkpoints import load_weights as load_weights
     from ufmstar_torch.models.checkpoints import save_checkpoint as save_checkpoint
+    from ufmstar_torch.models.depth_anything import DepthAnything as DepthAnything
+    from ufmstar_torch.models.depth_anything import depth_anything_name as depth_anything_name
     from ufmstar_torch.models.distribution import EvidentialDepth as EvidentialDepth
     from ufmstar_torch.models.distribution import GaussianDepth as GaussianDepth
     from ufmstar_torch.models.distribution import PointDepth as PointDepth
@@ -28,6 +38,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.heads import EvidentialNetwork as EvidentialNetwork
     from ufmstar_torch.models.heads import UncertaintyNetwork as UncertaintyNetwork
     from ufmstar_torch.models.heads import with_head as with_head
+    from ufmstar_torch.models.hugging_face import HuggingFaceDepth as HuggingFaceDepth
+    from ufmstar_torch.models.hugging_face import from_hugging_face as from_hugging_face
     from ufmstar_torch.models.load import load_network as load_network
     from ufmstar_torch.models.monodepth2 import MonodepthResNet as MonodepthResNet
     from ufmstar_torch.models.monodepth2_import import load_monodepth2 as load_monodepth2
@@ -40,9 +52,14 @@ if TYPE_CHECKING:
 
 _HOME = {
     "AleatoricNetwork": "heads",
+    "AlignedNetwork": "aligned",
+    "Alignment": "alignment",
+    "AlignmentFit": "alignment",
+    "AlignmentSums": "alignment",
     "Backbone": "network",
     "CheckpointError": "checkpoints",
     "DecoderDropout": "dropout",
+    "DepthAnything": "depth_anything",
     "DepthNetwork": "network",
     "DepthOnlyNetwork": "heads",
     "EvidentialDepth": "distribution",
@@ -50,6 +67,8 @@ _HOME = {
     "FastDepth": "fastdepth",
     "FastDepthWidths": "fastdepth",
     "GaussianDepth": "distribution",
+    "GroundFit": "camera_height",
+    "HuggingFaceDepth": "hugging_face",
     "MonodepthResNet": "monodepth2",
     "MonteCarloDropout": "dropout",
     "OnnxNetwork": "onnx_network",
@@ -59,6 +78,11 @@ _HOME = {
     "Preprocess": "preprocess",
     "UncertaintyNetwork": "heads",
     "WrappedNetwork": "any_network",
+    "align_to_camera_height": "camera_height",
+    "depth_anything_name": "depth_anything",
+    "fit_affine_depth": "alignment",
+    "fit_inverse_depth": "alignment",
+    "from_hugging_face": "hugging_face",
     "load_monodepth2": "monodepth2_import",
     "load_network": "load",
     "load_state_dict_file": "checkpoints",

@@ -21,7 +21,12 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
             fastdepth: ``size``, ``dropout``, and ``positive`` with a state_dict. ``weights``: an ONNX export, or a
                 state_dict (.pth, .pt, .safetensors).
             monodepth2: ``strides`` ("v1.5" or "v1"), ``size``, ``dropout``. ``weights``: a state_dict.
+            trained: none. ``weights``: a file of ``save_trained``; where it has several members, all of them as
+                one network (``Ensemble``). ``load_trained`` gives them one by one, and takes several files.
             onnx: ``spec`` (an ``OnnxSpec``, a dict or a JSON file), ``threads``, ``providers``.
+            depth_anything: ``spec`` with "size", "keep_aspect" and, for a relative checkpoint, "alignment" (a dict or
+                a JSON file). ``weights``: a directory or hub name of ``transformers``.
+            huggingface: ``spec`` with "kind" and what else ``from_hugging_face`` takes. ``weights`` as above.
             torchscript, exported: ``spec`` with "outputs" and, if needed, "preprocess" (a dict or a JSON file).
 
     Raises:
@@ -34,6 +39,10 @@ def load_network(name: str, weights: str | Path | None = None, **options: Any) -
     if weights is None:
         raise ValueError(f"network {name!r} needs weights: the file to load")
     return _BUILDERS[name](Path(weights), **options).eval()
+
+
+# Networks whose weights are a directory.
+DIRECTORIES = frozenset({"depth_anything", "huggingface"})
 
 
 def network_names() -> tuple[str, ...]:
@@ -77,6 +86,14 @@ def _monodepth2(
     return network
 
 
+def _trained(weights: Path) -> DepthNetwork:
+    from ufmstar_torch.models.ensemble import Ensemble
+    from ufmstar_torch.models.trained import load_trained
+
+    members = load_trained(weights)
+    return members[0] if len(members) == 1 else Ensemble(members)
+
+
 def _onnx(weights: Path, spec: Any = None, **options: Any) -> DepthNetwork:
     from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
 
@@ -117,10 +134,25 @@ def _declared(spec: Any) -> tuple[OutputSpec, Preprocess]:
     return OutputSpec.from_dict(values["outputs"]), Preprocess.from_dict(values.get("preprocess") or {})
 
 
+def _depth_anything(weights: Path, spec: Any = None) -> DepthNetwork:
+    from ufmstar_torch.models.hugging_face_spec import load_depth_anything
+
+    return load_depth_anything(weights, spec)
+
+
+def _hugging_face(weights: Path, spec: Any = None) -> DepthNetwork:
+    from ufmstar_torch.models.hugging_face_spec import load_hugging_face
+
+    return load_hugging_face(weights, spec)
+
+
 _BUILDERS: dict[str, Callable[..., DepthNetwork]] = {
+    "depth_anything": _depth_anything,
     "exported": _exported,
     "fastdepth": _fastdepth,
+    "huggingface": _hugging_face,
     "monodepth2": _monodepth2,
     "onnx": _onnx,
     "torchscript": _torchscript,
+    "trained": _trained,
 }

@@ -1,0 +1,44 @@
+"""A relative network with a fixed alignment: metric depth for UfM*."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ufmstar_torch.models.alignment import Alignment
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.prediction import DepthPrediction
+
+
+class AlignedNetwork(DepthNetwork):
+    """Metric depth from a network that predicts it up to scale (and shift).
+
+    Args:
+        network: image [B, 3, H, W] -> relative depth [B, H, W] or [B, 1, H, W].
+        alignment: the same for every frame, fitted once; see :mod:`ufmstar_torch.models.alignment` for why.
+        preprocess: what the network's input needs; None: images in [0, 1] at their own size.
+    """
+
+    def __init__(self, network: nn.Module, alignment: Alignment, preprocess: Preprocess | None = None) -> None:
+        super().__init__()
+        self.network = network
+        self.alignment = alignment
+        self.preprocess = preprocess or Preprocess()
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W]; 0 (no prediction) where the alignment is not possible.
+
+        Raises:
+            ValueError: the network returns another shape.
+        """
+        relative = self.network(image)
+        if not isinstance(relative, Tensor):
+            raise ValueError(f"network must return a tensor of relative depth, got {type(relative).__name__}")
+        if relative.dim() == 4 and relative.shape[1] == 1:
+            relative = relative[:, 0]
+        if relative.shape[-2:] != image.shape[-2:]:
+            raise ValueError(f"network must return {tuple(image.shape[-2:])} px, got {tuple(relative.shape)}")
+        if relative.dtype in (torch.float16, torch.bfloat16):
+            relative = relative.float()  # a scale of 1e-3 and less is no number in half precision
+        return DepthPrediction(self.alignment.depth(relative))

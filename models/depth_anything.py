@@ -1,0 +1,90 @@
+"""Depth Anything V2 (Yang et al., NeurIPS 2024): a DINOv2 encoder with a DPT decoder, by ``transformers``.
+
+The metric checkpoints (indoor up to 20 m, outdoor up to 80 m) are depth networks at once. The relative ones
+predict inverse depth up to scale and shift and need an alignment. Small is Apache-2.0, Base and Large are
+CC BY-NC 4.0: not for commercial use.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from ufmstar_torch.models.checkpoints import CheckpointError
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, own_preprocess, patch_size
+from ufmstar_torch.models.hugging_face_files import read_checkpoint
+
+SIZES = ("small", "base", "large")
+VARIANTS = ("indoor", "outdoor", "relative")
+# What the published checkpoints' image processors say; for directories without preprocessor_config.json.
+_PROCESSOR = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225], "resample": 3}
+
+
+def depth_anything_name(size: str = "small", variant: str = "indoor") -> str:
+    """The published checkpoint's name on the Hugging Face hub.
+
+    Args:
+        size: "small" (25 million weights, Apache-2.0), "base" (97) or "large" (335), both CC BY-NC 4.0.
+        variant: "indoor" (metric, trained on Hypersim), "outdoor" (metric, Virtual KITTI) or "relative".
+
+    Raises:
+        ValueError: no such size or variant.
+    """
+    if size not in SIZES or variant not in VARIANTS:
+        raise ValueError(f"size must be one of {SIZES} and variant one of {VARIANTS}, got {size!r} and {variant!r}")
+    metric = "" if variant == "relative" else f"Metric-{variant.capitalize()}-"
+    return f"depth-anything/Depth-Anything-V2-{metric}{size.capitalize()}-hf"
+
+
+class DepthAnything(HuggingFaceDepth):
+    """Depth Anything V2 for UfM*; made by :meth:`from_pretrained`.
+
+    A metric checkpoint is a depth network as it is. A relative one refuses to be one: ``network.raw(image)`` is
+    its inverse depth up to scale and shift, and ``network.aligned(alignment)`` a depth network.
+    """
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        name_or_dir: str | Path,
+        *,
+        size: tuple[int, int] = (518, 518),
+        keep_aspect: bool = False,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+        revision: str | None = None,
+        local_files_only: bool = False,
+    ) -> DepthAnything:
+        """A checkpoint in the format of ``transformers``, in eval mode; colours as its own processor has them.
+
+        Args:
+            name_or_dir: a hub name (:func:`depth_anything_name`) or a directory.
+            size: (height, width) [px] of the input, multiples of the patch (14).
+            keep_aspect: keep the image's aspect as the checkpoint's own processor does: 480 x 640 becomes 518 x 686.
+                The intrinsics follow in either case.
+            dtype: of the weights; depth is float32 in any case (float64 for float64).
+            device: where the weights go; None = the CPU.
+            revision: branch, tag or commit on the hub.
+            local_files_only: whether the hub may not be asked.
+
+        Raises:
+            ValueError: ``size`` is no multiple of the patch.
+            CheckpointError: the checkpoint is damaged, incomplete or of another kind of model; named.
+            FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
+            ModuleNotFoundError: transformers is missing.
+        """
+        checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
+        if checkpoint.model_type != "depth_anything":
+            raise CheckpointError(
+                f"{checkpoint.name} is a {checkpoint.config.get('model_type')!r} model, expected 'depth_anything'; "
+                "other depth models: from_hugging_face"
+            )
+        multiple = patch_size(checkpoint)
+        if len(size) != 2 or any(side < 1 or side % multiple for side in size):
+            raise ValueError(f"size must be (height, width) in multiples of the patch, {multiple} px, got {size}")
+        if not checkpoint.processor:
+            checkpoint = replace(checkpoint, processor=_PROCESSOR)
+        preprocess = own_preprocess(checkpoint, size, keep_aspect)
+        return cls.of_checkpoint(checkpoint, preprocess, dtype=dtype).to(device)

@@ -1,0 +1,256 @@
+"""Depth models of Hugging Face's ``transformers``, from a hub name or a local directory.
+
+What such a model's numbers mean stands in few of the configurations ("depth_estimation_type"). Where it does
+not, it has to be declared, as always here; where both exist, they have to agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ufmstar_torch.models.aligned import AlignedNetwork
+from ufmstar_torch.models.alignment import KINDS, Alignment
+from ufmstar_torch.models.hugging_face_files import Checkpoint, load_model, read_checkpoint
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.outputs import METRIC
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.prediction import DepthPrediction
+
+# Pillow's numbers, which the configurations use.
+_LINEAR, _CUBIC = 2, 3
+# What "depth_estimation_type" says, in the words of this package. "relative" is inverse depth in all of them.
+_DECLARED = {"metric": METRIC, "relative": "inverse"}
+
+
+class RawDepth(nn.Module):
+    """A transformers depth model as an image-to-map network: its own units, the input's resolution, float32.
+
+    Args:
+        model: has ``predicted_depth`` [B, h, w] in what it returns for ``pixel_values``.
+        multiple: [px] what the input's sides have to be multiples of.
+    """
+
+    def __init__(self, model: nn.Module, multiple: int = 1) -> None:
+        super().__init__()
+        self.model = model
+        self.multiple = multiple
+
+    def forward(self, image: Tensor) -> Tensor:
+        """[B, H, W] of ``image`` [B, 3, H, W]; a smaller output is enlarged bilinearly.
+
+        Raises:
+            ValueError: the image has another shape, or sides that are no multiples of ``multiple``.
+        """
+        if image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
+            raise ValueError(
+                f"image must be floating-point [B, 3, H, W] as preprocess returns it, got {image.dtype} "
+                f"{tuple(image.shape)}"
+            )
+        size = (image.shape[-2], image.shape[-1])
+        if 0 in size or size[0] % self.multiple or size[1] % self.multiple:
+            raise ValueError(
+                f"image must have sides that are multiples of {self.multiple} px, got {size[0]} x {size[1]}"
+            )
+        dtype = next(self.model.parameters()).dtype
+        depth: Tensor = self.model(pixel_values=image.to(dtype)).predicted_depth
+        depth = depth if depth.dtype == torch.float64 else depth.float()
+        depth = depth[:, 0] if depth.dim() == 4 and depth.shape[1] == 1 else depth
+        if depth.shape[-2:] == size:
+            return depth
+        return F.interpolate(depth[:, None], size, mode="bilinear", align_corners=False)[:, 0]
+
+
+class HuggingFaceDepth(DepthNetwork):
+    """A transformers depth model; made by :func:`from_hugging_face`.
+
+    Attributes:
+        raw: the :class:`RawDepth`; ``raw(image)`` is what alignments are fitted to.
+        kind: "metric", "inverse" or "affine".
+        scale: [m] length of one unit, where metric.
+    """
+
+    def __init__(
+        self, raw: RawDepth, preprocess: Preprocess, kind: str, *, scale: float = 1.0, source: str = ""
+    ) -> None:
+        super().__init__()
+        if kind not in (METRIC, *KINDS):
+            raise ValueError(f"kind must be one of {(METRIC, *KINDS)}, got {kind!r}")
+        if not 0 < scale < float("inf"):
+            raise ValueError(f"scale must be positive metres per unit, got {scale}")
+        if kind != METRIC and scale != 1:
+            raise ValueError(f"scale goes with kind {METRIC!r} only; a relative network gets an Alignment")
+        self.raw = raw
+        self.preprocess = preprocess
+        self.kind = kind
+        self.scale = scale
+        self.source = source
+
+    @classmethod
+    def of_checkpoint(
+        cls,
+        checkpoint: Checkpoint,
+        preprocess: Preprocess,
+        *,
+        kind: str | None = None,
+        scale: float = 1.0,
+        allow_missing: Sequence[str] = (),
+        dtype: torch.dtype = torch.float32,
+    ) -> Self:
+        """From a checkpoint that was read; arguments and errors as :func:`from_hugging_face`."""
+        meant = _kind(checkpoint, kind)
+        raw = RawDepth(load_model(checkpoint, dtype, allow_missing), patch_size(checkpoint))
+        return cls(raw, preprocess, meant, scale=scale, source=checkpoint.name).eval()
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether it can be used without an alignment."""
+        return self.kind == METRIC
+
+    def forward(self, image: Tensor) -> DepthPrediction:
+        """Depth [B, H, W] [m], float32, of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
+
+        Raises:
+            ValueError: the network is relative, or the image does not fit.
+        """
+        self.require_metric()
+        return DepthPrediction(self.raw(image) * self.scale)
+
+    def require_metric(self) -> None:
+        """Raises ValueError if the network is relative."""
+        if not self.is_metric:
+            what = "inverse depth" if self.kind == "inverse" else "depth"
+            raise ValueError(
+                f"{self.source or 'this network'} predicts relative depth ({what} up to scale and shift), not metres: "
+                "give it an Alignment, fitted to measured depth (fit_inverse_depth, fit_affine_depth) or to the "
+                "camera's height (align_to_camera_height), by network.aligned(alignment); or use a metric checkpoint"
+            )
+
+    def aligned(self, alignment: Alignment) -> AlignedNetwork:
+        """The metric network that a relative one becomes by a fixed alignment; the weights are shared.
+
+        Raises:
+            ValueError: this network is metric, or the alignment is for the other kind of output.
+        """
+        if alignment.kind != self.kind:
+            raise ValueError(f"alignment must be of the network's kind {self.kind!r}, got {alignment.kind!r}")
+        return AlignedNetwork(self.raw, alignment, self.preprocess)
+
+
+def from_hugging_face(
+    name_or_dir: str | Path,
+    *,
+    kind: str | None = None,
+    scale: float = 1.0,
+    size: tuple[int, int] | None = None,
+    keep_aspect: bool | None = None,
+    preprocess: Preprocess | None = None,
+    allow_missing: Sequence[str] = (),
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
+    revision: str | None = None,
+    local_files_only: bool = False,
+) -> HuggingFaceDepth:
+    """Any model that ``AutoModelForDepthEstimation`` knows (DPT, ZoeDepth, GLPN, ...), in eval mode.
+
+    Args:
+        name_or_dir: "owner/name" on the hub, or a directory with config.json and weights.
+        kind: what it predicts: "metric" (ZoeDepth, GLPN, DPT trained on NYU or KITTI), "inverse" (DPT and MiDaS
+            otherwise) or "affine" (depth up to scale and shift). None = what the configuration says, if it does.
+        scale: [m] length of one unit of metric depth.
+        size: (height, width) [px] of the input; None = that of preprocessor_config.json.
+        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration says.
+        preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
+        allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
+            "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
+        dtype: of the weights; what comes out is float32 in any case (float64 for float64).
+        device: where they go; None = the CPU.
+        revision: branch, tag or commit on the hub.
+        local_files_only: whether the hub may not be asked.
+
+    The image processor's padding (ZoeDepth) is not done.
+
+    Raises:
+        ValueError: the kind is declared nowhere or contradicts the configuration, or a value is out of range.
+        CheckpointError: a directory or checkpoint is damaged, incomplete or of another kind of model; named.
+        FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
+        ModuleNotFoundError: transformers is missing.
+    """
+    checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
+    _kind(checkpoint, kind)  # before the weights are downloaded
+    if preprocess is None:
+        preprocess = own_preprocess(checkpoint, size, keep_aspect)
+    elif size is not None or keep_aspect is not None:
+        raise ValueError("preprocess excludes size and keep_aspect: it says both")
+    network = HuggingFaceDepth.of_checkpoint(
+        checkpoint, preprocess, kind=kind, scale=scale, allow_missing=allow_missing, dtype=dtype
+    )
+    return network.to(device)
+
+
+def own_preprocess(
+    checkpoint: Checkpoint, size: tuple[int, int] | None = None, keep_aspect: bool | None = None
+) -> Preprocess:
+    """The preprocessing that a checkpoint's image processor describes.
+
+    Raises:
+        ValueError: it says nothing of what is needed, or wants what ``Preprocess`` cannot do.
+    """
+    says = checkpoint.processor
+    unknown = [name for name in ("do_center_crop", "do_flip_channel_order") if says.get(name)]
+    if unknown or says.get("resample", _CUBIC) not in (_LINEAR, _CUBIC):
+        raise ValueError(
+            f"{checkpoint.name}: its image processor asks for {unknown or 'resample ' + str(says['resample'])}, which "
+            "is not supported: give a Preprocess of your own"
+        )
+    own = says.get("size")
+    if size is None and isinstance(own, dict) and {"height", "width"} <= set(own):
+        size = (int(own["height"]), int(own["width"]))
+    if size is None or not says:
+        raise ValueError(f"{checkpoint.name} does not say what its input needs: give size or a Preprocess of your own")
+    keep = bool(says.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
+    multiple = max(patch_size(checkpoint), int(says.get("ensure_multiple_of") or says.get("size_divisor") or 1))
+    normal = bool(says.get("do_normalize", True))
+    mean, std = (says.get(name) if normal else None for name in ("image_mean", "image_std"))
+    if normal and (mean is None or std is None):
+        raise ValueError(f"{checkpoint.name}: its image processor normalises, but names no image_mean and image_std")
+    return Preprocess.from_dict(
+        {
+            "size": tuple(size),
+            "aspect_multiple": multiple if keep else None,
+            "value_range": 255 * float(says.get("rescale_factor", 1 / 255)) if says.get("do_rescale", True) else 255.0,
+            "mean": tuple(mean or (0.0, 0.0, 0.0)),
+            "std": tuple(std or (1.0, 1.0, 1.0)),
+            "cubic": says.get("resample", _CUBIC) == _CUBIC,
+        }
+    )
+
+
+def patch_size(checkpoint: Checkpoint) -> int:
+    """[px] what an input's sides have to be multiples of: Depth Anything's patches; 1 where others decide."""
+    value: Any = checkpoint.config.get("patch_size", 14 if checkpoint.model_type == "depth_anything" else 1)
+    return int(max(value)) if isinstance(value, (list, tuple)) else int(value or 1)
+
+
+def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
+    said = checkpoint.config.get(
+        "depth_estimation_type", "relative" if checkpoint.model_type == "depth_anything" else None
+    )
+    if said is not None and said not in _DECLARED:
+        raise ValueError(f"{checkpoint.name}: depth_estimation_type must be one of {list(_DECLARED)}, got {said!r}")
+    own = None if said is None else _DECLARED[said]
+    if own is None and kind is None:
+        raise ValueError(
+            f"{checkpoint.name} ({checkpoint.model_type}) does not say whether its depth is metric: declare "
+            "kind='metric', 'inverse' (inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
+        )
+    if own is not None and kind not in (None, own):
+        raise ValueError(f"kind={kind!r}, but {checkpoint.name} says depth_estimation_type {said!r}, which is {own!r}")
+    if own == METRIC and "max_depth" not in checkpoint.config:
+        raise ValueError(f"{checkpoint.name} says metric, but not the max_depth [m] that its output is a share of")
+    return own or kind or ""

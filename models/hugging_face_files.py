@@ -1,0 +1,142 @@
+"""Checkpoints of ``transformers`` from disk or hub: read completely, or an error that names them.
+
+``transformers`` itself fills weights that a file lacks with random numbers and goes on; here that is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+from torch import nn
+
+from ufmstar_torch.models.checkpoints import CheckpointError
+
+_SHOWN = 5  # weights named in an error message
+_TO_DOWNLOAD = "with a connection, `hf download NAME --local-dir DIR` fetches it; a directory needs no connection"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint whose configuration has been read.
+
+    Attributes:
+        name: as given, for messages.
+        folder: None if it comes from the hub.
+        config: config.json.
+        processor: preprocessor_config.json, empty if there is none.
+        options: for every further question to ``transformers``.
+    """
+
+    name: str
+    folder: Path | None
+    config: dict[str, Any]
+    processor: dict[str, Any]
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def model_type(self) -> str:
+        """As "depth_anything", "dpt"."""
+        return str(self.config.get("model_type"))
+
+
+def read_checkpoint(name_or_dir: str | Path, revision: str | None, local_files_only: bool) -> Checkpoint:
+    """The configuration of a checkpoint.
+
+    Raises:
+        FileNotFoundError: a directory is missing, or lacks config.json.
+        CheckpointError: config.json or preprocessor_config.json cannot be read.
+        OSError: the hub cannot be reached, or has nothing of that name.
+        ModuleNotFoundError: transformers is missing.
+    """
+    from transformers import PreTrainedConfig
+    from transformers.image_processing_base import ImageProcessingMixin
+
+    name = Path(name_or_dir).as_posix()
+    folder = Path(name_or_dir).expanduser() if _is_path(name) else None
+    if folder is not None and not (folder / "config.json").is_file():
+        what = f"{folder} has no config.json" if folder.is_dir() else f"no such directory: {folder}"
+        raise FileNotFoundError(f"{what}; a checkpoint of transformers is a directory with config.json and weights")
+    options = {"local_files_only": local_files_only or folder is not None, "revision": revision or "main"}
+    try:
+        config, _ = PreTrainedConfig.get_config_dict(str(folder or name), **options)
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        if folder is None:
+            raise OSError(f"{name} cannot be had from the Hugging Face hub: {error}; {_TO_DOWNLOAD}") from error
+        raise CheckpointError(f"{folder}/config.json cannot be read: {error}") from error
+    processor: dict[str, Any] = {}
+    if folder is None or any((folder / f).is_file() for f in ("preprocessor_config.json", "processor_config.json")):
+        try:
+            processor, _ = ImageProcessingMixin.get_image_processor_dict(str(folder or name), **options)
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise CheckpointError(f"{folder or name}: preprocessor_config.json cannot be read: {error}") from error
+    if not isinstance(config, dict) or not isinstance(processor, dict):
+        raise CheckpointError(f"{folder or name}: config.json and preprocessor_config.json must hold JSON objects")
+    return Checkpoint(str(folder or name), folder, config, processor, options)
+
+
+def load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: Sequence[str] = ()) -> nn.Module:
+    """The model with every weight from the checkpoint, on the CPU.
+
+    Args:
+        checkpoint: what to load.
+        dtype: of the weights, whatever the file has.
+        allow_missing: beginnings of names of weights that the file may lack.
+
+    Raises:
+        CheckpointError: not a depth model, damaged, or with missing, misshapen or non-finite weights; the message
+            names the directory.
+    """
+    from huggingface_hub.errors import StrictDataclassError
+    from safetensors import SafetensorError
+    from transformers import AutoModelForDepthEstimation
+
+    damage = (OSError, ValueError, TypeError, LookupError, RuntimeError, AttributeError, EOFError)
+    try:
+        with _quiet(checkpoint.folder is not None):
+            model, report = AutoModelForDepthEstimation.from_pretrained(
+                checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options
+            )
+    except (*damage, UnpicklingError, SafetensorError, StrictDataclassError) as error:
+        raise CheckpointError(
+            f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}"
+        ) from error
+    missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(allow_missing)))
+    if missing:
+        more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
+        raise CheckpointError(
+            f"{checkpoint.name} lacks weights, which would stay random: {', '.join(missing[:_SHOWN])}{more}; where the "
+            "model does not use them, name them in allow_missing"
+        )
+    broken = [key for key, value in model.state_dict().items() if not value.isfinite().all()]
+    if broken:
+        raise CheckpointError(f"{checkpoint.name} has weights that are not finite: {', '.join(broken[:_SHOWN])}")
+    return model.eval()
+
+
+def _is_path(name: str) -> bool:
+    """Whether a directory is meant: one that exists, or what no "owner/name" looks like."""
+    path = Path(name)
+    return path.is_dir() or path.is_absolute() or name.startswith((".", "~")) or len(path.parts) > 2
+
+
+@contextmanager
+def _quiet(local: bool) -> Iterator[None]:
+    """No progress bar for reading a local file of a second, and no report on the weights, which are checked here."""
+    from transformers.utils import logging
+
+    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    if local and bars:
+        logging.disable_progress_bar()
+    logging.set_verbosity(max(level, logging.CRITICAL if local else logging.ERROR))
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if local and bars:
+            logging.enable_progress_bar()
