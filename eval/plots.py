@@ -104,6 +104,7 @@ def contact_sheet(
     *,
     title: str = "",
     scales: PanelScales | None = None,
+    columns: Sequence[Column] | None = None,
     dpi: int = 110,
 ) -> PanelScales:
     """Draw the frames below each other and write the picture (PNG), atomically.
@@ -116,6 +117,7 @@ def contact_sheet(
         path: the file; its folder must exist.
         title: over the sheet.
         scales: None = ``fit_scales(panels)``.
+        columns: right of the image; None = depth, sigma and, where a panel has one, the error.
         dpi: pixels per inch.
 
     Returns:
@@ -132,7 +134,8 @@ def contact_sheet(
     from matplotlib.figure import Figure
 
     used = fit_scales(panels) if scales is None else scales
-    columns = map_columns(used, with_error=any(p.error is not None for p in panels))
+    if columns is None:
+        columns = map_columns(used, with_error=any(p.error is not None for p in panels))
     grid = _Grid.of(panels, columns=1 + len(columns), title=bool(title))
     figure = Figure(figsize=(grid.width, grid.height), dpi=dpi, facecolor="white")
     canvas = FigureCanvasAgg(figure)

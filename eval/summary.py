@@ -199,9 +199,9 @@ def table(summary: Mapping[str, Any]) -> str:
             rows.append(("network alone", summary["network_alone"], uncertainty["mean_network_sigma"]))
         head = ["", *_COLUMNS.values(), "sigma [m]"]
         body = [
-            [name, *(_number(figures.get(key)) for key in _COLUMNS), _number(sigma)] for name, figures, sigma in rows
+            [name, *(number(figures.get(key)) for key in _COLUMNS), number(sigma)] for name, figures, sigma in rows
         ]
-        lines += _aligned([head, *body])
+        lines += aligned([head, *body])
         if summary["network_alone"] is None:
             lines.append(f"network alone: no row, {summary['network_alone_reason']}")
         if (summary["metrics"]["nll"] or 0) > _NLL_DOMINATED:
@@ -210,7 +210,7 @@ def table(summary: Mapping[str, Any]) -> str:
                 f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
             )
     else:
-        sigma = _number(uncertainty["mean_sigma"])
+        sigma = number(uncertainty["mean_sigma"])
         lines.append(f"no metrics: {summary['metrics_reason']}; mean sigma {sigma} m")
     mixture, time = summary["mixture"], summary["time"]
     stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
@@ -218,7 +218,7 @@ def table(summary: Mapping[str, Any]) -> str:
     lines += [
         f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
         f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "
-        f"{_number(uncertainty['mean_disagreement'])} m^2",
+        f"{number(uncertainty['mean_disagreement'])} m^2",
         f"{summary['frames']['done']} frames{f' at {rate:.1f} per second' if rate else ''}; median ms: {stages}",
     ]
     lines += [f"skipped {count}: {reason}" for reason, count in summary["frames"]["skipped"].items()]
@@ -226,11 +226,13 @@ def table(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
+    """Three digits, a dash for no value."""
     return "-" if value is None or math.isnan(value) else f"{value:.3g}"
 
 
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table: the first column to the left, the others to the right."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
         "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
