@@ -86,7 +86,36 @@ def bench(arguments: Sequence[str]) -> int:
     return int(benchmark.main(list(arguments)) or OK)
 
 
-COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {"run": run, "bench": bench}
+def train(arguments: Sequence[str]) -> int:
+    """networks with an uncertainty head, or ensembles of them"""
+    from jsonargparse import ArgumentError
+
+    from ufmstar_torch.train.options import job_from, parse_train, train_parser
+    from ufmstar_torch.train.presets import table
+
+    try:
+        options = parse_train(train_parser(), arguments)
+        if options["list"]:
+            print(table())
+            return OK
+        _set_threads(options["threads"])
+        job = job_from(options)
+    except (ArgumentError, ImportError, OSError, TypeError, ValueError) as error:
+        raise UsageError(_one_line(error)) from error
+    from ufmstar_torch.train.fit import fit
+
+    try:
+        with _stop_signals(lambda text: print(text, file=sys.stderr)) as stop:
+            summary = fit(job, asked=stop)
+    except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
+        if options["debug"]:
+            traceback.print_exc()
+        return _told(f"ufmstar train: failed: {_one_line(error)}", FAILED)
+    print(f"{job.settings.out}: trained.safetensors, summary.json")
+    return OK if summary["stopped"] is None else _told(f"ufmstar train: {summary['stopped']}", INTERRUPTED)
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {"run": run, "bench": bench, "train": train}
 
 
 def _run(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,127 @@
+"""Checkpoints that are whole or absent, written so that a killed training goes on exactly; and orderly stops.
+
+```
+OUT/member_0/last.ckpt    Lightning's checkpoint: weights, optimizer, schedule, loops; and the next (epoch, batch)
+```
+The order of the samples, their augmentation and dropout are functions of seed, epoch and step (``train.batches``,
+``train.module.step_seed``), so no state of a random number generator has to be kept: nothing else that draws
+numbers, nor a progress bar, nor another number of workers, can change what a continued training computes.
+"""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+
+from ufmstar_torch.eval.files import write_atomic
+
+NAME = "last.ckpt"
+# Under this key, the sampler's position: {"epoch", "batch"} that come next.
+POSITION = "ufmstar_next"
+TIME, STEPS, SIGNAL = "time budget spent", "step budget spent", "stopped"
+
+
+class ResumeError(ValueError):
+    """There is nothing to go on from, or it does not fit; the message says what to do."""
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes through a temporary file that then takes the old one's place, once the disk has it.
+
+    Lightning's own writer fills the destination in place: a kill in the middle would leave neither checkpoint.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Replace ``path`` durably.
+
+        Raises:
+            OSError: a full disk, say; the checkpoint before it is kept.
+        """
+        target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(target, lambda file: torch.save(checkpoint, file), durable=True)
+
+
+class Checkpoints(pl.Callback):
+    """Writes ``last.ckpt`` every so many steps and at the end of every epoch, after its validation.
+
+    Args:
+        path: of the file.
+        every: steps; 0 = at the end of epochs only.
+    """
+
+    def __init__(self, path: Path, every: int) -> None:
+        self.path = path
+        self.every = every
+
+    def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
+        """In the middle of an epoch; what its last batch leaves is kept with its validation."""
+        due = self.every > 0 and trainer.global_step % self.every == 0
+        if (due or trainer.should_stop) and not trainer.fit_loop.epoch_loop._num_ready_batches_reached():
+            trainer.save_checkpoint(self.path)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        """At the end of an epoch that was not cut short."""
+        if trainer.fit_loop.epoch_loop._num_ready_batches_reached():
+            trainer.save_checkpoint(self.path)
+
+    def on_save_checkpoint(self, trainer: pl.Trainer, module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
+        """The sampler's position."""
+        loop = trainer.fit_loop.epoch_loop
+        done = loop.batch_progress.current.processed
+        ended = loop._num_ready_batches_reached()
+        epoch = trainer.current_epoch
+        checkpoint[POSITION] = {"epoch": epoch + 1, "batch": 0} if ended else {"epoch": epoch, "batch": done}
+
+
+class Stops(pl.Callback):
+    """Ends a training in good order: by the clock, or when asked to.
+
+    Args:
+        deadline: ``time.monotonic()`` at which to stop, or None.
+        asked: whether somebody wants it to stop.
+
+    Attributes:
+        reason: why it was stopped, or None.
+    """
+
+    def __init__(self, deadline: float | None, asked: Callable[[], bool] | None = None) -> None:
+        self.deadline = deadline
+        self.asked = asked
+        self.reason: str | None = None
+
+    def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
+        """All processes stop after the same step."""
+        late = self.deadline is not None and time.monotonic() >= self.deadline
+        asked = self.asked is not None and self.asked()
+        reason = SIGNAL if asked else TIME if late else None
+        if trainer.world_size > 1:
+            code = torch.tensor(0 if reason is None else 2 if asked else 1, device=module.device)
+            torch.distributed.all_reduce(code, torch.distributed.ReduceOp.MAX)
+            reason = (None, TIME, SIGNAL)[int(code)]
+        if reason is not None:
+            self.reason = reason
+            trainer.should_stop = True
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint that :class:`Checkpoints` wrote.
+
+    Raises:
+        ResumeError: it cannot be read, or is none of those.
+    """
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, EOFError, RuntimeError, KeyError, UnpicklingError, zipfile.BadZipFile, ValueError) as error:
+        raise ResumeError(f"--resume: {path} cannot be read ({error}); --overwrite starts again") from error
+    if not isinstance(stored, dict) or POSITION not in stored:
+        raise ResumeError(f"--resume: {path} is no checkpoint of this program; --overwrite starts again")
+    return stored

@@ -1,0 +1,180 @@
+"""The training of one network, from its first step or from its last checkpoint to its weights on disk."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import nn
+
+from ufmstar_torch.eval.files import write_json_atomic
+from ufmstar_torch.models.spec import build_network
+from ufmstar_torch.models.trained import save_trained
+from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, read_checkpoint
+from ufmstar_torch.train.data import DataConfig, DepthDataModule
+from ufmstar_torch.train.history import METRICS, History, read_rows
+from ufmstar_torch.train.module import TrainingModule, step_seed
+from ufmstar_torch.train.presets import Recipe
+from ufmstar_torch.train.settings import FitSettings
+from ufmstar_torch.train.start import start_from
+
+WEIGHTS, RESULT = "trained.safetensors", "result.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is trained, on what, and how it is run; plain values that pickle.
+
+    Attributes:
+        recipe: decides the weights.
+        data: where samples come from; its batch size and seed are replaced by the recipe's and the member's.
+        settings: of this run.
+    """
+
+    recipe: Recipe
+    data: DataConfig
+    settings: FitSettings
+
+    def folder(self, member: int) -> Path:
+        """Of everything that belongs to one member."""
+        return self.settings.out / f"member_{member}"
+
+    def seed(self, member: int) -> int:
+        """Of a member's first weights, order of samples, augmentation and dropout."""
+        return self.settings.seed + member
+
+
+def new_network(job: Job, member: int) -> nn.Module:
+    """The network that a member starts with; the same for the same seed, whatever was drawn before."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(step_seed(job.seed(member), 0, -1))
+        network = build_network(job.recipe.network)
+    return start_from(network, job.recipe.network, job.settings)
+
+
+def train_member(
+    job: Job, member: int, *, deadline: float | None = None, asked: Callable[[], bool] | None = None
+) -> str | None:
+    """Train one member, going on from its checkpoint where it has one.
+
+    Args:
+        job: what and how.
+        member: its number.
+        deadline: ``time.monotonic()`` at which to stop, or None.
+        asked: whether somebody wants it to stop.
+
+    Returns:
+        None when it is finished, otherwise why it was stopped; both times its weights are on disk.
+
+    Raises:
+        NonFiniteLossError: the training has diverged.
+        ResumeError: the checkpoint cannot be read.
+    """
+    s, folder = job.settings, job.folder(member)
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = folder / NAME
+    stored = read_checkpoint(checkpoint) if checkpoint.is_file() else None
+    start = (0, 0.0) if stored is None else (int(stored["global_step"]), float(stored["ufmstar_seconds"]))
+    stops = Stops(deadline, asked)
+    history = History(folder, s.log_every, start)
+    with quiet_lightning(), torch.random.fork_rng():
+        trainer = make_trainer(job, member, [stops, history, Checkpoints(checkpoint, s.checkpoint_every)])
+        data = make_data(job, member, trainer.world_size)
+        module = TrainingModule(new_network(job, member), job.recipe, total_steps(job, data), job.seed(member))
+        trainer.fit(module, data, ckpt_path=None if stored is None else checkpoint, weights_only=True)
+    if trainer.is_global_zero:
+        finish(job, member, module, history, trainer.global_step, stops.reason)
+    trainer.strategy.barrier("member is written")
+    return stops.reason
+
+
+def make_data(job: Job, member: int, world: int) -> DepthDataModule:
+    """The member's data, opened.
+
+    Raises:
+        ValueError: the batch cannot be divided among the processes.
+    """
+    if job.recipe.batch_size % world:
+        raise ValueError(f"batch_size {job.recipe.batch_size} must be a multiple of the {world} processes")
+    config = replace(job.data, batch_size=job.recipe.batch_size // world, seed=job.seed(member))
+    data = DepthDataModule(config, job.recipe.network.input())
+    data.setup("fit")
+    return data
+
+
+def total_steps(job: Job, data: DepthDataModule) -> int:
+    """Optimizer steps of the whole training.
+
+    Raises:
+        ValueError: an epoch has no full batch.
+    """
+    images, batch = len(data.train_set or ()), job.recipe.batch_size
+    if images < batch:
+        raise ValueError(f"the training part has {images} images, fewer than batch_size {batch}")
+    return job.recipe.max_steps or job.recipe.epochs * (images // batch)
+
+
+def make_trainer(job: Job, member: int, callbacks: Sequence[pl.Callback]) -> pl.Trainer:
+    """Lightning's trainer; nothing of it writes checkpoints but :class:`Checkpoints`."""
+    r, s = job.recipe, job.settings
+    return pl.Trainer(
+        accelerator=s.accelerator,
+        devices=s.devices,
+        num_nodes=s.nodes,
+        strategy=s.strategy,
+        precision=s.precision,
+        max_epochs=-1 if r.max_steps else r.epochs,
+        max_steps=r.max_steps or -1,
+        gradient_clip_val=r.clip or None,
+        logger=tensorboard(job, member),
+        callbacks=list(callbacks),
+        plugins=[AtomicCheckpointIO()],
+        log_every_n_steps=1,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        enable_progress_bar=s.progress,
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+        default_root_dir=str(s.out),
+    )
+
+
+def tensorboard(job: Job, member: int) -> Any:
+    """The logger for TensorBoard, or False."""
+    if not job.settings.tensorboard:
+        return False
+    from lightning.pytorch.loggers import TensorBoardLogger
+
+    return TensorBoardLogger(str(job.settings.out), name="tensorboard", version=f"member_{member}")
+
+
+def finish(job: Job, member: int, module: TrainingModule, history: History, step: int, reason: str | None) -> None:
+    """Write the weights, and then result.json, whose "finished" says that the member needs no more training."""
+    folder = job.folder(member)
+    rows = read_rows(folder / METRICS)
+    figures: dict[str, Any] = {k: float(v) for k, v in rows[-1].items() if v} if rows else {}
+    told = {"member": member, "seed": job.seed(member), "steps": step, "seconds": round(history.seconds, 1)}
+    result = {**told, "finished": reason is None, "stopped": reason, "figures": figures}
+    info = {"recipe": job.recipe.to_dict(), **result}
+    save_trained(folder / WEIGHTS, [module.result.eval()], job.recipe.network, info=info)
+    write_json_atomic(folder / RESULT, result)
+
+
+@contextmanager
+def quiet_lightning() -> Iterator[None]:
+    """Without Lightning's remarks on hardware and tips; warnings stay."""
+    loggers = [logging.getLogger(f"lightning.{part}") for part in ("pytorch", "fabric")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)

@@ -1,0 +1,202 @@
+"""The Lightning module: loss, optimizer, schedule, and what is told of a network while it is trained."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.optim import Adam
+from torch.optim.lr_scheduler import LambdaLR
+
+from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.train.losses import loss_sums
+from ufmstar_torch.train.presets import Recipe
+from ufmstar_torch.train.progress import Sums, ValidationSums
+
+Batch = Mapping[str, Any]
+
+
+class NonFiniteLossError(RuntimeError):
+    """The loss is NaN or infinite; the message names the batch and its samples."""
+
+
+class TrainingModule(pl.LightningModule):
+    """Trains one network.
+
+    Every random number of a step (dropout) follows from (seed, process, step) alone, so that a run that was killed
+    goes on as if nothing had happened, whatever else drew random numbers meanwhile.
+
+    Args:
+        network: an ``UncertaintyNetwork``, ``MonteCarloDropout`` or ``BatchEnsemble``: it has ``.distribution(image)``.
+        recipe: of its training.
+        total_steps: with which the schedule ends.
+        seed: of the training.
+
+    Attributes:
+        averaged: running mean of the network's weights (``recipe.average``), or None.
+        residuals: squared errors of the training part in this epoch, as they were at each step: the variance of
+            the constant-variance baseline.
+        losses: of the training part in this epoch: (sum, pixels).
+    """
+
+    def __init__(self, network: nn.Module, recipe: Recipe, total_steps: int, seed: int = 0) -> None:
+        super().__init__()
+        self.network = network
+        self.recipe = recipe
+        self.total_steps = total_steps
+        self.seed = seed
+        self.averaged = copy.deepcopy(network).requires_grad_(False) if recipe.average else None
+        self.residuals = Sums()
+        self.losses = Sums()
+        self.validation = ValidationSums()
+
+    @property
+    def result(self) -> nn.Module:
+        """The network to keep: the running mean where there is one."""
+        return self.network if self.averaged is None else self.averaged
+
+    # ---- training ----
+
+    def on_train_epoch_start(self) -> None:
+        """The sums are those of one epoch."""
+        self.residuals, self.losses = Sums(), Sums()
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Random numbers that depend on nothing but seed, process and step."""
+        torch.manual_seed(step_seed(self.seed, self.global_rank, self.global_step))
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The loss of the whole batch, whatever processes it is divided among.
+
+        The value returned is this process's sum over the batch's number of pixels, times the number of processes:
+        its gradient, averaged over processes as DistributedDataParallel does, is that of the mean over all pixels.
+
+        Raises:
+            NonFiniteLossError: it is NaN or infinite.
+        """
+        distribution = self._distribution(batch["image"])
+        target, valid = _tiled(batch["depth"], distribution), _tiled(batch["valid"], distribution)
+        total, count = loss_sums(distribution, target, valid)
+        error = torch.where(valid, distribution.depth.detach().float() - target, 0.0).double()
+        mine = torch.stack([total.detach().double(), count.double(), error.square().sum(), valid.sum().double()])
+        together, world = self._over_processes(mine)
+        if not math.isfinite(together[0]):
+            raise NonFiniteLossError(self._blame(batch, batch_idx, float(total.detach())))
+        self.residuals = self.residuals.plus(*together[2:].tolist())
+        self.losses = self.losses.plus(*together[:2].tolist())
+        mean = together[0] / together[1].clamp(min=1)
+        self.log("train_loss", mean.float(), prog_bar=True, batch_size=len(target))
+        self.log("learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=1)
+        return total * (world / together[1].clamp(min=1)).to(total)
+
+    def optimizer_step(self, *arguments: Any, **named: Any) -> None:
+        """A step, and the running mean after it (here, so that a checkpoint after the step holds both)."""
+        super().optimizer_step(*arguments, **named)
+        if self.averaged is not None:
+            # The start is not worth remembering: the first steps get a shorter memory.
+            decay = min(self.recipe.average, self.global_step / (self.global_step + 10))
+            move_average(self.averaged, self.network, decay)
+
+    def on_train_epoch_end(self) -> None:
+        """Log the epoch's mean loss over pixels."""
+        if self.losses.pixels:
+            self.log("train_loss_epoch", self.losses.mean())
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Adam and the schedule, step by step."""
+        r = self.recipe
+        trained = [p for p in self.network.parameters() if p.requires_grad]
+        optimizer = Adam(trained, r.learning_rate, betas=(r.beta1, r.beta2), weight_decay=r.weight_decay)
+        schedule = LambdaLR(optimizer, lambda step: share_of_rate(step, self.total_steps, r))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    # ---- validation ----
+
+    def on_validation_epoch_start(self) -> None:
+        """A fresh start."""
+        self.validation = ValidationSums()
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Add a batch to the sums."""
+        prediction = self.result(batch["image"])
+        self.validation = self.validation.plus(prediction, batch["depth"], batch["valid"])
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the validation's figures, over all processes."""
+        sums = self.validation.over(lambda values: self._over_processes(values.to(self.device))[0])
+        if not sums.pixels:
+            return
+        for name, value in sums.figures(self.residuals).items():
+            self.log(name, value, prog_bar=name in ("val_nll", "val_delta1"), rank_zero_only=False, sync_dist=False)
+
+    # ---- state ----
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The epoch's sums, beside what Lightning keeps."""
+        checkpoint["ufmstar_sums"] = {"residuals": self.residuals.to_list(), "losses": self.losses.to_list()}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The same back."""
+        self.residuals = Sums(*checkpoint["ufmstar_sums"]["residuals"])
+        self.losses = Sums(*checkpoint["ufmstar_sums"]["losses"])
+
+    def _distribution(self, image: Tensor) -> DepthDistribution:
+        return self.network.distribution(image)
+
+    def _over_processes(self, values: Tensor) -> tuple[Tensor, int]:
+        """The sum over all processes, and their number."""
+        if not (dist.is_available() and dist.is_initialized()):
+            return values, 1
+        together = values.clone()
+        dist.all_reduce(together)
+        return together, dist.get_world_size()
+
+    def _blame(self, batch: Batch, batch_idx: int, mine: float) -> str:
+        names = batch.get("name")
+        told = f", samples {', '.join(map(str, names))}" if names is not None else ""
+        process = f" (process {self.global_rank}: {mine})" if self.trainer.world_size > 1 else ""
+        return (
+            f"the loss is not finite in epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step}{told})"
+            f"{process}; a smaller learning rate or clip = 1 may help; the last checkpoint before it is kept"
+        )
+
+
+def step_seed(seed: int, rank: int, step: int) -> int:
+    """A seed in 63 bits that differs for every (seed, process, step)."""
+    # SplitMix64's mixing, so that neighbouring steps have nothing in common.
+    z = (seed * 0x9E3779B97F4A7C15 + rank * 0xBF58476D1CE4E5B9 + step * 0x94D049BB133111EB + 1) % 2**64
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
+    return (z ^ (z >> 31)) >> 1
+
+
+def share_of_rate(step: int, total: int, recipe: Recipe) -> float:
+    """The learning rate of a step (from 0) as a share of ``recipe.learning_rate``."""
+    warm = min(1.0, (step + 1) / (recipe.warmup_steps + 1))
+    if recipe.schedule == "constant":
+        return warm
+    past = max(0, step - recipe.warmup_steps) / max(1, total - recipe.warmup_steps)
+    return warm * 0.5 * (1 + math.cos(math.pi * min(1.0, past)))
+
+
+@torch.no_grad()
+def move_average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
+    """averaged <- decay averaged + (1 - decay) network, in place; batch norm's statistics as well, counters copied."""
+    state = network.state_dict()
+    for name, mean in averaged.state_dict().items():
+        if mean.is_floating_point():
+            mean.lerp_(state[name], 1 - decay)
+        else:
+            mean.copy_(state[name])
+
+
+def _tiled(target: Tensor, distribution: DepthDistribution) -> Tensor:
+    """The target once per prediction: a BatchEnsemble predicts for every member, member after member."""
+    times = len(distribution.depth) // len(target)
+    return target if times == 1 else target.repeat(times, 1, 1)
