@@ -1,0 +1,96 @@
+"""Where rays meet a tour's surfaces, exactly: closed forms in unit coordinates, in float64.
+
+A ray is origin + t direction, in the unit coordinates of the surface (see ``shapes``); an affine map leaves t
+alone, so with directions of camera z = 1, t is the depth. A miss is infinity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD
+
+Scalars = tuple[float, float, float] | tuple[Tensor, Tensor, Tensor]
+Components = tuple[Tensor, Tensor, Tensor]
+
+# Added to directions: turns an exact 0 into a number whose inverse is finite, and leaves all others as they
+# are (they are above 1e-13 or 0).
+_NOT_ZERO = 1e-30
+_MISS = float("inf")
+
+
+def entry(kind: int, origin: Scalars, direction: Components, taper: float) -> Tensor:
+    """The ray parameter t > 0 at which rays first meet a unit shape from outside; infinity where they miss it.
+
+    Args:
+        kind: QUAD, BOX, ELLIPSOID or FRUSTUM.
+        origin: x, y, z of the rays' common origin, or of one origin per ray.
+        direction: x, y, z of the rays' directions, any shape.
+        taper: of a frustum.
+    """
+    return _ENTRIES[kind](origin, direction, taper)
+
+
+def _quad(o: Scalars, d: Components, taper: float) -> Tensor:
+    t = -o[1] / (d[1] + _NOT_ZERO)
+    x, z = t * d[0] + o[0], t * d[2] + o[2]
+    outside = torch.maximum(x.abs_(), z.abs_()) > 1
+    return t.masked_fill_(outside | (t <= 0) | (d[1] <= 0), _MISS)
+
+
+def _slab(o: float | Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    inverse = (d + _NOT_ZERO).reciprocal_()
+    middle, reach = inverse * -o, inverse.abs()
+    return middle - reach, middle + reach
+
+
+def _box(o: Scalars, d: Components, taper: float) -> Tensor:
+    near, far = _slab(o[0], d[0])
+    for axis in (1, 2):
+        a, b = _slab(o[axis], d[axis])
+        near, far = torch.maximum(near, a, out=a), torch.minimum(far, b, out=b)
+    return near.masked_fill_((near > far) | (near <= 0), _MISS)
+
+
+def _ellipsoid(o: Scalars, d: Components, taper: float) -> Tensor:
+    a = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    b = d[0] * o[0] + d[1] * o[1] + d[2] * o[2]
+    c = o[0] * o[0] + o[1] * o[1] + o[2] * o[2] - 1
+    discriminant = b * b - a * c
+    # From outside c > 0 and b < 0 towards the ball: c / (-b + root) is the nearer root without cancellation.
+    t = c / (discriminant.clamp_min(0).sqrt_() - b)
+    return t.masked_fill_((discriminant < 0) | (b >= 0), _MISS)
+
+
+def _frustum(o: Scalars, d: Components, taper: float) -> Tensor:
+    """x^2 + z^2 = (m + n y)^2 between the planes y = -1 and 1."""
+    m, n = (1 + taper) / 2, (1 - taper) / 2
+    radius = o[1] * n + m
+    a = d[0] * d[0] + d[2] * d[2] - d[1] * d[1] * (n * n)
+    b = d[0] * o[0] + d[2] * o[2] - d[1] * (radius * n)
+    c = o[0] * o[0] + o[2] * o[2] - radius * radius
+    discriminant = b * b - a * c
+    root = discriminant.clamp_min(0).sqrt_()
+    q = -(b + torch.copysign(root, b))  # both roots without cancellation: q / a and c / q
+    best = torch.full_like(b, _MISS)
+    for t in (q / (a + _NOT_ZERO), c / (q + _NOT_ZERO)):
+        outside = (t * d[1] + o[1]).abs_() > 1
+        best = torch.minimum(best, t.masked_fill(outside | (discriminant < 0) | (t <= 0), _MISS))
+    inverse = (d[1] + _NOT_ZERO).reciprocal_()
+    for y, r in ((-1.0, taper), (1.0, 1.0)):
+        t = inverse * (y - o[1])
+        x, z = t * d[0] + o[0], t * d[2] + o[2]
+        outside = x * x + z * z > r * r
+        best = torch.minimum(best, t.masked_fill(outside | (t <= 0), _MISS))
+    return best
+
+
+_ENTRIES: dict[int, Callable[[Scalars, Components, float], Tensor]] = {
+    QUAD: _quad,
+    BOX: _box,
+    ELLIPSOID: _ellipsoid,
+    FRUSTUM: _frustum,
+}

@@ -1,0 +1,122 @@
+"""``tour_path``: a hand-held camera that walks a way through a tour."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.eval.tour.route import SPACING
+from ufmstar_torch.eval.tour.shapes import lean, tilt, turn
+from ufmstar_torch.eval.tour.tour import Tour
+
+Array = NDArray[np.float64]
+
+_STEP, _TURN = 0.12, np.radians(5.0)  # a frame moves about this far [m], or turns about this much [rad]
+_SLOWEST = 0.5  # of that pace; with more frames, the way is walked again
+_LOOKAHEAD, _SMOOTH = 0.7, 0.4  # the camera looks at where it will be, with a slow head [m]
+SWAY = 0.04  # of the hand, at most, on either axis [m]
+_GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
+
+
+def tour_path(tour: Tour, frames: int, seed: int | None = None) -> Tensor:
+    """[N, 4, 4] float64 camera-to-world poses [m] of a camera that walks through the rooms and comes back.
+
+    Without ``seed``, it starts in the first room and walks to the farthest one that the frames allow and back
+    (or only to it, in a tour whose last room has another style). With ``seed``, it starts anywhere on the
+    longest way, in either direction.
+
+    Args:
+        tour: where.
+        frames: at least 1.
+        seed: of the start, the sway of the hand and the glances; None = the tour's own.
+
+    Raises:
+        ValueError: no frame, or a negative seed.
+    """
+    if frames < 1:
+        raise ValueError(f"frames must be at least 1, got {frames}")
+    if seed is not None and seed < 0:
+        raise ValueError(f"seed must be None or at least 0, got {seed}")
+    rng = np.random.default_rng([tour.seed, 101] if seed is None else [tour.seed, 102, seed])
+    if seed is None:
+        way, share = _way_within(tour, frames)
+        s = _samples(way, frames, share)
+    else:
+        way = tour.ways[-1].numpy()
+        way = way if rng.random() < 0.5 else way[::-1].copy()
+        way = np.roll(way, -int(rng.integers(len(way))), axis=0)
+        s = _samples(way, frames, min(1.0, frames / _effort(way)[-1]))
+    return torch.from_numpy(_poses(tour, way, s, rng))
+
+
+def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:
+    """The way that leads farthest within a number of frames, and which share of it to walk."""
+    ways = [way.numpy() for way in tour.ways]
+    efforts = [_effort(way)[-1] for way in ways]
+    for k in range(len(ways) - 1, -1, -1):
+        if efforts[k] <= frames:
+            if k < len(ways) - 2 and len(set(tour.room_styles)) > 1:
+                break
+            return ways[k], 1.0
+    if len(set(tour.room_styles)) > 1:  # the last room is the point of such a tour: at least look round in it
+        return ways[-2], min(1.0, max(frames / efforts[-2], 0.6))
+    return ways[0], min(1.0, frames / efforts[0])
+
+
+def _effort(way: Array) -> Array:
+    """[M + 1] frames needed up to each sample at the usual pace, for the closed way."""
+    yaw = _gaze(way)
+    turned = np.abs(np.diff(np.concatenate([yaw, [_next(yaw)]])))
+    return np.concatenate([[0.0], np.cumsum(np.hypot(SPACING / _STEP, turned / _TURN))])
+
+
+def _next(yaw: Array) -> float:
+    """The first yaw again, as the one that follows the last."""
+    return float(yaw[-1] + (yaw[0] - yaw[-1] + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _samples(way: Array, frames: int, share: float) -> Array:
+    """[frames] positions along the way [samples], evenly by effort; several rounds where there is time."""
+    effort = _effort(way)
+    rounds = max(1, int(frames * _SLOWEST // effort[-1])) if share == 1.0 else 1
+    at = rounds * share * effort[-1] * np.arange(frames) / frames
+    whole, rest = np.divmod(at, effort[-1])
+    return whole * len(way) + np.interp(rest, effort, np.arange(len(way) + 1))
+
+
+def _gaze(way: Array) -> Array:
+    """[M] yaw that looks where the way leads, smoothed and continuous [rad]."""
+    ahead = np.roll(way, -int(_LOOKAHEAD / SPACING), axis=0) - way
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True) + 0.1
+    frequency = np.fft.rfftfreq(len(way), SPACING)
+    kernel = np.exp(-2 * (np.pi * frequency * _SMOOTH) ** 2)[:, None]
+    smooth = np.fft.irfft(np.fft.rfft(ahead, axis=0) * kernel, n=len(way), axis=0)
+    return np.unwrap(np.arctan2(smooth[:, 0], smooth[:, 1]))
+
+
+def _poses(tour: Tour, way: Array, s: Array, rng: np.random.Generator) -> Array:
+    yaw = _gaze(way)
+    turns = _next(yaw) - yaw[0]
+    samples = np.arange(len(way) + 1)
+    rounds, rest = np.divmod(s, len(way))
+    x, z = (np.interp(rest, samples, np.append(way[:, k], way[0, k])) for k in (0, 1))
+    heading = np.interp(rest, samples, np.append(yaw, yaw[0] + turns)) + rounds * turns
+    metres = s * SPACING
+    hand = [_waves(metres, rng, 0.35, 1.1) for _ in range(5)]
+    glance = _waves(metres, rng, 0.06, 0.14)
+    height = tour.camera_height - SWAY * 0.6 * hand[2]
+    poses = np.tile(np.eye(4), (len(s), 1, 1))
+    for i in range(len(s)):
+        direction = heading[i] + _GLANCE * glance[i] + 0.015 * hand[3][i]
+        pitch = np.radians(6.0) + _PITCH * hand[4][i] * 0.7
+        poses[i, :3, :3] = turn(direction) @ tilt(pitch) @ lean(_ROLL * hand[3][i])
+        poses[i, :3, 3] = x[i] + SWAY * 0.7 * hand[0][i], -height[i], z[i] + SWAY * 0.7 * hand[1][i]
+    return poses
+
+
+def _waves(metres: Array, rng: np.random.Generator, slow: float, fast: float) -> Array:
+    """A smooth motion within -1 to 1: three waves of random frequency [1/m] and phase."""
+    frequency, phase = rng.uniform(slow, fast, 3), rng.uniform(0, 2 * np.pi, 3)
+    return np.sin(2 * np.pi * frequency * metres[:, None] + phase).mean(1)

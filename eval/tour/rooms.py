@@ -1,0 +1,208 @@
+"""The plan of a tour: rooms as rectangles side by side, a doorway from each to an earlier one, and their shells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.tour.palette import Palette
+from ufmstar_torch.eval.tour.shapes import BOX, QUAD, Finish, Part, part
+from ufmstar_torch.eval.tour.style import TourStyle
+
+Array = NDArray[np.float64]
+
+# Walls and floors reach this far beyond the edge at which they meet, so that no ray slips between [m].
+_OVERLAP = 0.02
+_CORNER_TO_DOOR = 0.8  # between a room's corner and the middle of a doorway, at least [m]
+_DOOR_TO_DOOR = 1.5  # between the middles of two doorways of one wall, at least [m]
+_TRIES = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """A rectangle of floor with walls up to a ceiling.
+
+    Attributes:
+        lower, upper: [2] x and z of its corners [m].
+        height: of the ceiling [m].
+        style: how it is furnished.
+    """
+
+    lower: Array
+    upper: Array
+    height: float
+    style: TourStyle
+
+    @property
+    def centre(self) -> Array:
+        """[2] x and z [m]."""
+        return (self.lower + self.upper) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Door:
+    """An opening in the wall between two rooms.
+
+    Attributes:
+        rooms: the earlier and the later room.
+        middle: [2] x and z of its middle, halfway through the wall [m].
+        normal: [2] unit vector from the earlier into the later room.
+        width, height: of the opening [m].
+        thickness: of the wall [m].
+    """
+
+    rooms: tuple[int, int]
+    middle: Array
+    normal: Array
+    width: float
+    height: float
+    thickness: float
+
+    @property
+    def along(self) -> Array:
+        """[2] unit vector along the wall, towards larger coordinates."""
+        return np.abs(self.normal[::-1])
+
+
+def lay_out(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]]:
+    """Draws the rooms; door i joins room i + 1 to an earlier one."""
+    while True:
+        found = _try_layout(style, rng)
+        if found is not None:
+            return found
+
+
+def _try_layout(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]] | None:
+    count = int(rng.integers(style.rooms[0], style.rooms[1] + 1))
+    styles = [style] * count
+    if style.last is not None:
+        styles[-1] = style.last
+    rooms = [_room(styles[0], np.zeros(2), rng)]
+    doors: list[Door] = []
+    for own in styles[1:]:
+        new = _room(own, np.zeros(2), rng)
+        for _ in range(_TRIES):
+            parent = len(rooms) - 1 if rng.random() < 0.75 or own is not style else int(rng.integers(len(rooms)))
+            attached = _attach(rooms, doors, parent, new, rng)
+            if attached is not None:
+                rooms.append(attached[0])
+                doors.append(attached[1])
+                break
+        else:
+            return None
+    return rooms, doors
+
+
+def _room(style: TourStyle, lower: Array, rng: np.random.Generator) -> Room:
+    size = rng.uniform(*style.room_size, 2)
+    return Room(lower, lower + size, float(rng.uniform(*style.ceiling)), style)
+
+
+def _attach(
+    rooms: list[Room], doors: list[Door], parent: int, new: Room, rng: np.random.Generator
+) -> tuple[Room, Door] | None:
+    """The new room moved to a wall of its parent, with a doorway; None where it does not fit."""
+    old, size = rooms[parent], new.upper - new.lower
+    axis, sign = int(rng.integers(2)), int(rng.choice([-1, 1]))
+    thickness, width = float(rng.uniform(0.12, 0.22)), float(rng.uniform(1.0, 1.25))
+    along = 1 - axis
+    wall = old.upper[axis] if sign > 0 else old.lower[axis]
+    middle, lower = np.zeros(2), np.zeros(2)
+    middle[axis] = wall + sign * thickness / 2
+    middle[along] = rng.uniform(old.lower[along] + _CORNER_TO_DOOR, old.upper[along] - _CORNER_TO_DOOR)
+    lower[axis] = wall + thickness if sign > 0 else wall - thickness - size[axis]
+    lower[along] = middle[along] - rng.uniform(_CORNER_TO_DOOR, size[along] - _CORNER_TO_DOOR)
+    room = Room(lower, lower + size, new.height, new.style)
+    for other in rooms:
+        if (room.lower < other.upper + 0.1).all() and (room.upper > other.lower - 0.1).all():
+            return None
+    for door in doors:
+        if parent in door.rooms and np.linalg.norm(door.middle - middle) < _DOOR_TO_DOOR:
+            return None
+    normal = np.zeros(2)
+    normal[axis] = sign
+    height = min(old.height, new.height, 2.3) - float(rng.uniform(0.15, 0.3))
+    return room, Door((parent, len(rooms)), middle, normal, width, height, thickness)
+
+
+def shell(index: int, room: Room, doors: list[Door], palette: Palette) -> Iterator[Part]:
+    """Floor, ceiling, walls around the openings, and skirting boards."""
+    x, z = room.centre
+    half = (room.upper - room.lower) / 2 + _OVERLAP
+    own = (index, -1)
+    yield _in_rooms(part(QUAD, (x, 0, z), (half[0], 1, half[1]), palette.finish("floor"), label="floor"), own)
+    over = np.diag([1.0, -1.0, -1.0])
+    ceiling = part(QUAD, (x, -room.height, z), (half[0], 1, half[1]), palette.finish("ceiling"), over, label="ceiling")
+    yield _in_rooms(ceiling, own)
+    usual, special, board = palette.finish("wall"), palette.finish("wall"), palette.finish("paint")
+    accent = int(room.lower.sum() * 1000) % 4
+    for number, (axis, sign) in enumerate(((0, -1), (0, 1), (1, -1), (1, 1))):
+        finish = special if number == accent else usual
+        for piece in _wall(room, axis, sign, _openings(index, room, axis, sign, doors), finish, board):
+            yield _in_rooms(piece, own)
+
+
+def _openings(index: int, room: Room, axis: int, sign: int, doors: list[Door]) -> list[tuple[float, float, float]]:
+    """(start, end, height) of the doorways in one wall, in order along it [m]."""
+    wall = room.upper[axis] if sign > 0 else room.lower[axis]
+    found = []
+    for door in doors:
+        if index in door.rooms and abs(door.normal[axis]) > 0.5 and abs(door.middle[axis] - wall) < door.thickness:
+            s = float(door.middle[1 - axis])
+            found.append((s - door.width / 2, s + door.width / 2, door.height))
+    return sorted(found)
+
+
+def _wall(
+    room: Room, axis: int, sign: int, openings: list[tuple[float, float, float]], finish: Finish, board: Finish
+) -> Iterator[Part]:
+    along = 1 - axis
+    wall = float(room.upper[axis] if sign > 0 else room.lower[axis])
+    inward = np.zeros(3)
+    inward[2 * axis] = -sign
+    y_axis, z_axis = -inward, np.array([0.0, 1.0, 0.0])
+    R = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis], axis=1)
+
+    def rectangle(start: float, end: float, top: float, bottom: float) -> Part:
+        centre = np.zeros(3)
+        centre[2 * axis], centre[2 * along], centre[1] = wall, (start + end) / 2, (top + bottom) / 2
+        return part(QUAD, centre, ((end - start) / 2, 1, (bottom - top) / 2), finish, R, label=f"wall {axis}{sign}")
+
+    def skirting(start: float, end: float) -> Part:
+        centre, half = np.zeros(3), np.zeros(3)
+        centre[2 * axis], centre[2 * along], centre[1] = wall, (start + end) / 2, -0.04
+        half[2 * axis], half[2 * along], half[1] = 0.015, (end - start) / 2, 0.045
+        return part(BOX, centre, half, board, label="skirting")
+
+    top, at = -room.height - _OVERLAP, float(room.lower[along]) - _OVERLAP
+    for start, end, height in openings:
+        yield rectangle(at, start, top, _OVERLAP)
+        yield skirting(at, start)
+        yield rectangle(start, end, top, -height)
+        at = end
+    yield rectangle(at, float(room.upper[along]) + _OVERLAP, top, _OVERLAP)
+    yield skirting(at, float(room.upper[along]) + _OVERLAP)
+
+
+def frame(door: Door, finish: Finish) -> Iterator[Part]:
+    """Jambs, head and threshold of a doorway; they line the opening through the whole wall."""
+    n, a = np.abs(door.normal), door.along
+    through = door.thickness / 2 + 0.015
+
+    def piece(offset: float, y: float, half_along: float, half_y: float, half_through: float) -> Part:
+        centre, half = door.middle + a * offset, a * half_along + n * half_through
+        return _in_rooms(
+            part(BOX, (centre[0], y, centre[1]), (half[0], half_y, half[1]), finish, label="door"), door.rooms
+        )
+
+    for side in (-1, 1):
+        yield piece(side * (door.width / 2 + 0.015), -door.height / 2, 0.035, door.height / 2 + 0.03, through)
+    yield piece(0.0, -door.height - 0.015, door.width / 2 + 0.05, 0.035, through)
+    yield piece(0.0, 0.005, door.width / 2, 0.013, through - 0.005)
+
+
+def _in_rooms(piece: Part, rooms: tuple[int, int]) -> Part:
+    return Part(piece.kind, piece.centre, piece.half, piece.finish, piece.rotation, piece.taper, rooms, piece.label)

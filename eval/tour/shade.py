@@ -1,0 +1,167 @@
+"""The light that a tour's surfaces send to the camera: texture, Lambert's law, soft shadows, dark corners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD
+from ufmstar_torch.eval.tour.texture import Patch, albedo, noise_table
+from ufmstar_torch.eval.tour.tour import Tour
+
+_AMBIENT = 0.42  # light from everywhere, as a share of the lamps'
+_BEFORE = 0.1  # how far before a surface its shadow is looked up [m]
+_CORNER, _DARKNESS = 0.22, 0.3  # how far corners are darker [m], and by how much
+_CAP = 1e-3  # how near to a frustum's end a point is on its cap, in unit coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """Where pixels see a surface; P of them, float32.
+
+    Attributes:
+        surface: [P] int64.
+        point: [3, P] [m].
+        normal: [3, P] unit, towards the camera.
+        u, v: [P] coordinates on the surface [m].
+        footprint: [P] size of a pixel there [m].
+    """
+
+    surface: Tensor
+    point: Tensor
+    normal: Tensor
+    u: Tensor
+    v: Tensor
+    footprint: Tensor
+
+
+def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float) -> Tensor:
+    """[3, P] linear RGB, about 0 to 1.
+
+    Args:
+        tour: what is seen.
+        surface: [P] int64 which primitive.
+        depth: [P] float32 along z [m].
+        direction: [3, P] float32 of the rays, with depth 1.
+        origin: [3] of the camera [m].
+        pixel_angle: size of a pixel at depth 1 [m].
+    """
+    hits = _hits(tour, surface, depth, direction, origin, pixel_angle)
+    color = _albedo(tour, hits)
+    glow = tour.surfaces.look[:, 7][surface]
+    return color * torch.maximum(_light(tour, hits), glow)
+
+
+def _hits(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float) -> Hits:
+    s = tour.surfaces
+    geometry = torch.cat([s.rotation.flatten(1), s.centre, s.half, s.taper[:, None]], dim=1).float().T.contiguous()
+    g = geometry.index_select(1, surface)
+    R = g[:9].view(3, 3, -1)
+    point = origin[:, None] + depth * direction
+    d = point - g[9:12]
+    q = R[0] * d[0] + R[1] * d[1] + R[2] * d[2]
+    kind = s.kind[surface]
+    normal, uv = torch.zeros_like(q), torch.zeros_like(q[:2])
+    for number, local in ((QUAD, _quad), (BOX, _box), (ELLIPSOID, _ellipsoid), (FRUSTUM, _frustum)):
+        chosen = torch.nonzero(kind == number).flatten()
+        if len(chosen):
+            normal[:, chosen], uv[:, chosen] = local(q[:, chosen], g[:, chosen])
+    n = R[:, 0] * normal[0] + R[:, 1] * normal[1] + R[:, 2] * normal[2]
+    n = n * _dot(n, n).clamp_min(1e-12).rsqrt()
+    cosine = _dot(n, direction) * _dot(direction, direction).rsqrt()
+    footprint = pixel_angle * depth / cosine.abs().clamp_min(0.25)
+    return Hits(surface, point, torch.where(cosine > 0, -n, n), uv[0], uv[1], footprint)
+
+
+def _quad(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+    """Coordinates from the world's origin, so that patterns go on from one piece of a wall to the next."""
+    R, centre = g[:9].view(3, 3, -1), g[9:12]
+    normal = torch.zeros_like(q)
+    normal[1] = -1
+    return normal, torch.stack([q[k] + _dot(R[:, k], centre) for k in (0, 2)])
+
+
+def _box(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+    e = q / g[12:15]
+    a = e.abs()
+    x, y = (a[0] >= a[1]) & (a[0] >= a[2]), (a[1] > a[0]) & (a[1] >= a[2])
+    z = ~(x | y)
+    normal = torch.stack([x, y, z]) * e.sign()
+    return normal, torch.stack([torch.where(x, q[2], q[0]), torch.where(y, q[2], q[1])])
+
+
+def _ellipsoid(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+    half = g[12:15]
+    radius = 0.5 * (half[0] + half[2])
+    return q / (half * half), torch.stack([torch.atan2(q[0] / half[0], q[2] / half[2]) * radius, q[1]])
+
+
+def _frustum(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+    half, taper = g[12:15], g[15]
+    e = q / half
+    m, n = (1 + taper) / 2, (1 - taper) / 2
+    cap = (e[1].abs() > 1 - _CAP) & ((e[0] * e[0] + e[2] * e[2]).sqrt() < m + n * e[1] - _CAP)
+    side = torch.stack([e[0], -n * (m + n * e[1]), e[2]]) / half
+    flat = torch.stack([torch.zeros_like(cap), cap, torch.zeros_like(cap)]) * e.sign()
+    around = torch.atan2(e[0], e[2]) * half[0]
+    uv = torch.stack([torch.where(cap, q[0], around), torch.where(cap, q[2], q[1])])
+    return torch.where(cap, flat, side), uv
+
+
+def _albedo(tour: Tour, hits: Hits) -> Tensor:
+    look, texture = tour.surfaces.look.T.contiguous(), tour.surfaces.texture[hits.surface]
+    table = noise_table(tour.device)
+    color = torch.empty_like(hits.point)
+    for number in torch.unique(texture).tolist():
+        chosen = torch.nonzero(texture == number).flatten()
+        own = look.index_select(1, hits.surface[chosen])
+        period = own[6]
+        u, v = hits.u[chosen] / period, hits.v[chosen] / period
+        pixel = hits.footprint[chosen] / period
+        shift = own[8:10]
+        color[:, chosen] = albedo(number, Patch(u + shift[0], v + shift[1], u, v, pixel, own[:3], own[3:6], table))
+    return color
+
+
+def _light(tour: Tour, hits: Hits) -> Tensor:
+    """[3, P] what the room's lamps and the light from everywhere bring to a surface."""
+    room = tour.surfaces.rooms[:, 0][hits.surface]
+    light = torch.empty_like(hits.point)
+    for r in torch.unique(room).tolist():
+        chosen = torch.nonzero(room == r).flatten()
+        light[:, chosen] = _light_of(tour, r, hits.point[:, chosen], hits.normal[:, chosen])
+    return light
+
+
+def _light_of(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:
+    lower, upper = tour.rooms[room].float()
+    before = ((point + _BEFORE * normal - lower[:, None]) / (upper - lower)[:, None] * 2 - 1).T
+    reached = grid_sample(
+        tour.volumes[room][None], before[None, None, None], align_corners=True, padding_mode="border"
+    )[0, :, 0, 0]
+    lamps = tour.lights[room]
+    ambient = _AMBIENT * lamps[:, 3:6].sum(0)
+    light = ambient[:, None] * _corners(point, normal, lower, upper)
+    for k, lamp in enumerate(lamps):
+        to_lamp = lamp[:3, None] - point
+        squared = _dot(to_lamp, to_lamp)
+        facing = (_dot(to_lamp, normal) * squared.clamp_min(1e-6).rsqrt()).clamp_min(0)
+        strength = facing * reached[k] / (0.35 + 0.65 * squared / (lamp[6] * lamp[6]))
+        light = light + lamp[3:6, None] * strength
+    return light
+
+
+def _corners(point: Tensor, normal: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """[P] darker where another wall, the floor or the ceiling is near."""
+    open_ = torch.ones_like(point[0])
+    for k in range(3):
+        near = torch.minimum(point[k] - lower[k], upper[k] - point[k]).clamp_min(0)
+        open_ = open_ * (1 - _DARKNESS * (1 - normal[k] * normal[k]) * torch.exp(-near / _CORNER))
+    return open_
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,0 +1,171 @@
+"""Surfaces of a tour: quads, boxes, ellipsoids and frusta, each an affine image of a unit shape.
+
+In unit coordinates q = diag(1/half) R^T (p - centre), a box is [-1, 1]^3, an ellipsoid the unit ball, and a
+frustum stands along y with radius 1 at its foot y = 1 and ``taper`` at its head y = -1 (a cylinder has 1, a cone
+nearly 0). A quad is the square |x|, |z| <= 1 of the plane y = 0, seen from y < 0 only. World axes: x right,
+y down, z forward [m], the floor at y = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.eval.tour.style import TEXTURES
+
+QUAD, BOX, ELLIPSOID, FRUSTUM = range(4)
+Vector = Sequence[float]
+Array = NDArray[np.float64]
+NOBODY = -1
+
+
+@dataclass(frozen=True)
+class Finish:
+    """How a surface looks.
+
+    Attributes:
+        texture: one of ``TEXTURES``.
+        first, second: its two colours, linear RGB in [0, 1].
+        period: of the pattern [m].
+        glow: light of its own, 0 = none.
+    """
+
+    texture: str = "plain"
+    first: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    second: tuple[float, float, float] = (0.3, 0.3, 0.3)
+    period: float = 0.3
+    glow: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One primitive while a tour is built.
+
+    Attributes:
+        kind: QUAD, BOX, ELLIPSOID or FRUSTUM.
+        centre: [3] [m].
+        half: [3] half its extent along its own axes [m]; a quad's is (x, 1, z).
+        finish: how it looks.
+        rotation: [3, 3] its axes in the world, as columns.
+        taper: of a frustum.
+        rooms: the one or two rooms from which it can be seen directly.
+        label: what it is part of.
+    """
+
+    kind: int
+    centre: Array
+    half: Array
+    finish: Finish
+    rotation: Array
+    taper: float = 1.0
+    rooms: tuple[int, int] = (0, NOBODY)
+    label: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """The primitives of a tour as tensors; N of them.
+
+    Attributes:
+        kind: [N] int64.
+        centre: [N, 3] float64 [m].
+        half: [N, 3] float64 [m].
+        rotation: [N, 3, 3] float64.
+        taper: [N] float64.
+        rooms: [N, 2] int64.
+        texture: [N] int64, index into ``TEXTURES``.
+        look: [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m].
+    """
+
+    kind: Tensor
+    centre: Tensor
+    half: Tensor
+    rotation: Tensor
+    taper: Tensor
+    rooms: Tensor
+    texture: Tensor
+    look: Tensor
+
+    def __len__(self) -> int:
+        return self.kind.shape[0]
+
+    def to(self, device: torch.device | str) -> Surfaces:
+        """The same on another device."""
+        return Surfaces(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+
+def part(
+    kind: int,
+    centre: Vector,
+    half: Vector,
+    finish: Finish,
+    rotation: Array | None = None,
+    taper: float = 1.0,
+    label: str = "",
+) -> Part:
+    """A primitive in the frame in which the caller thinks."""
+    R = np.eye(3) if rotation is None else rotation
+    return Part(kind, np.asarray(centre, np.float64), np.asarray(half, np.float64), finish, R, taper, label=label)
+
+
+def box(centre: Vector, half: Vector, finish: Finish, yaw: float = 0.0, pitch: float = 0.0) -> Part:
+    """A box, turned about the vertical axis by ``yaw`` and then tilted about its x axis by ``pitch`` [rad]."""
+    return part(BOX, centre, half, finish, turn(yaw) @ tilt(pitch))
+
+
+def ball(centre: Vector, half: Vector, finish: Finish, yaw: float = 0.0, roll: float = 0.0) -> Part:
+    """An ellipsoid."""
+    return part(ELLIPSOID, centre, half, finish, turn(yaw) @ lean(roll))
+
+
+def tube(
+    centre: Vector, radius: float, half_height: float, finish: Finish, taper: float = 1.0, rotation: Array | None = None
+) -> Part:
+    """A frustum on its foot."""
+    return part(FRUSTUM, centre, (radius, half_height, radius), finish, rotation, taper)
+
+
+def turn(yaw: float) -> Array:
+    """[3, 3] rotation about the vertical axis; a positive yaw turns z towards x, which is to the right [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def tilt(pitch: float) -> Array:
+    """[3, 3] rotation about the x axis; a positive pitch looks down [rad]."""
+    c, s = np.cos(pitch), np.sin(pitch)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
+
+
+def lean(roll: float) -> Array:
+    """[3, 3] rotation about the z axis [rad]."""
+    c, s = np.cos(roll), np.sin(roll)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def surfaces(parts: Sequence[Part], rng: np.random.Generator) -> Surfaces:
+    """The tensors of a list of primitives; ``rng`` shifts every pattern by its own offset."""
+    offsets = rng.uniform(0.0, 7.0, (len(parts), 2))
+    looks = [
+        [*p.finish.first, *p.finish.second, p.finish.period, p.finish.glow, *offset]
+        for p, offset in zip(parts, offsets, strict=True)
+    ]
+
+    def stack(values: list[Array]) -> Tensor:
+        return torch.from_numpy(np.stack(values))
+
+    return Surfaces(
+        kind=torch.tensor([p.kind for p in parts]),
+        centre=stack([p.centre for p in parts]),
+        half=stack([p.half for p in parts]),
+        rotation=stack([p.rotation for p in parts]),
+        taper=torch.tensor([p.taper for p in parts], dtype=torch.float64),
+        rooms=torch.tensor([p.rooms for p in parts]),
+        texture=torch.tensor([TEXTURES.index(p.finish.texture) for p in parts]),
+        look=torch.tensor(looks, dtype=torch.float32),
+    )

@@ -1,0 +1,142 @@
+"""What rooms look like: sizes, surfaces and light of a tour's styles.
+
+``home`` is the distribution that a network can be trained on; ``hall`` lies outside of it: larger rooms and
+things, darker and colder light, and textures that no home has. ``mixed`` begins at home and ends in a hall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+Range = tuple[float, float]
+
+# The two sets are disjoint on purpose: a texture of the second is something a network never saw.
+HOME_TEXTURES = (
+    "plain",
+    "plaster",
+    "wood",
+    "checks",
+    "stripes",
+    "tiles",
+    "bricks",
+    "fabric",
+    "books",
+    "painting",
+    "window",
+)
+HALL_TEXTURES = ("dots", "zigzag", "marble", "terrazzo", "hexagons", "rings")
+TEXTURES = HOME_TEXTURES + HALL_TEXTURES
+
+
+@dataclass(frozen=True)
+class TourStyle:
+    """Sizes and looks of a tour's rooms; ranges are (lowest, highest), drawn uniformly.
+
+    Attributes:
+        name: of the rooms' style.
+        textures: the names of the surface textures that occur.
+        rooms: number of rooms, lowest and highest.
+        room_size: side of a room [m].
+        ceiling: its height [m].
+        camera_height: above the floor [m].
+        scale: of the furniture, 1 = usual.
+        furniture: pieces of furniture per m^2 of floor.
+        brightness: of the lights, 1 = a lit living room.
+        warmth: -1 (cold, blue) to 1 (warm, yellow) of the lights.
+        last: style of the last room; None = as the others.
+
+    Raises:
+        ValueError: a value is out of its range.
+    """
+
+    name: str = "home"
+    textures: tuple[str, ...] = HOME_TEXTURES
+    rooms: tuple[int, int] = (3, 5)
+    room_size: Range = (3.2, 6.0)
+    ceiling: Range = (2.3, 3.0)
+    camera_height: Range = (1.0, 1.6)
+    scale: Range = (0.9, 1.1)
+    furniture: float = 0.5
+    brightness: Range = (0.8, 1.2)
+    warmth: Range = (0.1, 0.9)
+    last: TourStyle | None = None
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.textures) - set(TEXTURES))
+        if unknown or not self.textures:
+            raise ValueError(f"textures must be some of {', '.join(TEXTURES)}, got {unknown or 'none'}")
+        if not 1 <= self.rooms[0] <= self.rooms[1] <= 12:
+            raise ValueError(f"rooms must be two numbers 1 <= lowest <= highest <= 12, got {self.rooms}")
+        limits = {
+            "room_size": (3.0, 30.0),
+            "ceiling": (2.2, 10.0),
+            "camera_height": (0.5, 1.7),
+            "scale": (0.5, 3.0),
+            "brightness": (0.05, 5.0),
+            "warmth": (-1.0, 1.0),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if not low <= value[0] <= value[1] <= high:
+                raise ValueError(f"{name} must be two numbers {low:g} <= lowest <= highest <= {high:g}, got {value}")
+        if not 0 <= self.furniture <= 5:
+            raise ValueError(f"furniture must be 0 to 5 pieces per m^2, got {self.furniture}")
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TourStyle:
+        """From plain values.
+
+        Raises:
+            ValueError: an unknown name, or a value out of its range.
+        """
+        unknown = sorted(set(values) - {f.name for f in fields(cls)})
+        if unknown:
+            raise ValueError(f"unknown field {unknown} of TourStyle, expected some of {[f.name for f in fields(cls)]}")
+        plain = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        if isinstance(plain.get("last"), dict):
+            plain["last"] = cls.from_dict(plain["last"])
+        return cls(**plain)
+
+
+HOME = TourStyle()
+HALL = TourStyle(
+    name="hall",
+    textures=HALL_TEXTURES,
+    rooms=(2, 3),
+    room_size=(8.0, 14.0),
+    ceiling=(4.0, 6.0),
+    scale=(1.5, 1.9),
+    furniture=0.16,
+    brightness=(0.45, 0.65),
+    warmth=(-0.9, -0.4),
+)
+MIXED = TourStyle(
+    rooms=(3, 3),
+    room_size=(3.2, 4.4),
+    last=TourStyle(
+        name="hall",
+        textures=HALL_TEXTURES,
+        rooms=(1, 1),
+        room_size=(7.0, 9.0),
+        ceiling=(3.6, 4.6),
+        scale=(1.4, 1.7),
+        furniture=0.22,
+        brightness=(0.45, 0.65),
+        warmth=(-0.9, -0.4),
+    ),
+)
+STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED}
+
+
+def style_of(style: str | TourStyle) -> TourStyle:
+    """A style by its name.
+
+    Raises:
+        ValueError: no such name.
+    """
+    if isinstance(style, TourStyle):
+        return style
+    if style not in STYLES:
+        raise ValueError(f"style must be one of {', '.join(STYLES)} or a TourStyle, got {style!r}")
+    return STYLES[style]

@@ -1,0 +1,216 @@
+"""Patterns of surfaces, evaluated where a pixel looks, softened to the size of a pixel.
+
+Coordinates are in periods of the pattern; ``pixel`` is a pixel's size in them, so that edges are as soft as a
+camera would see them, and patterns too fine to be seen fade to their mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.tour.style import TEXTURES
+
+_TABLE = 64  # side of the table of random numbers behind all noise; patterns repeat after so many cells
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Pixels that see one kind of texture; P of them.
+
+    Attributes:
+        u, v: [P] coordinates on the surface [periods], shifted at random.
+        own_u, own_v: [P] the same from the surface's middle.
+        pixel: [P] size of a pixel there [periods].
+        first, second: [3, P] the texture's colours.
+        table: [64, 64] random numbers in [0, 1).
+    """
+
+    u: Tensor
+    v: Tensor
+    own_u: Tensor
+    own_v: Tensor
+    pixel: Tensor
+    first: Tensor
+    second: Tensor
+    table: Tensor
+
+    def mixed(self, share: Tensor, mean: float = 0.5) -> Tensor:
+        """[3, P] from the first to the second colour; ``mean`` where the pattern is too fine to be seen."""
+        seen = (1.6 - 2.0 * self.pixel).clamp(0, 1)
+        return self.first + (self.second - self.first) * (mean + (share - mean) * seen)
+
+    def gain(self, values: Tensor, contrast: float) -> Tensor:
+        """[P] 1 + contrast times values in [0, 1] about their middle."""
+        seen = (1.6 - 2.0 * self.pixel).clamp(0, 1)
+        return 1 + contrast * seen * (values - 0.5)
+
+    def cell(self, i: Tensor, j: Tensor) -> Tensor:
+        """[P] a random number in [0, 1) for each cell (i, j)."""
+        return self.table.flatten()[(i.long() & _TABLE - 1) * _TABLE + (j.long() & _TABLE - 1)]
+
+    def noise(self, u: Tensor, v: Tensor) -> Tensor:
+        """[P] smooth noise in [0, 1) with cells of size 1."""
+        i, j = u.floor(), v.floor()
+        a, b = u - i, v - j
+        a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
+        top = self.cell(i, j) * (1 - a) + self.cell(i + 1, j) * a
+        bottom = self.cell(i, j + 1) * (1 - a) + self.cell(i + 1, j + 1) * a
+        return top * (1 - b) + bottom * b
+
+
+def noise_table(device: torch.device) -> Tensor:
+    """[64, 64] the same random numbers everywhere."""
+    return torch.rand(_TABLE, _TABLE, generator=torch.Generator().manual_seed(3)).to(device)
+
+
+def albedo(texture: int, patch: Patch) -> Tensor:
+    """[3, P] linear RGB in [0, 1] of a texture, given as an index into ``TEXTURES``."""
+    return _PATTERNS[TEXTURES[texture]](patch).clamp(0, 1)
+
+
+def _soft(edge: Tensor, pixel: Tensor) -> Tensor:
+    """0 where edge is negative, 1 where it is positive, over the width of a pixel."""
+    return (edge / (pixel + 0.01) + 0.5).clamp(0, 1)
+
+
+def _square(x: Tensor, pixel: Tensor) -> Tensor:
+    """A square wave of period 1."""
+    return _soft(0.25 - (x - x.floor() - 0.5).abs(), pixel)
+
+
+def _to_edge(x: Tensor) -> Tensor:
+    """Distance to the nearest integer."""
+    return 0.5 - (x - x.floor() - 0.5).abs()
+
+
+def _plain(p: Patch) -> Tensor:
+    return p.first * p.gain(p.noise(p.u * 2, p.v * 2), 0.08)
+
+
+def _plaster(p: Patch) -> Tensor:
+    return p.first * p.gain(p.noise(p.u * 5, p.v * 5) * 0.6 + p.noise(p.u * 13, p.v * 13) * 0.4, 0.35)
+
+
+def _wood(p: Patch) -> Tensor:
+    plank = p.v.floor()
+    grain = p.noise(p.u * 0.9 + plank * 7, p.v * 11)
+    share = 0.65 * grain + 0.35 * p.cell(plank, (p.u * 0.18 + plank * 0.37).floor())
+    seam = 1 - 0.45 * (1 - _soft(_to_edge(p.v) - 0.04, p.pixel)) * (1.6 - 2 * p.pixel).clamp(0, 1)
+    return p.mixed(share) * seam
+
+
+def _checks(p: Patch) -> Tensor:
+    a, b = _square(p.u / 2, p.pixel), _square(p.v / 2, p.pixel)
+    return p.mixed(a + b - 2 * a * b)
+
+
+def _stripes(p: Patch) -> Tensor:
+    return p.mixed(_square(p.u, p.pixel))
+
+
+def _tiles(p: Patch) -> Tensor:
+    joint = _soft(torch.minimum(_to_edge(p.u), _to_edge(p.v)) - 0.03, p.pixel)
+    return p.mixed(1 - joint, 0.1) * p.gain(p.cell(p.u.floor(), p.v.floor()), 0.3)
+
+
+def _bricks(p: Patch) -> Tensor:
+    v = p.v * 3
+    u = p.u + 0.5 * (v.floor() % 2)
+    joint = _soft(torch.minimum(_to_edge(u) * 3, _to_edge(v)) - 0.09, p.pixel * 3)
+    return p.mixed(1 - joint, 0.25) * p.gain(p.cell(u.floor(), v.floor()), 0.5)
+
+
+def _fabric(p: Patch) -> Tensor:
+    weave = 0.5 + 0.25 * torch.sin(25 * p.u) + 0.25 * torch.sin(25 * p.v)
+    return p.mixed(0.6 * p.noise(p.u * 3, p.v * 3) + 0.4 * weave, 0.4)
+
+
+def _books(p: Patch) -> Tensor:
+    i = p.u.floor()
+    spine = torch.stack([p.cell(i, torch.full_like(i, k)) for k in (1, 2, 3)])
+    band = 1 - 0.5 * _soft(0.12 - (p.own_v - 1.2).abs(), p.pixel)
+    gap = 0.3 + 0.7 * _soft(_to_edge(p.u) - 0.08, p.pixel)
+    return (0.1 + 0.6 * spine**1.5 + 0.2 * p.first) * (band * gap)
+
+
+def _painting(p: Patch) -> Tensor:
+    """Hills before a sky, or shapes before a wall, by the surface's random shift."""
+    tall = 0.12 * torch.sin(p.own_u * 5 + p.u - p.own_u) + 0.06 * torch.sin(p.own_u * 13 + 2)
+    hill = _soft(p.own_v - tall, p.pixel)
+    sun = _soft(0.16 - ((p.own_u - 0.15) ** 2 + (p.own_v + 0.2) ** 2).sqrt(), p.pixel)
+    sky = p.first * (0.7 - 0.5 * p.own_v)
+    ground = p.second * (0.5 + 0.5 * p.noise(p.u * 9, p.v * 9))
+    return (sky * (1 - hill) + ground * hill) * (1 - sun) + (1 - p.second * 0.3) * sun
+
+
+def _window(p: Patch) -> Tensor:
+    """Trees and a sky with clouds."""
+    cloud = p.noise(p.u * 3, p.v * 6)
+    sky = torch.stack([0.45 + 0.4 * cloud, 0.62 + 0.28 * cloud, 0.9 + 0.05 * cloud])
+    leaves = 0.4 + 0.6 * p.noise(p.u * 14, p.v * 14)
+    tree = torch.stack([0.12 * leaves, 0.25 * leaves, 0.08 * leaves])
+    skyline = _soft(p.own_v - 0.12 - 0.35 * (p.noise(p.u * 2.5, p.v * 0) - 0.5), p.pixel)
+    return sky * (1 - skyline) + tree * skyline
+
+
+def _dots(p: Patch) -> Tensor:
+    distance = ((p.u - p.u.floor() - 0.5) ** 2 + (p.v - p.v.floor() - 0.5) ** 2).sqrt()
+    return p.mixed(_soft(0.28 - distance, p.pixel), 0.25)
+
+
+def _zigzag(p: Patch) -> Tensor:
+    return p.mixed(_square(p.v + 2 * (p.u / 2 - (p.u / 2).floor() - 0.5).abs(), p.pixel))
+
+
+def _marble(p: Patch) -> Tensor:
+    bent = p.u + 1.6 * p.noise(p.u * 2, p.v * 2) + 0.6 * p.noise(p.u * 6, p.v * 6)
+    return p.mixed((0.5 + 0.5 * torch.sin(6.0 * bent)) ** 3, 0.3)
+
+
+def _terrazzo(p: Patch) -> Tensor:
+    u, v = p.u * 4, p.v * 4
+    i, j = u.floor(), v.floor()
+    du, dv = u - i - 0.3 - 0.4 * p.cell(i, j), v - j - 0.3 - 0.4 * p.cell(j, i)
+    chip = _soft(0.16 + 0.14 * p.cell(i + 9, j) - (du * du + dv * dv).sqrt(), p.pixel * 4)
+    return p.mixed(chip, 0.2) * p.gain(p.cell(i, j + 5), 0.6)
+
+
+def _hexagons(p: Patch) -> Tensor:
+    """Distance to the border of hexagonal cells: two rectangular grids of centres, the nearer one counts."""
+    r = 3.0**0.5
+    edges = []
+    for shift in (0.0, 0.5):
+        x, y = p.u + shift, p.v / r + shift
+        x, y = (x - x.floor() - 0.5).abs(), (y - y.floor() - 0.5).abs() * r
+        edges.append(0.5 - torch.maximum(x, 0.5 * x + 0.5 * r * y))
+    return p.mixed(1 - _soft(torch.maximum(edges[0], edges[1]) - 0.06, p.pixel), 0.3)
+
+
+def _rings(p: Patch) -> Tensor:
+    u, v = p.u / 4 - (p.u / 4).floor() - 0.5, p.v / 4 - (p.v / 4).floor() - 0.5
+    return p.mixed(_square(4 * (u * u + v * v).sqrt(), p.pixel))
+
+
+_PATTERNS: dict[str, Callable[[Patch], Tensor]] = {
+    "plain": _plain,
+    "plaster": _plaster,
+    "wood": _wood,
+    "checks": _checks,
+    "stripes": _stripes,
+    "tiles": _tiles,
+    "bricks": _bricks,
+    "fabric": _fabric,
+    "books": _books,
+    "painting": _painting,
+    "window": _window,
+    "dots": _dots,
+    "zigzag": _zigzag,
+    "marble": _marble,
+    "terrazzo": _terrazzo,
+    "hexagons": _hexagons,
+    "rings": _rings,
+}

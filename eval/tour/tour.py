@@ -1,0 +1,162 @@
+"""``make_tour``: rooms, furniture, lights and ways from a seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.eval.tour.furnish import LIGHTS, Light, furnish
+from ufmstar_torch.eval.tour.palette import Palette
+from ufmstar_torch.eval.tour.rooms import Door, Room, frame, lay_out, shell
+from ufmstar_torch.eval.tour.route import ways
+from ufmstar_torch.eval.tour.shapes import Part, Surfaces, surfaces
+from ufmstar_torch.eval.tour.style import TourStyle, style_of
+from ufmstar_torch.eval.tour.volume import light_volumes
+
+Array = NDArray[np.float64]
+
+# Streams of random numbers: each part of a tour has its own, so that one can change without the others.
+_PLAN, _HEIGHT, _LOOKS, _THINGS, _SHIFTS = range(5)
+# A doorway lets see at most what its opening and its frame enclose, and a bit more [m].
+_FRAME = 0.12
+
+
+@dataclass(frozen=True, eq=False)
+class Tour:
+    """Furnished rooms, and the ways through them. World axes: x right, y down, z forward [m], the floor at y = 0.
+
+    Attributes:
+        seed: that it was made from.
+        style: likewise.
+        rooms: [R, 2, 3] float64 lower and upper corners (y from the ceiling to 0) [m].
+        room_styles: the name of each room's style.
+        doors: [D, 2, 3] float64 boxes around the openings [m].
+        door_rooms: [D, 2] the rooms that each one joins.
+        surfaces: the primitives.
+        labels: what each primitive is part of.
+        lights: [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark.
+        volumes: [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room.
+        ways: [M, 2] float64 closed ways of x and z [m], see ``route.ways``.
+        camera_height: above the floor [m].
+    """
+
+    seed: int
+    style: TourStyle
+    rooms: Tensor
+    room_styles: tuple[str, ...]
+    doors: Tensor
+    door_rooms: Tensor
+    surfaces: Surfaces
+    labels: tuple[str, ...]
+    lights: Tensor
+    volumes: Tensor
+    ways: tuple[Tensor, ...]
+    camera_height: float
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is rendered."""
+        return self.rooms.device
+
+    def to(self, device: torch.device | str) -> Tour:
+        """The same tour on another device."""
+        names = ("rooms", "doors", "door_rooms", "surfaces", "lights", "volumes")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+
+    def room_at(self, position: Tensor) -> Tensor:
+        """The room at a position, or the nearest one (in a doorway, say).
+
+        Args:
+            position: [..., 3] [m].
+
+        Returns:
+            [...] int64 index of a room.
+        """
+        p = position.to(self.rooms)[..., None, :]
+        beyond = torch.maximum(self.rooms[:, 0] - p, p - self.rooms[:, 1]).clamp_min(0)
+        return beyond.pow(2).sum(-1).argmin(-1)
+
+    def style_at(self, position: Tensor) -> str:
+        """The name of the style of the room at one position [3] [m]."""
+        return self.room_styles[int(self.room_at(position))]
+
+
+def make_tour(seed: int, style: str | TourStyle = "home") -> Tour:
+    """Makes the rooms of a seed; the same ones everywhere.
+
+    Args:
+        seed: at least 0.
+        style: ``home``, ``hall``, ``mixed``, or one's own.
+
+    Raises:
+        ValueError: a negative seed, or no such style.
+    """
+    if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
+        raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
+    chosen = style_of(style)
+
+    def stream(number: int) -> np.random.Generator:
+        return np.random.default_rng([seed, number])
+
+    rooms, doors = lay_out(chosen, stream(_PLAN))
+    routes = ways(rooms, doors)
+    parts, lights = _fill(rooms, doors, np.concatenate(routes), stream(_LOOKS), stream(_THINGS))
+    table = surfaces(parts, stream(_SHIFTS))
+    corners = torch.tensor(np.array([_corners(room) for room in rooms]))
+    light_table = _light_table(lights)
+    sizes = torch.tensor([[light.size for light in of_room] + [0.0] * (LIGHTS - len(of_room)) for of_room in lights])
+    return Tour(
+        seed=seed,
+        style=chosen,
+        rooms=corners,
+        room_styles=tuple(room.style.name for room in rooms),
+        doors=torch.tensor(np.array([_opening(door) for door in doors]).reshape(-1, 2, 3)),
+        door_rooms=torch.tensor([door.rooms for door in doors]).reshape(-1, 2),
+        surfaces=table,
+        labels=tuple(p.label for p in parts),
+        lights=light_table,
+        volumes=light_volumes(corners, table, light_table, sizes),
+        ways=tuple(torch.from_numpy(way) for way in routes),
+        camera_height=float(stream(_HEIGHT).uniform(*chosen.camera_height)),
+    )
+
+
+def _fill(
+    rooms: list[Room], doors: list[Door], way: Array, looks: np.random.Generator, things: np.random.Generator
+) -> tuple[list[Part], list[list[Light]]]:
+    """All primitives, and the lights of each room."""
+    parts: list[Part] = []
+    lights: list[list[Light]] = []
+    palettes = [Palette(room.style, looks) for room in rooms]
+    for index, room in enumerate(rooms):
+        own = [door for door in doors if index in door.rooms]
+        parts += shell(index, room, own, palettes[index])
+        found = furnish(room, own, way, palettes[index], things)
+        parts += [replace(p, rooms=(index, -1)) for p in found.parts]
+        lights.append(found.lights)
+    for door in doors:
+        parts += frame(door, palettes[door.rooms[0]].finish("wood"))
+    return parts, lights
+
+
+def _corners(room: Room) -> list[list[float]]:
+    return [[room.lower[0], -room.height, room.lower[1]], [room.upper[0], 0.0, room.upper[1]]]
+
+
+def _opening(door: Door) -> list[list[float]]:
+    across = door.along * (door.width / 2 + _FRAME) + np.abs(door.normal) * (door.thickness / 2 + _FRAME)
+    low, high = door.middle - across, door.middle + across
+    return [[low[0], -door.height - _FRAME, low[1]], [high[0], _FRAME, high[1]]]
+
+
+def _light_table(lights: list[list[Light]]) -> Tensor:
+    table = torch.zeros(len(lights), LIGHTS, 7)
+    table[..., 6] = 1.0
+    for room, of_room in enumerate(lights):
+        for k, light in enumerate(of_room):
+            table[room, k] = torch.tensor([*light.position, *light.color, light.reach])
+    return table

@@ -1,0 +1,120 @@
+"""``render``: what a camera in a tour sees, with exact depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.tour.intersect import entry
+from ufmstar_torch.eval.tour.sensor import develop
+from ufmstar_torch.eval.tour.shade import shade
+from ufmstar_torch.eval.tour.tour import Tour
+from ufmstar_torch.eval.tour.visibility import surface_windows
+
+
+@dataclass(frozen=True, eq=False)
+class TourView:
+    """What a camera sees.
+
+    Attributes:
+        image: [H, W, 3] uint8 RGB.
+        depth: [H, W] float64 along z [m].
+        surface: [H, W] int64 which primitive, -1 where there is none.
+        valid: [H, W] bool whether there is one; everywhere, inside of a room.
+    """
+
+    image: Tensor
+    depth: Tensor
+    surface: Tensor
+    valid: Tensor
+
+
+def render(
+    tour: Tour,
+    T_world_cam: Tensor,
+    K: Tensor,
+    height: int,
+    width: int,
+    *,
+    frame_seed: int | None = None,
+) -> TourView:
+    """Renders one view, on the tour's device.
+
+    Args:
+        tour: what is seen.
+        T_world_cam: [4, 4] camera-to-world, camera axes x right, y down, z forward [m].
+        K: [3, 3] intrinsics [px], the centre of the first pixel at (0, 0).
+        height, width: of the image.
+        frame_seed: adds what a sensor does (exposure, vignetting, noise); None = a perfect one.
+
+    Raises:
+        ValueError: a malformed pose, intrinsics or size, or a camera outside of every room.
+    """
+    pose, intrinsics = _checked(tour, T_world_cam, K, height, width)
+    depth, surface = cast(tour, pose, intrinsics, height, width)
+    valid = surface >= 0
+    fx, fy = float(intrinsics[0, 0]), float(intrinsics[1, 1])
+    direction = _directions(pose, intrinsics, height, width)
+    flat = surface.flatten().clamp_min(0)
+    near = torch.where(valid, depth, 0.0).flatten().float()
+    color = shade(tour, flat, near, direction, pose[:3, 3].float(), (fx * fy) ** -0.5)
+    image = develop((color * valid.flatten()).view(3, height, width), frame_seed)
+    return TourView(image, torch.where(valid, depth, 0.0), surface, valid)
+
+
+def cast(
+    tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int, *, cull: bool = True
+) -> tuple[Tensor, Tensor]:
+    """Depth [H, W] float64 [m], infinite where nothing is, and the primitives seen [H, W] int64, -1 for none.
+
+    Args:
+        tour, T_world_cam, K, height, width: as :func:`render` takes them, on one device.
+        cull: leave out where a primitive cannot be seen; the result is the same without, but slow.
+    """
+    s = tour.surfaces
+    origin = ((T_world_cam[:3, 3] - s.centre)[:, :, None] * s.rotation).sum(1) / s.half
+    # Directions in unit coordinates are linear in the pixel's column u and row v: M (u, v, 1).
+    camera = (s.rotation[:, :, :, None] * T_world_cam[:3, None, :3]).sum(1) / s.half[:, :, None]
+    M = (camera[..., None] * torch.linalg.inv(K)).sum(2)
+    if cull:
+        windows = surface_windows(tour, T_world_cam, K, height, width).tolist()
+    else:
+        windows = [[0, height, 0, width]] * len(s)
+    u = torch.arange(width, dtype=torch.float64, device=tour.device)
+    v = torch.arange(height, dtype=torch.float64, device=tour.device)[:, None]
+    depth = torch.full((height, width), float("inf"), dtype=torch.float64, device=tour.device)
+    surface = torch.full((height, width), -1, dtype=torch.int64, device=tour.device)
+    table = zip(windows, s.kind.tolist(), s.taper.tolist(), origin.tolist(), M.tolist(), strict=True)
+    for i, ((top, bottom, left, right), kind, taper, o, m) in enumerate(table):
+        if top >= bottom or left >= right:
+            continue
+        x, y, z = (u[left:right] * row[0] + (v[top:bottom] * row[1] + row[2]) for row in m)
+        t = entry(kind, (o[0], o[1], o[2]), (x, y, z), taper)
+        part = depth[top:bottom, left:right]
+        surface[top:bottom, left:right].masked_fill_(t < part, i)
+        torch.minimum(part, t, out=part)
+    return depth, surface
+
+
+def _directions(T_world_cam: Tensor, K: Tensor, height: int, width: int) -> Tensor:
+    """[3, H W] float32 world directions of the pixels' rays, with depth 1."""
+    M = (T_world_cam[:3, :3, None] * torch.linalg.inv(K)).sum(1)
+    u = torch.arange(width, dtype=torch.float64, device=M.device)
+    v = torch.arange(height, dtype=torch.float64, device=M.device)[:, None]
+    return torch.stack([(u * row[0] + (v * row[1] + row[2])).flatten().float() for row in M])
+
+
+def _checked(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+    for name, value, size in (("T_world_cam", T_world_cam, 4), ("K", K, 3)):
+        if value.shape != (size, size) or not bool(torch.isfinite(value).all()):
+            raise ValueError(f"{name} must be a finite [{size}, {size}] matrix, got shape {tuple(value.shape)}")
+    if height < 1 or width < 1:
+        raise ValueError(f"height and width must be at least 1, got {height} and {width}")
+    pose = T_world_cam.to(tour.device, torch.float64)
+    p = pose[:3, 3]
+    boxes = torch.cat([tour.rooms, tour.doors])
+    if not bool(((boxes[:, 0] < p) & (p < boxes[:, 1])).all(1).any()):
+        raise ValueError(f"T_world_cam must stand in a room or a doorway of the tour, got position {p.tolist()}")
+    return pose, K.to(tour.device, torch.float64)
