@@ -144,8 +144,10 @@ def _add_fields(group: Any, config: type, prefix: str, without: Sequence[str], *
         if kind is bool and not unset:
             group.add_argument(f"--{_dashes(prefix + f.name)}", type=bool, default=default, help=told)
             continue
-        if unset and type(None) not in get_args(kind):
-            kind = Union[kind, None]
+        parts = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+        # Text takes every word, so it comes last.
+        parts = tuple(sorted(dict.fromkeys((*parts, *((type(None),) if unset else ()))), key=lambda part: part is str))
+        kind = Union[parts]
         group.add_argument(f"--{_dashes(prefix + f.name)}", type=kind, default=default, help=told)
 
 
