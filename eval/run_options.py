@@ -38,12 +38,17 @@ _GROUPS: dict[str, tuple[tuple[str, Any, Any, str], ...]] = {
         ("--depth-intrinsics", _WORDS, [], "of the sequence's own depth: a file, or fx fy cx cy [px]"),
     ),
     "depth from networks": (
-        ("--model", str, None, "fastdepth, trained (by ufmstar train), depth_anything, huggingface, onnx, torchscript or exported"),
-        ("--weights", _WORDS, [], "file; several are the members of an ensemble"),
+        (
+            "--model",
+            str,
+            None,
+            "fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript, exported",
+        ),
+        ("--weights", _WORDS, [], "file (depth_anything, huggingface: directory); several are an ensemble's members"),
         ("--mode", ("alternate", "full"), "alternate", "ensemble: one member per image in turn, or all on every image"),
         ("--samples", int, None, "passes per image of an mc_dropout network in mode full; default: 10"),
         ("--offload", bool, False, "trained: keep the weights in host memory, only the member in turn on the device"),
-        ("--spec", str, None, "JSON file that declares an ONNX file's or a saved program's inputs and outputs"),
+        ("--spec", str, None, "JSON file that declares what the weights do not say: inputs, outputs, an alignment"),
     ),
     "depth that is there": (
         ("--depth", str, None, "folder of predicted maps (16-bit PNG, EXR, npy); 'self': the sequence's own depth"),

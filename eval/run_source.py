@@ -23,7 +23,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
 from ufmstar_torch.models.dropout import SAMPLES, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
-from ufmstar_torch.models.load import load_network
+from ufmstar_torch.models.load import DIRECTORIES, load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
@@ -179,7 +179,8 @@ def network_source(
 
     Args:
         model: a name that ``load_network`` knows.
-        weights: one file for each member; those of "trained" may hold several.
+        weights: one file for each member (a directory for networks of ``transformers``); those of "trained" may hold
+            several.
         config: of UfM*.
         spec: declares what an ONNX file or saved program does not say.
         mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
@@ -195,7 +196,11 @@ def network_source(
             of one network that does not sample, ``samples`` for any other.
     """
     files = [Path(file) for file in weights]
-    for file in [*files, *([Path(spec)] if spec is not None else [])]:
+    for folder in files if model in DIRECTORIES else []:
+        if not folder.is_dir():
+            fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
+            raise FileNotFoundError(f"no such directory: {folder}; {fetch}")
+    for file in [*(files if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
         if not file.is_file():
             raise FileNotFoundError(f"no such file: {file}")
     options: dict[str, Any] = {} if spec is None else {"spec": spec}
@@ -337,6 +342,11 @@ def own_depth_source(config: UfMStarConfig, *, size: Size | None = None, device:
 
 
 def sha256(file: Path) -> str:
-    """Hex digest of a file's content."""
+    """Hex digest of a file's content; of a directory's files and their names, but for hidden ones (a download's)."""
+    if file.is_dir():
+        names = sorted(path.relative_to(file) for path in file.rglob("*") if path.is_file())
+        shown = [name for name in names if not any(part.startswith(".") for part in name.parts)]
+        listing = "\n".join(f"{name.as_posix()} {sha256(file / name)}" for name in shown)
+        return hashlib.sha256(listing.encode()).hexdigest()
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
