@@ -1,0 +1,569 @@
+"""BatchEnsemble against loops over the formula, the plain networks its members are, and what conversions get wrong."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import threading
+from collections import OrderedDict
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+from ufmstar_torch import UncertainDepth
+from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble, convert, converted_layers
+from ufmstar_torch.models.batch_layer import BatchLayer, Selection
+from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
+from ufmstar_torch.models.heads import AleatoricNetwork, EvidentialNetwork
+from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.pipeline import combine
+
+N = 3
+
+
+class Tiny(Backbone):
+    """A backbone with a depthwise, a grouped and a 1x1 convolution and a batch norm."""
+
+    def __init__(self):
+        super().__init__()
+        self.preprocess = Preprocess(size=(6, 8))
+        self.feature_channels = 4
+        self.stem = nn.Conv2d(3, 4, 3, padding=1, padding_mode="reflect", bias=False)
+        self.norm = nn.BatchNorm2d(4)
+        self.rest = nn.Sequential(nn.Conv2d(4, 4, 3, padding=1, groups=4), nn.ELU(), nn.Conv2d(4, 4, 1, groups=2))
+        self.out = nn.Linear(4, 1)
+
+    def features(self, image):
+        return self.rest(self.norm(self.stem(image)))
+
+    def depth(self, features):
+        return F.softplus(self.out(features.movedim(1, -1)))[..., 0]
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def tiny(seed=0, **options):
+    """A network in eval mode whose statistics are not the initial ones, and its ensemble with biases that differ."""
+    torch.manual_seed(seed)
+    network = AleatoricNetwork(Tiny()).double()
+    network(torch.rand(8, 3, 6, 8, dtype=torch.float64))
+    ensemble = BatchEnsemble(network, N, **{"std": 0.4, "generator": seeded(seed), **options})
+    with torch.no_grad():
+        for layer in converted_layers(ensemble):
+            if layer.bias is not None:
+                layer.bias += torch.randn_like(layer.bias)
+    return network.eval(), ensemble.eval()
+
+
+def images(batch=2, seed=1):
+    return torch.rand(batch, 3, 6, 8, dtype=torch.float64, generator=seeded(seed))
+
+
+def alone(layer, n):
+    """The layer, every image by member n."""
+
+    def call(x):
+        layer.selection.members = torch.full((len(x),), n)
+        try:
+            return layer(x)
+        finally:
+            layer.selection.members = None
+
+    return call
+
+
+# ---- one layer ----
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    groups=st.sampled_from([(1, 3, 2), (2, 4, 6), (4, 4, 4), (4, 4, 8)]),
+    kernel=st.sampled_from([1, 3, (1, 3)]),
+    padding=st.sampled_from([("zeros", 0), ("zeros", 1), ("zeros", "same"), ("reflect", 1), ("circular", 1)]),
+    stride=st.integers(1, 2),
+    dilation=st.integers(1, 2),
+    bias=st.booleans(),
+)
+def test_a_convolution_is_the_formula(groups, kernel, padding, stride, dilation, bias):
+    count, inputs, outputs = groups
+    mode, amount = padding
+    stride = 1 if amount == "same" else stride
+    options = {"padding": amount, "padding_mode": mode, "stride": stride, "dilation": dilation, "groups": count}
+    torch.manual_seed(0)
+    plain = nn.Conv2d(inputs, outputs, kernel, bias=bias, **options).double()
+    layer = convert(plain, N, std=0.5, generator=seeded())
+    x = torch.randn(2, inputs, 7, 9, dtype=torch.float64)
+    for n in range(N):
+        # W_n[o, i] = W[o, i] s_n[o] r_n[j], j the channel that weight i of o's group multiplies.
+        weight = plain.weight.detach().clone()
+        for o in range(outputs):
+            for i in range(inputs // count):
+                j = o // (outputs // count) * (inputs // count) + i
+                weight[o, i] *= layer.s[n, o].item() * layer.r[n, j].item()
+        own = copy.deepcopy(plain)
+        own.weight = nn.Parameter(weight)
+        torch.testing.assert_close(alone(layer, n)(x), own(x), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(layer.weight_of(n), weight, rtol=1e-14, atol=0)
+        torch.testing.assert_close(layer.plain(n)(x), own(x), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(2, 5), (2, 4, 5), (2, 3, 4, 5)])
+@pytest.mark.parametrize("bias", [True, False])
+def test_a_linear_layer_is_the_formula(shape, bias):
+    plain = nn.Linear(5, 6, bias=bias).double()
+    layer = convert(plain, N, std=0.5, generator=seeded())
+    if bias:
+        with torch.no_grad():
+            layer.bias += torch.randn(N, 6)
+    x = torch.randn(shape, dtype=torch.float64)
+    for n in range(N):
+        W = torch.einsum("oi,o,i->oi", plain.weight, layer.s[n], layer.r[n])
+        expected = torch.einsum("oi,...i->...o", W, x) + (layer.bias[n] if bias else 0)
+        torch.testing.assert_close(alone(layer, n)(x), expected, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(layer.plain(n)(x), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_every_image_by_its_own_member():
+    layer = convert(nn.Conv2d(3, 2, 3).double(), N, std=0.5)
+    x, turns = torch.randn(5, 3, 6, 6, dtype=torch.float64), [2, 0, 0, 1, 2]
+    layer.selection.members = torch.tensor(turns)
+    together = layer(x)
+    layer.selection.members = None
+    for b, n in enumerate(turns):
+        torch.testing.assert_close(together[b : b + 1], layer.plain(n)(x[b : b + 1]), rtol=1e-12, atol=1e-12)
+
+
+def test_a_layer_needs_its_ensemble():
+    layer = convert(nn.Conv2d(3, 2, 3), N)
+    with pytest.raises(RuntimeError, match="whose turn"):
+        layer(torch.zeros(1, 3, 6, 6))
+    layer.selection.members = torch.zeros(2, dtype=torch.int64)
+    with pytest.raises(ValueError, match=r"of 2 images .* got 6"):
+        layer(torch.zeros(6, 3, 6, 6))
+
+
+def test_autocast_does_not_widen_what_follows():
+    layer = convert(nn.Conv2d(3, 2, 3), N)
+    layer.selection.members = torch.zeros(1, dtype=torch.int64)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer(torch.zeros(1, 3, 6, 6)).dtype == torch.bfloat16
+
+
+# ---- how factors begin ----
+
+
+def test_factors_of_signs():
+    layer = convert(nn.Conv2d(300, 400, 1), 10, init="sign", generator=seeded())
+    for factor in (layer.r, layer.s):
+        assert set(factor.unique().tolist()) == {-1.0, 1.0}
+        assert abs(factor.mean().item()) < 4 / factor.numel() ** 0.5
+        assert not torch.equal(factor[0], factor[1])
+
+
+@pytest.mark.parametrize("std", [INIT_STD, 0.5])
+def test_factors_around_one(std):
+    layer = convert(nn.Linear(300, 400), 10, std=std, generator=seeded())
+    for factor in (layer.r, layer.s):
+        error = std / factor.numel() ** 0.5
+        assert abs(factor.mean().item() - 1) < 4 * error
+        assert abs(factor.std().item() - std) < 4 * error
+
+
+def test_a_seed_decides_the_factors_and_nothing_else_does():
+    torch.manual_seed(1)
+    first = convert(nn.Linear(4, 5), N, generator=seeded(7))
+    state = torch.get_rng_state()
+    second = convert(nn.Linear(4, 5).double(), N, generator=seeded(7))
+    assert torch.equal(first.r.double(), second.r)
+    assert torch.equal(first.s.double(), second.s)
+    torch.set_rng_state(state)
+    nn.Linear(4, 5)
+    after = torch.get_rng_state()
+    torch.set_rng_state(state)
+    convert(nn.Linear(4, 5), N, generator=seeded())
+    assert torch.equal(torch.get_rng_state(), after)
+
+
+def test_without_spread_all_members_are_the_network():
+    network, _ = tiny()
+    ensemble = BatchEnsemble(network, N, std=0.0)
+    x = images()
+    expected = network(x)
+    for member in ensemble.all_members():
+        torch.testing.assert_close(member(x).depth, expected.depth, rtol=1e-12, atol=1e-12)
+    combined = ensemble(x)
+    torch.testing.assert_close(combined.depth, expected.depth, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(combined.aleatoric_variance, expected.aleatoric_variance, rtol=1e-12, atol=1e-12)
+    assert combined.epistemic_variance.max() < 1e-28
+
+
+# ---- conversion ----
+
+
+class KeepsTwice(nn.Module):
+    """Modules in a dict that is not registered, in a tuple and as an attribute, besides a ModuleList: what made a
+    published conversion change nothing."""
+
+    def __init__(self):
+        super().__init__()
+        self.by_name = OrderedDict(a=nn.Conv2d(3, 4, 1), b=nn.Conv2d(4, 3, 1))
+        self.layers = nn.ModuleList(self.by_name.values())
+        self.pairs = [(self.layers[0], self.layers[1])]
+        self.parts = nn.ModuleDict({"x": nn.Sequential(nn.Identity(), nn.Sequential(nn.Conv2d(3, 3, 1)))})
+        self.again = self.layers[1]
+
+    def forward(self, x):
+        (first, second), *_ = self.pairs
+        return self.parts["x"](self.again(self.by_name["a"](x))) + second(first(x))
+
+
+def test_conversion_finds_layers_wherever_they_are():
+    plain = KeepsTwice().double()
+    before = copy.deepcopy(plain.state_dict())
+    network = convert(plain, N, std=0.3)
+    assert len(converted_layers(network)) == 3
+    assert network.by_name["a"] is network.layers[0] is network.pairs[0][0]
+    assert network.by_name["b"] is network.layers[1] is network.pairs[0][1] is network.again
+    assert isinstance(network.again, BatchLayer)
+    x = torch.randn(2, 3, 4, 4, dtype=torch.float64)
+    network.again.selection.members = torch.tensor([0, 1])
+    assert (network(x) - plain(x)).abs().max() > 0.01
+    for key, value in plain.state_dict().items():  # the argument is as it was, and shares nothing with the copy
+        assert torch.equal(value, before[key])
+    assert not {p.data_ptr() for p in plain.parameters()} & {p.data_ptr() for p in network.parameters()}
+    assert not converted_layers(plain)
+
+
+def test_a_module_that_is_used_twice_is_converted_once():
+    shared = nn.Conv2d(3, 3, 1)
+    network = convert(nn.Sequential(shared, nn.ReLU(), shared), N)
+    assert network[0] is network[2]
+    assert len(converted_layers(network)) == 1
+
+
+def test_tied_weights_stay_tied():
+    plain = nn.Sequential(nn.Linear(4, 4), nn.Linear(4, 4))
+    plain[1].weight = plain[0].weight
+    network = convert(plain, N)
+    assert network[0].shared.weight is network[1].shared.weight
+    assert network[0].r is not network[1].r
+
+
+def test_weights_and_biases_are_copied():
+    plain = nn.Sequential(nn.Conv2d(2, 3, 3), nn.BatchNorm2d(3), nn.Linear(4, 5, bias=False))
+    network = convert(plain, N)
+    assert torch.equal(network[0].shared.weight, plain[0].weight)
+    assert torch.equal(network[0].bias, plain[0].bias.expand(N, 3))
+    assert network[2].bias is None
+    shapes = {key: tuple(value.shape) for key, value in network[0].state_dict().items()}
+    assert shapes == {"r": (N, 2), "s": (N, 3), "bias": (N, 3), "shared.weight": (3, 2, 3, 3)}
+    assert torch.equal(network[1].running_mean, plain[1].running_mean)
+
+
+def test_nothing_to_convert():
+    with pytest.raises(ValueError, match="nothing to convert"):
+        convert(nn.Sequential(nn.BatchNorm2d(3), nn.ReLU()), N)
+
+
+def test_a_converted_network_is_not_converted_again():
+    with pytest.raises(ValueError, match="converted already"):
+        convert(convert(nn.Linear(3, 3), N), N)
+
+
+@pytest.mark.parametrize("options", [{"members": 1}, {"init": "zeros"}, {"std": -1.0}, {"std": float("nan")}])
+def test_impossible_options(options):
+    with pytest.raises(ValueError, match="need members >= 2"):
+        convert(nn.Linear(3, 3), **{"members": N, **options})
+
+
+class Standardised(nn.Conv2d):
+    """A convolution that computes something else with its weight."""
+
+
+def test_layers_that_compute_something_else_are_refused():
+    for layer in (
+        Standardised(3, 3, 1),
+        nn.LazyConv2d(3, 1),
+        nn.utils.parametrizations.weight_norm(nn.Conv2d(3, 3, 1)),
+        nn.MultiheadAttention(4, 2),
+    ):
+        with pytest.raises(TypeError, match=r"1.* cannot be converted"):
+            convert(nn.Sequential(nn.Conv2d(3, 3, 1), layer), N)
+
+
+class HidesOne(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.seen = nn.Conv2d(3, 3, 1)
+        self.hidden = [nn.Conv2d(3, 3, 1)]
+
+
+def test_a_module_in_a_plain_list_only_is_told():
+    with pytest.raises(ValueError, match=r"HidesOne\.hidden keeps a Conv2d .* nn\.ModuleList"):
+        convert(HidesOne(), N)
+
+
+class Out:
+    """An object of one's own that holds a layer where no conversion looks."""
+
+    def __init__(self, layer):
+        self.layer = layer
+
+
+class KeepsOut(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.conv = nn.Conv2d(3, 3, 1)
+        self.out = Out(self.conv)
+
+    def forward(self, x):
+        return self.out.layer(x)
+
+
+def test_a_reference_that_no_conversion_can_see_fails_when_used():
+    network = convert(KeepsOut(), N)
+    with pytest.raises(AttributeError, match="weight"):
+        network(torch.zeros(1, 3, 2, 2))
+
+
+def test_fastdepth_and_monodepth2_are_converted_whole():
+    from ufmstar_torch.models.monodepth2 import MonodepthResNet
+
+    fastdepth = FastDepth(FastDepthWidths.scaled(0.1), size=(32, 32))
+    monodepth = MonodepthResNet(18, size=(64, 64))
+    for network in (fastdepth, monodepth):
+        expected = sum(isinstance(m, (nn.Conv2d, nn.Linear)) for m in network.modules())
+        ensemble = BatchEnsemble(AleatoricNetwork(network), N, std=0.2).eval()
+        assert len(converted_layers(ensemble)) == expected + 1  # the head's
+        x = torch.rand(1, 3, 64, 64)
+        with torch.no_grad():
+            together = ensemble.distribution(x).depth
+            for n in range(N):
+                torch.testing.assert_close(ensemble.member(n)(x).depth, together[n : n + 1], rtol=1e-5, atol=1e-5)
+                torch.testing.assert_close(ensemble.folded(n)(x).depth, together[n : n + 1], rtol=2e-4, atol=1e-4)
+            assert together.var(0).mean() > 0
+
+
+# ---- the ensemble ----
+
+
+def test_a_member_alone_is_its_part_of_the_batched_pass():
+    _, ensemble = tiny()
+    x = images()
+    together = ensemble.distribution(x)
+    for n in range(N):
+        own = ensemble.member(n).distribution(x)
+        part = slice(2 * n, 2 * n + 2)
+        torch.testing.assert_close(own.depth, together.depth[part], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(own.log_variance, together.log_variance[part], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(ensemble.distribution(x, n).depth, own.depth, rtol=0, atol=0)
+        assert torch.equal(ensemble.member(n)(x).depth, own.depth)
+    assert together.depth.shape == (2 * N, 6, 8)
+
+
+def test_a_member_is_its_folded_network():
+    _, ensemble = tiny()
+    x = images()
+    for n, member in enumerate(ensemble.all_members()):
+        plain = ensemble.folded(n)
+        assert not converted_layers(plain)
+        assert {type(m) for m in plain.modules()} >= {nn.Conv2d, nn.Linear, nn.BatchNorm2d}
+        expected = member.distribution(x)
+        torch.testing.assert_close(plain.distribution(x).depth, expected.depth, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(plain.distribution(x).log_variance, expected.log_variance, rtol=1e-12, atol=1e-12)
+        with torch.no_grad():
+            for value in plain.parameters():
+                value.zero_()  # independent of the ensemble
+        torch.testing.assert_close(member.distribution(x).depth, expected.depth, rtol=0, atol=0)
+
+
+def test_the_batched_pass_combines_its_members():
+    _, ensemble = tiny()
+    x = images()
+    expected = combine([member(x) for member in ensemble.all_members()])
+    found = ensemble(x)
+    torch.testing.assert_close(found.depth, expected.depth, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.aleatoric_variance, expected.aleatoric_variance, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.epistemic_variance, expected.epistemic_variance, rtol=1e-9, atol=1e-15)
+    assert found.epistemic_variance.mean() > 1e-3
+
+
+@pytest.mark.parametrize("batch", [3, 4, 7])
+def test_a_batch_is_split_among_the_members(batch):
+    _, ensemble = tiny()
+    x = images(batch)
+    found = ensemble.distribution(x, repeat=False).depth
+    turns = [b * N // batch for b in range(batch)]
+    assert set(turns) == set(range(N))
+    for b, n in enumerate(turns):
+        torch.testing.assert_close(found[b], ensemble.member(n)(x).depth[b], rtol=1e-12, atol=1e-12)
+
+
+def test_a_batch_too_small_to_be_split():
+    _, ensemble = tiny()
+    with pytest.raises(ValueError, match="batch of 2 cannot be split among 3"):
+        ensemble.distribution(images(2), repeat=False)
+
+
+@pytest.mark.parametrize("n", [-1, N])
+def test_no_such_member(n):
+    _, ensemble = tiny()
+    for call in (ensemble.member, ensemble.folded, lambda k: ensemble.distribution(images(), k)):
+        with pytest.raises(IndexError, match="from 0 to 2"):
+            call(n)
+
+
+def test_evidential_members_are_combined_too():
+    ensemble = BatchEnsemble(EvidentialNetwork(Tiny()).double(), N, std=0.3).eval()
+    x = images()
+    expected = combine([member(x) for member in ensemble.all_members()])
+    torch.testing.assert_close(ensemble(x).epistemic_variance, expected.epistemic_variance, rtol=1e-9, atol=1e-12)
+
+
+def test_gradients_reach_the_shared_weights_and_the_member_in_turn_only():
+    _, ensemble = tiny()
+    ensemble.member(1).distribution(images()).depth.sum().backward()
+    reached = [layer for layer in converted_layers(ensemble) if layer.shared.weight.grad is not None]
+    assert len(reached) == len(converted_layers(ensemble)) - 1  # all but the variance's head
+    for layer in reached:
+        assert layer.shared.weight.grad.abs().sum() > 0
+        for value in (layer.r, layer.s, *([layer.bias] if layer.bias is not None else [])):
+            rows = value.grad.abs().sum(1)
+            assert rows[1] > 0
+            assert rows[0] == rows[2] == 0
+
+
+def test_gradients_are_those_of_the_formula():
+    layer = convert(nn.Conv2d(4, 2, 3, groups=2).double(), 2, std=0.3)
+    x = torch.randn(2, 4, 5, 5, dtype=torch.float64, requires_grad=True)
+    layer.selection.members = torch.tensor([1, 0])
+
+    def call(x, r, s, bias, weight):
+        parameters = {"r": r, "s": s, "bias": bias, "shared.weight": weight}
+        return torch.func.functional_call(layer, parameters, (x,))
+
+    assert torch.autograd.gradcheck(call, (x, layer.r, layer.s, layer.bias, layer.shared.weight))
+
+
+def test_training_makes_members_differ_from_each_other_and_fits_them():
+    torch.manual_seed(0)
+    ensemble = BatchEnsemble(AleatoricNetwork(Tiny()), N, init="sign", generator=seeded())
+    x, target = torch.rand(12, 3, 6, 8), torch.full((12, 6, 8), 4.0)
+    optimiser = torch.optim.Adam(ensemble.parameters(), 0.03)
+    losses = []
+    for _ in range(60):
+        optimiser.zero_grad()
+        loss = (ensemble.distribution(x, repeat=False).depth - target).square().mean()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.05 * losses[0]
+    depths = torch.stack([member(x).depth for member in ensemble.eval().all_members()])
+    assert (depths - 4).abs().mean() < 1
+    assert depths.std(0).min() > 0
+
+
+def test_factors_are_what_weight_decay_should_leave_alone():
+    _, ensemble = tiny()
+    layers = converted_layers(ensemble)
+    assert {id(f) for f in ensemble.factors()} == {id(f) for layer in layers for f in (layer.r, layer.s)}
+    assert len(ensemble.factors()) == 2 * len(layers)
+
+
+def test_a_member_costs_three_vectors_per_layer():
+    network, ensemble = tiny()
+    plain = sum(p.numel() for p in network.parameters())
+    own = sum(p[0].numel() for layer in converted_layers(ensemble) for p in (layer.r, layer.s))
+    biases = sum(layer.bias[0].numel() for layer in converted_layers(ensemble) if layer.bias is not None)
+    assert sum(p.numel() for p in ensemble.parameters()) == plain - biases + N * (own + biases)
+
+
+# ---- members as networks ----
+
+
+def test_members_alternate_and_share_everything():
+    _, ensemble = tiny()
+    pipeline = UncertainDepth(ensemble.all_members())
+    weights = sum(p.numel() for p in ensemble.parameters())
+    assert sum(p.numel() for p in pipeline.parameters()) == weights
+    pose, K = torch.eye(4), torch.tensor([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]])
+    x = images(1)
+    for turn in range(4):
+        result = pipeline(x, pose, K)
+        assert result.member == turn % N
+        assert torch.equal(result.depth, ensemble.member(turn % N)(x).depth)
+    full = UncertainDepth(ensemble.all_members(), mode="full")(x, pose, K)
+    torch.testing.assert_close(full.prediction.epistemic_variance, ensemble(x).epistemic_variance, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("moved", [lambda m: m.to(torch.float32), lambda m: m.to("meta"), copy.deepcopy, lambda m: m])
+def test_members_stay_one_when_they_are_moved(moved):
+    _, ensemble = tiny()
+    expected = ensemble.member(1)(images()).depth
+    networks = moved(nn.ModuleList(ensemble.all_members()))
+    assert all(member.ensemble is networks[0].ensemble for member in networks)
+    layers = converted_layers(networks)
+    assert len(layers) == len(converted_layers(ensemble))
+    assert len({id(layer.selection) for layer in layers}) == 1
+    dtype, device = next(networks.parameters()).dtype, next(networks.parameters()).device
+    x = images().to(device=device, dtype=dtype)
+    assert networks[1](x).depth.device == device
+    if device.type == "cpu":
+        torch.testing.assert_close(networks[1](x).depth.double(), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_state_dict_repeats_names_but_not_tensors():
+    _, ensemble = tiny(0)
+    networks = nn.ModuleList(ensemble.all_members())
+    state = networks.state_dict()
+    assert len(state) == N * len(ensemble.state_dict())
+    assert len({value.data_ptr() for value in state.values()}) <= len(ensemble.state_dict())
+    _, other = tiny(5)
+    target = nn.ModuleList(other.all_members())
+    target.load_state_dict(state)
+    x = images()
+    for ours, theirs in zip(networks, target, strict=True):
+        assert torch.equal(ours(x).depth, theirs(x).depth)
+
+
+def test_a_copy_or_pickle_has_its_own_turns():
+    _, ensemble = tiny()
+    x = images()
+    for other in (copy.deepcopy(ensemble), pickle.loads(pickle.dumps(ensemble))):
+        selections = {id(layer.selection) for layer in converted_layers(other)}
+        assert len(selections) == 1
+        assert selections != {id(layer.selection) for layer in converted_layers(ensemble)}
+        assert torch.equal(other.member(2)(x).depth, ensemble.member(2)(x).depth)
+    assert isinstance(copy.deepcopy(Selection()), Selection)
+
+
+def test_threads_do_not_mix_members():
+    _, ensemble = tiny()
+    x = images()
+    expected = [ensemble.member(n)(x).depth for n in range(N)]
+    wrong, barrier = [], threading.Barrier(N)
+
+    def work(n):
+        barrier.wait()
+        wrong.extend(n for _ in range(30) if not torch.equal(ensemble.member(n)(x).depth, expected[n]))
+
+    threads = [threading.Thread(target=work, args=(n,)) for n in range(N)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+
+
+def test_turns_end_with_an_error():
+    _, ensemble = tiny()
+    with pytest.raises(RuntimeError):
+        ensemble.member(0)(torch.zeros(1, 5, 6, 8, dtype=torch.float64))
+    assert converted_layers(ensemble)[0].selection.members is None
