@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.alignment import fit_inverse_depth as fit_inverse_depth
     from ufmstar_torch.models.any_network import WrappedNetwork as WrappedNetwork
     from ufmstar_torch.models.any_network import wrap_network as wrap_network
+    from ufmstar_torch.models.batch_ensemble import BatchEnsemble as BatchEnsemble
+    from ufmstar_torch.models.batch_ensemble import convert as convert
     from ufmstar_torch.models.camera_height import GroundFit as GroundFit
     from ufmstar_torch.models.camera_height import align_to_camera_height as align_to_camera_height
     from ufmstar_torch.models.checkpoints import CheckpointError as CheckpointError
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.dropout import DecoderDropout as DecoderDropout
     from ufmstar_torch.models.dropout import MonteCarloDropout as MonteCarloDropout
     from ufmstar_torch.models.dropout import set_sampling as set_sampling
+    from ufmstar_torch.models.ensemble import Ensemble as Ensemble
+    from ufmstar_torch.models.ensemble import LazyMember as LazyMember
     from ufmstar_torch.models.fastdepth import FastDepth as FastDepth
     from ufmstar_torch.models.fastdepth import FastDepthWidths as FastDepthWidths
     from ufmstar_torch.models.heads import AleatoricNetwork as AleatoricNetwork
@@ -49,6 +53,13 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.onnx_network import OnnxSpec as OnnxSpec
     from ufmstar_torch.models.outputs import OutputSpec as OutputSpec
     from ufmstar_torch.models.preprocess import Preprocess as Preprocess
+    from ufmstar_torch.models.spec import NetworkSpec as NetworkSpec
+    from ufmstar_torch.models.spec import build_backbone as build_backbone
+    from ufmstar_torch.models.spec import build_network as build_network
+    from ufmstar_torch.models.trained import TrainedInfo as TrainedInfo
+    from ufmstar_torch.models.trained import load_trained as load_trained
+    from ufmstar_torch.models.trained import read_info as read_info
+    from ufmstar_torch.models.trained import save_trained as save_trained
 
 _HOME = {
     "AleatoricNetwork": "heads",
@@ -57,11 +68,13 @@ _HOME = {
     "AlignmentFit": "alignment",
     "AlignmentSums": "alignment",
     "Backbone": "network",
+    "BatchEnsemble": "batch_ensemble",
     "CheckpointError": "checkpoints",
     "DecoderDropout": "dropout",
     "DepthAnything": "depth_anything",
     "DepthNetwork": "network",
     "DepthOnlyNetwork": "heads",
+    "Ensemble": "ensemble",
     "EvidentialDepth": "distribution",
     "EvidentialNetwork": "heads",
     "FastDepth": "fastdepth",
@@ -69,16 +82,22 @@ _HOME = {
     "GaussianDepth": "distribution",
     "GroundFit": "camera_height",
     "HuggingFaceDepth": "hugging_face",
+    "LazyMember": "ensemble",
     "MonodepthResNet": "monodepth2",
     "MonteCarloDropout": "dropout",
+    "NetworkSpec": "spec",
     "OnnxNetwork": "onnx_network",
     "OnnxSpec": "onnx_network",
     "OutputSpec": "outputs",
     "PointDepth": "distribution",
     "Preprocess": "preprocess",
+    "TrainedInfo": "trained",
     "UncertaintyNetwork": "heads",
     "WrappedNetwork": "any_network",
     "align_to_camera_height": "camera_height",
+    "build_backbone": "spec",
+    "build_network": "spec",
+    "convert": "batch_ensemble",
     "depth_anything_name": "depth_anything",
     "fit_affine_depth": "alignment",
     "fit_inverse_depth": "alignment",
@@ -86,8 +105,11 @@ _HOME = {
     "load_monodepth2": "monodepth2_import",
     "load_network": "load",
     "load_state_dict_file": "checkpoints",
+    "load_trained": "trained",
     "load_weights": "checkpoints",
+    "read_info": "trained",
     "save_checkpoint": "checkpoints",
+    "save_trained": "trained",
     "set_sampling": "dropout",
     "with_head": "heads",
     "wrap_network": "any_network",
