@@ -1,0 +1,250 @@
+"""MC-Dropout: closed forms for a linear decoder, only the decoder samples, both forms, seeds."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from onnx_files import small_network
+from test_ufmstar import SPGF
+from tiny_networks import Linear, constant_head
+from torch import Tensor, nn
+
+import scenes
+from ufmstar_torch import UfMStarConfig, UncertainDepth
+from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout, set_sampling
+from ufmstar_torch.models.fastdepth import FastDepth
+from ufmstar_torch.models.heads import AleatoricNetwork, DepthOnlyNetwork, EvidentialNetwork
+from ufmstar_torch.models.network import Backbone
+
+P = 0.2
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def with_dropout(p: float = P) -> FastDepth:
+    """A small FastDepth with dropout and the weights of ``small_network``."""
+    source = small_network()
+    network = FastDepth(source.widths, dropout=p)
+    network.load_state_dict(source.state_dict(), strict=True)
+    return network.eval()
+
+
+# --- the layer ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("generator", [None, seeded()], ids=["torch's", "own"])
+def test_share_and_scale(generator: torch.Generator | None) -> None:
+    """A value is 0 with probability p, otherwise it is divided by 1 - p: the mean stays."""
+    torch.manual_seed(0)
+    layer = DecoderDropout(P).eval()
+    set_sampling(layer, True, generator)
+    y = layer(torch.ones(200_000))
+    assert set(y.unique().tolist()) == {0.0, 1.25}
+    assert float((y == 0).double().mean()) == pytest.approx(P, abs=5 * (P * (1 - P) / 200_000) ** 0.5)
+
+
+def test_when_it_acts() -> None:
+    layer, x = DecoderDropout(P), torch.ones(1000)
+    assert not torch.equal(layer.train()(x), x)
+    assert layer.eval()(x) is x
+    assert set_sampling(layer, True) == 1
+    assert not torch.equal(layer(x), x)
+    assert set_sampling(layer, False) == 1
+    assert layer(x) is x
+    assert DecoderDropout(0.0).train()(x) is x
+    assert layer.state_dict() == {}
+
+
+@pytest.mark.parametrize("p", [-0.1, 1.0, float("nan")])
+def test_probability_in_range(p: float) -> None:
+    with pytest.raises(ValueError, match=r"probability in \[0, 1\)"):
+        DecoderDropout(p)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_keeps_the_type(dtype: torch.dtype) -> None:
+    layer = DecoderDropout(P)
+    set_sampling(layer, True, seeded())
+    assert layer(torch.ones(10, dtype=dtype)).dtype == dtype
+
+
+@pytest.mark.parametrize("network", [nn.Conv2d(1, 1, 1), Linear(), nn.Dropout(P)], ids=["none", "p = 0", "not ours"])
+def test_nothing_to_sample_is_an_error(network: nn.Module) -> None:
+    with pytest.raises(ValueError, match="has no decoder dropout"):
+        set_sampling(network, True)
+    with pytest.raises(ValueError, match="has no decoder dropout"):
+        MonteCarloDropout(AleatoricNetwork(Linear()))
+
+
+# --- moments -----------------------------------------------------------------------------------------
+
+
+def closed_form(backbone: Linear, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance of depth = offset + sum_c w_c x_c m_c / (1 - p), m_c ~ Bernoulli(1 - p)."""
+    terms = backbone.weights.detach()[None, :, None, None] * image[:, :2]
+    p = backbone.dropout.p
+    return backbone.offset + terms.sum(1), terms.square().sum(1) * p / (1 - p)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_moments_of_a_linear_decoder(batched: bool) -> None:
+    """The multi-inference baseline against its limit. Tolerances are 5 standard errors: of the mean
+    sqrt(V / T), of the variance V sqrt(2.25 / T), since a sum of two Bernoullis has a kurtosis below 3.25."""
+    backbone, count = Linear(dropout=P), 4000
+    image = 1 + torch.rand(2, 3, 4, 6, generator=seeded(1))
+    mean, variance = closed_form(backbone, image)
+    network = MonteCarloDropout(DepthOnlyNetwork(backbone), count, batched=batched, generator=seeded(2)).eval()
+    with torch.no_grad():
+        prediction = network(image)
+    assert prediction.aleatoric_variance is None
+    assert prediction.epistemic_variance is not None
+    assert ((prediction.depth - mean).abs() <= 5 * (variance / count).sqrt()).all()
+    assert ((prediction.epistemic_variance - variance).abs() <= 5 * variance * (2.25 / count) ** 0.5).all()
+
+
+def test_one_batch_draws_independently() -> None:
+    """Passes that run as one batch share no mask: neither with each other nor between images."""
+    backbone, count = Linear(dropout=P), 4000
+    network = MonteCarloDropout(DepthOnlyNetwork(backbone), generator=seeded(3)).eval()
+    with torch.no_grad():
+        depth = network(torch.ones(2 * count, 3, 4, 6)).depth.reshape(2, count, -1)
+    a, b = depth[0, :, 0], depth[1, :, 0]
+    other_pixel, next_pass = depth[0, :, 1], depth[0].roll(1, 0)[:, 0]
+    for other in (b, other_pixel, next_pass):
+        correlation = torch.corrcoef(torch.stack([a, other]))[0, 1]
+        assert abs(float(correlation)) < 5 / count**0.5
+
+
+def test_aleatoric_variance_is_averaged_and_evidence_added() -> None:
+    """combine(): A = mean A_n; E = variance between + mean E_n."""
+    image = 1 + torch.rand(1, 3, 4, 6, generator=seeded(4))
+    for kind in (AleatoricNetwork, EvidentialNetwork):
+        network = kind(Linear(dropout=P))
+        passes = MonteCarloDropout(network, generator=seeded(5)).eval()
+        with torch.no_grad():
+            single = [passes(image) for _ in range(SAMPLES)]
+            together = MonteCarloDropout(network, SAMPLES, generator=seeded(5)).eval()(image)
+        depth = torch.stack([p.depth for p in single])
+        aleatoric = torch.stack([p.aleatoric_variance for p in single if p.aleatoric_variance is not None])
+        between = depth.var(0, correction=0)
+        own = torch.stack(
+            [torch.zeros_like(p.depth) if p.epistemic_variance is None else p.epistemic_variance for p in single]
+        )
+        assert float(between.min()) >= 0
+        assert float(between.max()) > 0
+        torch.testing.assert_close(together.depth, depth.mean(0))
+        torch.testing.assert_close(together.aleatoric_variance, aleatoric.mean(0))
+        torch.testing.assert_close(together.epistemic_variance, between + own.mean(0))
+
+
+def test_batched_keeps_images_apart() -> None:
+    """Images of different depth in one batch: each pass's maps go back to their own image."""
+    backbone = Linear(weights=(1.0, 0.0), offset=0.0, dropout=1e-9)
+    network = AleatoricNetwork(backbone)
+    constant_head(network.head, (0.0,))
+    image = torch.arange(1.0, 4.0)[:, None, None, None].expand(3, 3, 4, 6).contiguous()
+    with torch.no_grad():
+        prediction = MonteCarloDropout(network, 5, batched=True).eval()(image)
+    torch.testing.assert_close(prediction.depth, image[:, 0])
+    torch.testing.assert_close(prediction.epistemic_variance, torch.zeros(3, 4, 6))
+
+
+# --- only the decoder ---------------------------------------------------------------------------------
+
+
+def backbones() -> list[Backbone]:
+    from ufmstar_torch.models.monodepth2 import MonodepthResNet
+
+    return [with_dropout(), MonodepthResNet(18, dropout=P).eval()]
+
+
+def test_the_encoder_does_not_sample() -> None:
+    """Two passes: the encoder's output is the same to the bit, the depth is not; no statistic moves."""
+    for backbone in backbones():
+        seen: list[Tensor] = []
+        last = [m for m in backbone.encoder.modules() if isinstance(m, nn.BatchNorm2d)][-1]
+        last.register_forward_hook(lambda *args, seen=seen: seen.append(args[2].clone()))
+        before = copy.deepcopy(backbone.state_dict())
+        network = MonteCarloDropout(AleatoricNetwork(backbone)).eval()
+        image = torch.rand(1, 3, 64, 64, generator=seeded(6))
+        with torch.no_grad():
+            depth = [network(image).depth for _ in range(2)]
+        assert len(seen) == 2
+        assert torch.equal(*seen)
+        assert float((depth[0] - depth[1]).abs().max()) > 1e-4
+        after = backbone.state_dict()
+        assert all(torch.equal(before[key], after[key]) for key in before)
+        assert not any(isinstance(m, DecoderDropout) for m in backbone.encoder.modules())
+        assert set_sampling(backbone, False) == 5
+        with torch.no_grad():
+            assert torch.equal(network(image).depth, network(image).depth)
+
+
+def test_dropout_has_no_weights() -> None:
+    """The weights of a network without dropout load, and without sampling it is the same function."""
+    image = torch.rand(1, 3, 64, 64, generator=seeded(7))
+    with torch.no_grad():
+        assert torch.equal(with_dropout()(image).depth, small_network()(image).depth)
+        assert with_dropout(0.5).folded().dropouts[0].p == 0.5
+
+
+# --- both forms in UncertainDepth ---------------------------------------------------------------------
+
+CONFIG = UfMStarConfig(segment=SPGF)
+K = torch.tensor(scenes.intrinsics(64, 64))
+POSE = torch.tensor(scenes.tour(30)[0])
+
+
+def test_single_inference_form_is_one_pass_per_image() -> None:
+    backbone = with_dropout()
+    calls: list[int] = []
+    backbone.encoder[0].register_forward_hook(lambda *_: calls.append(1))
+    network = AleatoricNetwork(backbone)
+    image = torch.rand(1, 3, 64, 64, generator=seeded(8))
+    stream = UncertainDepth(MonteCarloDropout(network, generator=seeded(9)), CONFIG)
+    out = [stream(image, POSE, K) for _ in range(3)]
+    assert len(calls) == 3
+    assert not torch.equal(out[0].depth, out[1].depth)
+    assert out[0].prediction.epistemic_variance is None
+    repeated = UncertainDepth(MonteCarloDropout(network, generator=seeded(9)), CONFIG)
+    assert all(torch.equal(repeated(image, POSE, K).depth, o.depth) for o in out)
+
+
+def test_multi_inference_form_is_ten_passes() -> None:
+    """``UncertainDepth(mode="full", samples=10)`` and the network that samples ten times are the same baseline."""
+    backbone = with_dropout()
+    calls: list[int] = []
+    backbone.encoder[0].register_forward_hook(lambda *_: calls.append(1))
+    network = AleatoricNetwork(backbone)
+    image = torch.rand(1, 3, 64, 64, generator=seeded(10))
+    full = UncertainDepth(MonteCarloDropout(network, generator=seeded(11)), CONFIG, mode="full", samples=SAMPLES)(
+        image, POSE, K
+    )
+    assert len(calls) == SAMPLES == 10
+    with torch.no_grad():
+        baseline = MonteCarloDropout(network, SAMPLES, generator=seeded(11)).eval()(image)
+    assert len(calls) == 2 * SAMPLES
+    assert torch.equal(full.depth, baseline.depth)
+    assert full.prediction.epistemic_variance is not None
+    torch.testing.assert_close(full.prediction.epistemic_variance, baseline.epistemic_variance)
+    assert float(full.prediction.epistemic_variance.mean()) > 0
+
+
+def test_training_and_arguments() -> None:
+    network = AleatoricNetwork(with_dropout())
+    wrapped = MonteCarloDropout(network).train()
+    image = torch.rand(2, 3, 64, 64, generator=seeded(12))
+    wrapped.distribution(image).depth.sum().backward()
+    assert all(p.grad is not None for name, p in network.named_parameters() if "head" not in name)
+    assert wrapped.preprocess is network.preprocess
+    with pytest.raises(ValueError, match="samples must be at least 1"):
+        MonteCarloDropout(network, 0)
+    with pytest.raises(TypeError, match="FastDepth is no UncertaintyNetwork"):
+        MonteCarloDropout(with_dropout()).distribution(image)
+    again = copy.deepcopy(MonteCarloDropout(network, generator=seeded(13)).eval())
+    with torch.no_grad():
+        assert again(image).depth.shape == (2, 64, 64)
