@@ -115,7 +115,24 @@ def train(arguments: Sequence[str]) -> int:
     return OK if summary["stopped"] is None else _told(f"ufmstar train: {summary['stopped']}", INTERRUPTED)
 
 
-COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {"run": run, "bench": bench, "train": train}
+def demo(arguments: Sequence[str]) -> int:
+    """the main job on rendered rooms, with nothing but this package"""
+    from ufmstar_torch.eval.demo_options import parse_demo
+
+    options = parse_demo(arguments)
+    try:
+        summary = _demo(options)
+    except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
+        if options.debug:
+            traceback.print_exc()
+        return _told(f"ufmstar demo: failed: {_one_line(error)}", FAILED)
+    from ufmstar_torch.eval.demo_report import explanation, table
+
+    print(table(summary), explanation(summary), sep="\n\n")
+    return OK
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {"demo": demo, "run": run, "bench": bench, "train": train}
 
 
 def _run(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -147,6 +164,30 @@ def _run(options: Mapping[str, Any]) -> dict[str, Any]:
             )
     except FolderError as error:
         raise UsageError(str(error)) from error
+
+
+def _demo(options: Any) -> dict[str, Any]:
+    """Run the demo.
+
+    Raises:
+        UsageError: the options do not fit, or what they name is not there.
+    """
+    from ufmstar_torch.eval.demo import DemoOptions, OutputError, run_demo
+
+    try:
+        _set_threads(options.threads)
+        chosen = DemoOptions(
+            out=options.out,
+            frames=options.frames,
+            seed=options.seed,
+            weights=options.weights,
+            device=options.device,
+            overwrite=options.overwrite,
+        )
+        with _Bars() as bars:
+            return run_demo(chosen, bars.show)
+    except (OutputError, FileNotFoundError) as error:
+        raise UsageError(_one_line(error)) from error
 
 
 def _report(summary: Mapping[str, Any], out: str) -> int:
