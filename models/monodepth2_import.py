@@ -64,17 +64,19 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     loaded: dict[str, Tensor] = {}
     for path, place in ((encoder_path, _encoder_place), (depth_path, _decoder_place)):
         state = load_state_dict_file(path, ignore=_NO_WEIGHTS)
-        found = {}
+        found, unused = {}, {}
         for key, value in state.items():
             target, reason = place(key)
             reason = reason or _fault(target, value, expected)
             if reason:
-                skipped[key] = reason
+                unused[key] = reason
             else:
                 found[target] = value
         if not found:
-            raise CheckpointError(f"nothing in {path} fits the network: {next(iter(skipped.items()), 'it is empty')}")
+            why = ": ".join(next(iter(unused.items()), ("it is empty",)))
+            raise CheckpointError(f"nothing in {path} fits the network; {why}")
         loaded |= found
+        skipped |= unused
     _to_imagenet_colours(loaded)
     network.load_state_dict(expected | loaded, strict=True)
     return Imported(tuple(sorted(loaded)), skipped, tuple(sorted(set(expected) - set(loaded))))

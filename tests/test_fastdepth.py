@@ -332,3 +332,52 @@ def test_fine_tuning_of_imported_weights(network: FastDepth) -> None:
     assert len(norms) == 38
     assert all(int(m.num_batches_tracked) > 50_000 for m in norms if m.num_batches_tracked is not None)
     assert all(p.requires_grad for p in network.parameters())
+
+
+# --- for training from scratch -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("multiplier", "stem", "last"), [(1.0, 32, 1024), (0.25, 8, 256), (0.3, 16, 304), (1.1, 32, 1128)]
+)
+def test_width_multiplier(multiplier: float, stem: int, last: int) -> None:
+    widths = FastDepthWidths.scaled(multiplier)
+    assert (widths.encoder[0], widths.encoder[-1]) == (stem, last)
+    full = FastDepthWidths.full()
+    for scaled, exact in zip(widths.encoder + widths.decoder, full.encoder + full.decoder, strict=True):
+        assert scaled % 8 == 0
+        assert scaled >= 0.9 * multiplier * exact
+        assert scaled <= multiplier * exact + 8
+    assert FastDepthWidths.scaled(1) == FastDepthWidths.full()
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("inf"), float("nan")])
+def test_width_multiplier_must_be_positive(bad: float) -> None:
+    with pytest.raises(ValueError, match="width multiplier must be positive"):
+        FastDepthWidths.scaled(bad)
+
+
+@pytest.mark.parametrize("norm", [True, False])
+@pytest.mark.parametrize("positive", ["relu", "softplus"])
+def test_fastdepth_starts_in_a_room(positive: str, norm: bool) -> None:
+    """Untrained, every pixel has a depth of a few metres and thus a gradient, with either activation."""
+    torch.manual_seed(0)
+    network = FastDepth(FastDepthWidths.scaled(0.25), positive=positive, norm=norm, size=(64, 96)).train()
+    assert network.preprocess.size == (64, 96)
+    image = torch.rand(4, 3, 64, 96, generator=torch.Generator().manual_seed(0))
+    depth = network(image).depth.detach()
+    assert float(depth.median()) == pytest.approx(2.5, abs=0.5)
+    assert float((depth > 0).float().mean()) > 0.98
+    nn.init.constant_(network.head.norm.bias if norm else network.head.conv.bias, -20.0)
+    depth = network(image).depth
+    assert (float(depth.detach().min()) > 0) == (positive == "softplus")
+    depth.sum().backward()
+    gradient = sum(float(p.grad.abs().sum()) for p in network.head.parameters() if p.grad is not None)
+    assert (gradient > 0) == (positive == "softplus")
+
+
+def test_fastdepth_arguments_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"positive must be one of \['relu', 'softplus'\], got 'elu'"):
+        FastDepth(positive="elu")
+    with pytest.raises(ValueError, match="size must be multiples of 32"):
+        FastDepth(size=(224, 230))

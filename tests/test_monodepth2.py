@@ -1,0 +1,411 @@
+"""ResNet-Monodepth2: sizes, strides, an independent decoder, ImageNet weights, published state_dicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from shared_data import require_shared
+from torch import Tensor, nn
+
+from ufmstar_torch.models.batch_ensemble import convert, converted_layers
+from ufmstar_torch.models.checkpoints import CheckpointError, save_checkpoint
+from ufmstar_torch.models.heads import with_head
+from ufmstar_torch.models.load import load_network
+from ufmstar_torch.models.monodepth2 import DECODER_WIDTHS, IMAGENET_MEAN, IMAGENET_STD, MonodepthResNet
+from ufmstar_torch.models.monodepth2_import import load_monodepth2
+
+RESNET50 = "weights/resnet50_v1_imagenet_fp16_nofc.pth"
+SMALL = (4, 8, 8, 8, 16)
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def random_like(state: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
+    """Other values for every tensor, of a size that keeps activations in range."""
+    generator, result = seeded(seed), {}
+    for key, value in state.items():
+        if not value.is_floating_point():
+            result[key] = value.clone()
+        elif key.endswith("running_var") or (value.dim() == 1 and key.endswith("weight")):
+            result[key] = 0.5 + torch.rand(value.shape, generator=generator)
+        else:
+            spread = 0.1 if value.dim() == 1 else value[0].numel() ** -0.5
+            result[key] = spread * torch.randn(value.shape, generator=generator)
+    return result
+
+
+def small(**options: Any) -> MonodepthResNet:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return MonodepthResNet(18, decoder=SMALL, **options).eval()
+
+
+def classifier_weights(layers: int = 18, seed: int = 1) -> dict[str, Tensor]:
+    """What torchvision publishes: a whole classifier's state_dict."""
+    import torchvision.models
+
+    return random_like(getattr(torchvision.models, f"resnet{layers}")(weights=None).state_dict(), seed)
+
+
+# --- the network -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("layers", "encoder", "total"), [(18, 11_176_512, 14.3e6), (50, 23_508_032, 32.5e6)])
+def test_sizes_are_monodepth2s(layers: int, encoder: int, total: float) -> None:
+    """ResNets without classifier, and the totals that the literature states for Monodepth2."""
+    network = MonodepthResNet(layers)
+    assert sum(p.numel() for p in network.encoder.parameters()) == encoder
+    assert sum(p.numel() for p in network.parameters()) == pytest.approx(total, rel=0.005)
+    assert network.feature_channels == DECODER_WIDTHS[0] == 16
+
+
+def test_untrained_depth_is_a_rooms() -> None:
+    """Metric and positive everywhere, at full resolution, about 2.5 m."""
+    image = torch.randn(2, 3, 64, 96, generator=seeded())
+    network = small()
+    with torch.inference_mode():
+        depth = network(image).depth
+        assert network.features(image).shape == (2, SMALL[0], 64, 96)
+    assert depth.shape == (2, 64, 96)
+    assert 2 < float(depth.min()) <= float(depth.max()) < 3
+    nn.init.constant_(network.head.bias, -50.0)
+    with torch.inference_mode():
+        assert float(network(image).depth.min()) > 0
+
+
+def test_preprocess_is_imagenets() -> None:
+    network = small()
+    assert (network.preprocess.mean, network.preprocess.std) == (IMAGENET_MEAN, IMAGENET_STD)
+    grey = torch.full((1, 3, 480, 640), 0.5)
+    x, K = network.preprocess(grey, torch.eye(3, dtype=torch.float64))
+    assert x.shape == (1, 3, 224, 224)
+    expected = (0.5 - torch.tensor(IMAGENET_MEAN)) / torch.tensor(IMAGENET_STD)
+    torch.testing.assert_close(x.mean((0, 2, 3)), expected)
+    assert K.shape == (3, 3)
+    assert small(size=(96, 128)).preprocess.size == (96, 128)
+
+
+def decoder_of_the_paper(state: Mapping[str, Tensor], maps: list[Tensor]) -> Tensor:
+    """Monodepth2's decoder, written out with the keys that its repository publishes, up to the last features."""
+
+    def convolve(x: Tensor, n: int) -> Tensor:
+        x = F.pad(x, (1, 1, 1, 1), mode="reflect")
+        x = F.conv2d(x, state[f"decoder.{n}.conv.conv.weight"], state[f"decoder.{n}.conv.conv.bias"])
+        return torch.where(x > 0, x, x.exp() - 1)
+
+    x = maps[4]
+    for step in range(5):
+        x = convolve(x, 2 * step)
+        x = x.repeat_interleave(2, 2).repeat_interleave(2, 3)
+        if step < 4:
+            x = torch.cat([x, maps[3 - step]], 1)
+        x = convolve(x, 2 * step + 1)
+    return x
+
+
+def published_decoder(channels: tuple[int, ...], widths: tuple[int, ...], seed: int = 2) -> dict[str, Tensor]:
+    """Random tensors under depth.pth's keys: levels 4 to 0 with two convolutions each, then four disparities."""
+    shapes, below = [], channels[-1]
+    for i in (4, 3, 2, 1, 0):
+        skip = channels[i - 1] if i else 0
+        shapes += [(widths[i], below, 3, 3), (widths[i], widths[i] + skip, 3, 3)]
+        below = widths[i]
+    keys = [f"decoder.{n}.conv.conv" for n in range(10)] + [f"decoder.{n}.conv" for n in range(10, 14)]
+    shapes += [(1, widths[i], 3, 3) for i in range(4)]
+    empty = {f"{k}.weight": torch.zeros(s) for k, s in zip(keys, shapes, strict=True)}
+    empty |= {f"{k}.bias": torch.zeros(s[0]) for k, s in zip(keys, shapes, strict=True)}
+    return random_like(empty, seed)
+
+
+def write_published(folder: Path, encoder: dict[str, Any], decoder: dict[str, Tensor]) -> tuple[Path, Path]:
+    extra = {"height": 192, "width": 640, "use_stereo": False}
+    torch.save({f"encoder.{k}": v for k, v in encoder.items()} | extra, folder / "encoder.pth")
+    torch.save(decoder, folder / "depth.pth")
+    return folder / "encoder.pth", folder / "depth.pth"
+
+
+# --- published Monodepth2 weights --------------------------------------------------------------------
+
+
+def test_published_weights_are_taken(tmp_path: Path) -> None:
+    """Every tensor but classifier and disparities; the features are those of the paper's decoder."""
+    network = small()
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    decoder = published_decoder(network.encoder.channels, SMALL)
+    report = load_monodepth2(network, *write_published(tmp_path, classifier_weights(), decoder))
+    assert len(report.loaded) == 120 + 20
+    assert report.kept == ("head.bias", "head.weight")
+    assert len(report.skipped) == 2 + 8
+    assert report.skipped["decoder.10.conv.weight"] == "disparity is not metric depth"
+    assert report.skipped["encoder.fc.weight"] == "the classifier is not used"
+    assert all(torch.equal(network.state_dict()[key], before[key]) for key in report.kept)
+    image = torch.randn(2, 3, 64, 96, generator=seeded())
+    with torch.inference_mode():
+        expected = decoder_of_the_paper(decoder, network.encoder(image))
+        torch.testing.assert_close(network.features(image), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_colours_are_renormalised(tmp_path: Path) -> None:
+    """The stem on an image normalised as ImageNet's equals the published one on (x - .45) / .225, but for
+    the two pixels at the border that see the padding."""
+    import torchvision.models
+
+    weights = classifier_weights()
+    published = torchvision.models.resnet18(weights=None).eval()
+    published.load_state_dict(weights)
+    network = small()
+    decoder = published_decoder(network.encoder.channels, SMALL)
+    load_monodepth2(network, *write_published(tmp_path, weights, decoder))
+    image = torch.rand(1, 3, 64, 64, generator=seeded())
+    mean, std = (torch.tensor(v)[:, None, None] for v in (IMAGENET_MEAN, IMAGENET_STD))
+    with torch.inference_mode():
+        expected = published.bn1(published.conv1((image - 0.45) / 0.225))
+        observed = network.encoder.bn1(network.encoder.conv1((image - mean) / std))
+        torch.testing.assert_close(observed[..., 2:-2, 2:-2], expected[..., 2:-2, 2:-2], rtol=1e-4, atol=1e-4)
+        difference = (observed - expected).abs()
+        assert float(difference.max()) > 1e-3, "the border is padded with another colour"
+
+
+def test_what_does_not_fit_is_reported(tmp_path: Path) -> None:
+    network = MonodepthResNet(18, decoder=(4, 8, 8, 8, 20))
+    decoder = published_decoder(network.encoder.channels, SMALL)
+    decoder["decoder.0.conv.conv.bias"] = torch.zeros(20)  # fits by chance
+    decoder["decoder.2.conv.conv.bias"][0] = float("nan")
+    decoder["mask.weight"] = torch.zeros(1)
+    report = load_monodepth2(network, *write_published(tmp_path, classifier_weights(), decoder))
+    assert report.skipped["decoder.0.conv.conv.weight"] == "is (16, 512, 3, 3), expected (20, 512, 3, 3)"
+    assert report.skipped["decoder.2.conv.conv.bias"] == "has NaN or infinity"
+    assert report.skipped["mask.weight"] == "not a key of Monodepth2's decoder"
+    assert "levels.4.before.bias" in report.loaded
+    assert {"levels.4.before.weight", "levels.4.after.weight", "levels.3.before.bias"} < set(report.kept)
+    assert set(report.kept) | set(report.loaded) == set(network.state_dict())
+
+
+def test_nothing_that_fits_is_an_error(tmp_path: Path) -> None:
+    network = small()
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    decoder = published_decoder(network.encoder.channels, SMALL)
+    encoder, depth = write_published(tmp_path, classifier_weights(), decoder)
+    with pytest.raises(CheckpointError, match=r"nothing in .*encoder.pth fits .*not a key of Monodepth2's decoder"):
+        load_monodepth2(network, encoder, encoder)
+    torch.save({"decoder.10.conv.weight": decoder["decoder.10.conv.weight"]}, depth)
+    with pytest.raises(CheckpointError, match=r"nothing in .*depth.pth fits .*disparity is not metric"):
+        load_monodepth2(network, encoder, depth)
+    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
+    with pytest.raises(ValueError, match=r"strides 'v1.5', got a network with 'v1'"):
+        load_monodepth2(small(strides="v1"), encoder, depth)
+    with pytest.raises(FileNotFoundError):
+        load_monodepth2(network, tmp_path / "none.pth", depth)
+
+
+# --- ImageNet ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
+@pytest.mark.parametrize("half", [False, True])
+def test_imagenet_from_a_file(tmp_path: Path, suffix: str, half: bool) -> None:
+    """The encoder computes what torchvision's classifier does up to its pooling."""
+    import torchvision.models
+
+    weights = classifier_weights()
+    published = torchvision.models.resnet18(weights=None).eval()
+    if half:
+        weights = {k: v.half() if v.is_floating_point() else v for k, v in weights.items()}
+    published.load_state_dict(weights)
+    save_checkpoint(tmp_path / f"w{suffix}", weights)
+    network = MonodepthResNet.imagenet(tmp_path / f"w{suffix}", 18, decoder=SMALL, dropout=0.2).eval()
+    assert {p.dtype for p in network.parameters()} == {torch.float32}
+    assert network.levels[0].dropout.p == 0.2
+    image = torch.randn(1, 3, 64, 64, generator=seeded())
+    published.avgpool, published.fc = nn.Identity(), nn.Identity()
+    with torch.inference_mode():
+        torch.testing.assert_close(network.encoder(image)[-1].flatten(1), published(image))
+
+
+def test_imagenet_from_torchvision(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None and an enum go through torchvision's own download, replaced here."""
+    import torchvision.models
+
+    weights, asked = classifier_weights(), []
+
+    class Downloaded:
+        def get_state_dict(self, **options: Any) -> dict[str, Tensor]:
+            asked.append(options)
+            return weights
+
+    class Enum:
+        DEFAULT = Downloaded()
+
+    monkeypatch.setattr(torchvision.models, "get_model_weights", {"resnet18": Enum}.__getitem__)
+    for given in (None, Downloaded()):
+        network = MonodepthResNet.imagenet(given, 18, decoder=SMALL)
+        assert torch.equal(network.encoder.layer4[1].conv2.weight, weights["layer4.1.conv2.weight"])
+    assert asked == [{"progress": False, "check_hash": True}] * 2
+    with pytest.raises(ValueError, match="torchvision's weights have strides"):
+        MonodepthResNet.imagenet(None, 18, strides="v1", decoder=SMALL)
+
+
+def test_torchvision_has_those_weights() -> None:
+    """The real enum offers what the code above asks for; nothing is downloaded."""
+    import torchvision.models
+
+    default = torchvision.models.get_model_weights("resnet50").DEFAULT
+    assert default.url.startswith("https://")
+    assert callable(default.get_state_dict)
+
+
+def test_imagenet_counts_every_tensor(tmp_path: Path) -> None:
+    weights = classifier_weights()
+
+    def load(changed: Mapping[str, Tensor], layers: int = 18) -> MonodepthResNet:
+        torch.save(dict(changed), tmp_path / "w.pth")
+        return MonodepthResNet.imagenet(tmp_path / "w.pth", layers, decoder=SMALL)
+
+    load({k: v for k, v in weights.items() if not k.endswith("num_batches_tracked")})  # as old files are
+    for key, value in (("layer1.0.bn1.bias", None), ("extra", torch.zeros(1)), ("conv1.weight", torch.zeros(64, 3, 3))):
+        changed = {k: v for k, v in weights.items() if k != key} | ({} if value is None else {key: value})
+        with pytest.raises(CheckpointError, match=f"1 of its 120 tensors .* first '{key}'"):
+            load(changed)
+    with pytest.raises(CheckpointError, match=r"first 'layer3.0.conv1.weight'"):
+        load(weights | {"layer3.0.conv1.weight": weights["layer3.0.conv1.weight"] * float("nan")})
+    with pytest.raises(CheckpointError, match="does not fit the ResNet encoder"):
+        load(weights, 34)
+
+
+def test_a_variance_beyond_half_precision(tmp_path: Path) -> None:
+    """Stored as infinity it would silence its channel: it becomes 65504. Any other infinity is a fault."""
+    weights = classifier_weights()
+    weights["bn1.running_var"][3] = 1e5
+    half = {k: v.half() if v.is_floating_point() else v for k, v in weights.items()}
+    assert torch.isinf(half["bn1.running_var"][3])
+    torch.save(half, tmp_path / "w.pth")
+    network = MonodepthResNet.imagenet(tmp_path / "w.pth", 18, decoder=SMALL)
+    assert float(network.encoder.bn1.running_var[3]) == 65504
+    half["bn1.running_mean"][0] = float("inf")
+    torch.save(half, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"first 'bn1.running_mean'"):
+        MonodepthResNet.imagenet(tmp_path / "w.pth", 18, decoder=SMALL)
+    weights["bn1.running_var"][3] = float("inf")  # in single precision it is no overflow
+    torch.save(weights, tmp_path / "w.pth")
+    with pytest.raises(CheckpointError, match=r"first 'bn1.running_var'"):
+        MonodepthResNet.imagenet(tmp_path / "w.pth", 18, decoder=SMALL)
+
+
+def variance_misfit(strides: str, image: Tensor) -> float:
+    """Median |log(variance / running variance)| over all channels: how well batch norms know their input."""
+    network = MonodepthResNet.imagenet(require_shared(RESNET50), strides=strides).eval()
+    ratios: list[Tensor] = []
+
+    def measure(norm: nn.Module, inputs: tuple[Tensor]) -> None:
+        assert isinstance(norm, nn.BatchNorm2d)
+        assert norm.running_var is not None
+        ratios.append((inputs[0].var((0, 2, 3)) / norm.running_var).log().abs().median())
+
+    for module in network.encoder.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.register_forward_pre_hook(measure)
+    with torch.inference_mode():
+        network.encoder(image)
+    assert len(ratios) == 53
+    return float(torch.stack(ratios).mean())
+
+
+def test_shared_weights_have_v1_strides() -> None:
+    """Shapes cannot tell, statistics can: with the right strides and normalisation activations have the variances
+    that training saw. Observed .17 with v1, .32 with v1.5, .40 with v1 and images in [-1, 1]."""
+    folder = require_shared("data/rgbd_dataset_freiburg1_xyz/rgb")
+    files = sorted(folder.glob("*.png"))[::13]
+    files += sorted(require_shared("data/hololens_office/images").glob("*.png"))[::25]
+    network = small()
+    frames = [torch.from_numpy(np.array(Image.open(f))).permute(2, 0, 1)[None] for f in files]
+    image = torch.cat([network.preprocess.apply_image(frame) for frame in frames])
+    right, wrong = variance_misfit("v1", image), variance_misfit("v1.5", image)
+    unnormalised = image * torch.tensor(IMAGENET_STD)[:, None, None] + torch.tensor(IMAGENET_MEAN)[:, None, None]
+    assert right < 0.25
+    assert wrong > 1.3 * right
+    assert variance_misfit("v1", 2 * unnormalised - 1) > 1.5 * right
+
+
+def test_v1_strides_move_to_the_first_convolution() -> None:
+    for strides, expected in (("v1.5", ((1, 1), (2, 2))), ("v1", ((2, 2), (1, 1)))):
+        encoder = MonodepthResNet(50, strides=strides, decoder=SMALL).encoder
+        for stage in (encoder.layer2, encoder.layer3, encoder.layer4):
+            assert (stage[0].conv1.stride, stage[0].conv2.stride) == expected
+        assert encoder.layer1[0].conv1.stride == encoder.layer1[0].conv2.stride == (1, 1)
+        maps = encoder.eval()(torch.zeros(1, 3, 64, 64))
+        assert [m.shape[-1] for m in maps] == [32, 16, 8, 4, 2]
+    v1, v15 = small(strides="v1"), small()
+    image = torch.randn(1, 3, 64, 64, generator=seeded())
+    with torch.inference_mode():  # no bottlenecks, no difference
+        assert torch.equal(v1(image).depth, v15(image).depth)
+
+
+# --- in company --------------------------------------------------------------------------------------
+
+
+def test_load_network(tmp_path: Path) -> None:
+    for layers in (18, 34):
+        network = MonodepthResNet(layers, decoder=SMALL).eval()
+        save_checkpoint(tmp_path / "w.pth", network)
+        loaded = load_network("monodepth2", tmp_path / "w.pth", size=(64, 96), dropout=0.1)
+        assert isinstance(loaded, MonodepthResNet)
+        assert (loaded.layers, loaded.preprocess.size) == (layers, (64, 96))
+        image = torch.randn(1, 3, 64, 96, generator=seeded())
+        with torch.inference_mode():
+            assert torch.equal(loaded(image).depth, network(image).depth)
+    torch.save({"a": torch.zeros(1)}, tmp_path / "w.pth")
+    with pytest.raises(ValueError, match=r"w.pth: not the weights of a MonodepthResNet: no .* \(6 such"):
+        load_network("monodepth2", tmp_path / "w.pth")
+    with pytest.raises(ValueError, match="ends in a ReLU"):
+        load_network("fastdepth", tmp_path / "w.onnx", positive="softplus")
+
+
+@pytest.mark.parametrize("method", ["depth", "aleatoric", "evidential"])
+def test_every_weight_is_trained(method: str) -> None:
+    network = with_head(small(dropout=0.2), method).train()
+    prediction = network(torch.randn(2, 3, 64, 64, generator=seeded()))
+    loss = prediction.depth.sum() + sum(v.sum() for v in [prediction.variance] if v is not None)
+    loss.backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
+
+
+def test_batch_ensemble_converts_all_of_it() -> None:
+    network = small()
+    count = sum(isinstance(m, nn.Conv2d) for m in network.modules())
+    assert count == 20 + 11
+    assert len(converted_layers(convert(network, 2))) == count
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"layers": 20}, r"layers must be one of \(18, 34, 50\), got 20"),
+        ({"strides": "v2"}, "strides must be one of"),
+        ({"decoder": (1, 2)}, "decoder must be 5 positive"),
+        ({"decoder": (1, 2, 3, 4, 0)}, "decoder must be 5 positive"),
+        ({"size": (224, 230)}, "size must be multiples of 32 px"),
+        ({"size": (32, 64)}, "at least 64"),
+        ({"dropout": 1.0}, "dropout must be a probability"),
+    ],
+)
+def test_arguments_are_checked(options: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        MonodepthResNet(**{"layers": 18, **options})
+
+
+def test_image_is_checked() -> None:
+    network = small()
+    with pytest.raises(ValueError, match="multiples of 32 px, at least 64, got 32 x 64"):
+        network(torch.zeros(1, 3, 32, 64))
+    for image in (torch.zeros(1, 1, 64, 64), torch.zeros(1, 3, 64, 64, dtype=torch.uint8)):
+        with pytest.raises(ValueError, match=r"image must be floating-point \[B, 3, H, W\]"):
+            network(image)
