@@ -6,8 +6,8 @@ is metric only together with these two numbers, which come from measured depth h
 height above the ground (``camera_height``).
 
 UfM* compares views, so one alignment has to hold for all of them: fit it on the first frames
-(``pooled=True``) and keep it. An alignment per frame moves every frame's points by its own error, which is
-then seen as disagreement, or hides the network's own.
+(``pooled=True``) and keep it. An alignment per frame moves every frame's points by its own error, which
+counts as disagreement, and removes the frame-to-frame error of scale that is the network's own.
 """
 
 from __future__ import annotations

@@ -83,7 +83,8 @@ def robust_fit(
         valid: [B, P] points to use; every row needs at least p.
         weight: [B, P] inverse variances up to a common factor, positive where valid.
         tolerance: [B, P] largest residual of an inlier; None: three standard deviations, estimated from the
-            median, which needs more than half of the points to follow the model.
+            median, which needs more than half of the points to follow the model. With a tolerance, the points
+            within it are the majority, and what stands out among them is left out as well.
         admissible: whether theta [..., p] is possible at all, [...] bool.
         seed: of the samples.
     """
@@ -95,12 +96,12 @@ def robust_fit(
     bound = None if tolerance is None else tolerance.gather(1, pick)
     theta = _best_hypothesis(judge_design, *judges, count, bound, admissible, seed)
     inlier, determined = valid, valid.new_zeros(len(valid))
+    # Residuals in units of their expected size (up to a factor), or of the tolerance.
+    unit = root if tolerance is None else 1 / tolerance.clamp_min(torch.finfo(tolerance.dtype).tiny)
     for _ in range(_REFITS):
-        previous, residual = inlier, (target - (design @ theta[..., None])[..., 0]).abs()
-        if tolerance is None:
-            inlier = valid & (residual * root <= _cut(residual * root, target * root, valid, design.shape[-1]))
-        else:
-            inlier = valid & (residual <= tolerance)
+        previous, residual = inlier, (target - (design @ theta[..., None])[..., 0]).abs() * unit
+        near = valid if tolerance is None else valid & (residual <= 1)
+        inlier = near & (residual <= _cut(residual, target * unit, near, design.shape[-1]))
         refit, determined = least_squares(design, target, weight * inlier)
         theta = torch.where(determined[:, None], refit, theta)
         if torch.equal(inlier, previous):
@@ -109,7 +110,7 @@ def robust_fit(
 
 
 def masked_median(value: Tensor, valid: Tensor) -> Tensor:
-    """The lower median of the valid entries along the last dimension; infinite where there are none."""
+    """[...] the lower median of the valid entries along the last dimension; infinite where there are none."""
     return torch.where(valid, value, torch.nan).nanmedian(-1).values.nan_to_num(torch.inf)
 
 

@@ -1,0 +1,523 @@
+"""Alignment of relative depth: known scale and shift come back, outliers do not count, what cannot be told is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scenes import look, render
+from ufmstar_torch import UfMStar, UncertainDepth
+from ufmstar_torch.models import (
+    AlignedNetwork,
+    Alignment,
+    align_to_camera_height,
+    fit_affine_depth,
+    fit_inverse_depth,
+)
+from ufmstar_torch.models.robust_fit import least_squares, masked_median, robust_fit
+
+SIZE = (24, 32)
+FITS = {"inverse": fit_inverse_depth, "affine": fit_affine_depth}
+
+
+def random_depth(batch=2, size=SIZE, seed=0, low=0.5, high=8.0):
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(batch, *size, generator=generator, dtype=torch.float64)
+
+
+def relative(depth, kind, scale, shift):
+    """What a network would say whose alignment is (scale, shift)."""
+    value = depth if kind == "affine" else 1 / depth
+    scale, shift = (torch.as_tensor(v, dtype=torch.float64).reshape(-1, 1, 1) for v in (scale, shift))
+    return (value - shift) / scale
+
+
+def sparse(size, share, seed=1):
+    return torch.rand(*size, generator=torch.Generator().manual_seed(seed)) < share
+
+
+# ---- scale and shift from measurements ----
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("kind", ["inverse", "affine"])
+def test_exact_measurements_give_back_each_image_s_scale_and_shift(kind, robust):
+    depth = random_depth(3)
+    scale, shift = [0.02, 0.5, 3.0], [-0.3, 0.0, 0.4]
+    prediction = relative(depth, kind, scale, shift)
+    fit = FITS[kind](prediction, depth, sparse(depth.shape, 0.05), shift=None, robust=robust)
+    assert fit.alignment.scale.tolist() == pytest.approx(scale, rel=1e-10)
+    assert fit.alignment.shift.tolist() == pytest.approx(shift, abs=1e-10)
+    torch.testing.assert_close(fit.alignment.depth(prediction), depth, rtol=1e-9, atol=0)
+    assert (fit.inliers == fit.points).all()
+    assert (fit.points == sparse(depth.shape, 0.05).sum((1, 2))).all()
+    assert (fit.residual < 1e-10).all()
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    kind=st.sampled_from(["inverse", "affine"]),
+    scale=st.floats(1e-3, 1e3),
+    shift=st.floats(-1, 1),
+    share=st.floats(0, 0.3),
+    seed=st.integers(0, 10_000),
+)
+def test_up_to_thirty_percent_of_outliers_change_nothing(kind, scale, shift, share, seed):
+    depth = random_depth(1, seed=seed)
+    prediction = relative(depth, kind, scale, shift)
+    wrong = sparse(depth.shape, share, seed + 1)
+    measured = torch.where(wrong, random_depth(1, seed=seed + 2, low=0.1, high=30.0), depth)
+    fit = FITS[kind](prediction, measured, shift=None)
+    assert float(fit.alignment.scale) == pytest.approx(scale, rel=1e-6)
+    assert float(fit.alignment.shift) == pytest.approx(shift, abs=1e-6)
+    assert int(fit.inliers) >= int((~wrong).sum())
+
+
+def test_one_sided_outliers_at_long_range_break_least_squares_but_not_the_robust_fit():
+    """Measurements of what lies behind glass: 30 % of the points, all too far, all at one place."""
+    depth = random_depth(1)
+    prediction = relative(depth, "inverse", 0.1, 0.05)
+    measured = depth.clone()
+    measured[:, :, : int(0.3 * SIZE[1])] *= 4
+    assert float(fit_inverse_depth(prediction, measured).alignment.scale) == pytest.approx(0.1, rel=1e-9)
+    plain = float(fit_inverse_depth(prediction, measured, robust=False).alignment.scale)
+    assert abs(plain / 0.1 - 1) > 0.1
+
+
+@pytest.mark.parametrize("kind", ["inverse", "affine"])
+def test_plain_least_squares_is_numpy_s_weighted(kind):
+    depth, prediction = random_depth(2), random_depth(2, seed=5)
+    prediction = prediction + depth if kind == "affine" else prediction + 5 / depth
+    weights = random_depth(2, seed=7)
+    fit = FITS[kind](prediction, depth, weights=weights, shift=None, robust=False)
+    for image in range(2):
+        x, y = prediction[image].flatten().numpy(), depth[image].flatten().numpy()
+        y = y if kind == "affine" else 1 / y
+        root = np.sqrt(weights[image].flatten().numpy())
+        design = np.stack([x, np.ones_like(x)], 1) * root[:, None]
+        a, b = np.linalg.lstsq(design, y * root, rcond=None)[0]
+        assert float(fit.alignment.scale[image]) == pytest.approx(a, rel=1e-10)
+        assert float(fit.alignment.shift[image]) == pytest.approx(b, rel=1e-10)
+        assert float(fit.residual[image]) == pytest.approx(np.sqrt(np.mean((y - a * x - b) ** 2)), rel=1e-10)
+
+
+def test_noise_averages_out_nearly_as_well_as_in_least_squares():
+    """Over 200 fits, the robust slope's spread is within 15 % of the optimum's."""
+    generator = torch.Generator().manual_seed(2)
+    inverse = 0.1 + torch.rand(200, 10, 30, generator=generator, dtype=torch.float64)
+    noise = 0.01 * torch.randn(200, 10, 30, generator=generator, dtype=torch.float64)
+    depth = 1 / (0.2 * inverse + 0.3 + noise)
+    robust = fit_inverse_depth(inverse, depth).alignment.scale
+    plain = fit_inverse_depth(inverse, depth, robust=False).alignment.scale
+    assert abs(float(robust.mean()) - 0.2) < 5 * float(robust.std()) / math.sqrt(200)
+    assert float(robust.std()) < 1.15 * float(plain.std())
+
+
+def test_a_known_shift_leaves_the_scale_alone():
+    depth = random_depth(1)
+    prediction = relative(depth, "inverse", 0.1, 0.05)
+    fit = fit_inverse_depth(prediction, depth, shift=0.05)
+    assert float(fit.alignment.scale) == pytest.approx(0.1, rel=1e-12)
+    assert float(fit.alignment.shift) == 0.05
+    affine = fit_affine_depth(relative(depth, "affine", 2.5, 0), depth)
+    assert float(affine.alignment.scale) == pytest.approx(2.5, rel=1e-12)
+    assert float(affine.alignment.shift) == 0
+
+
+def test_weights_decide_between_two_truths_and_zero_means_unused():
+    depth = random_depth(1)
+    prediction = relative(depth, "inverse", 0.1, 0.05)
+    other = sparse(depth.shape, 0.45)
+    measured = torch.where(other, 1 / (0.7 * prediction + 0.6), depth)
+    fit = fit_inverse_depth(prediction, measured, weights=(~other).double(), robust=False)
+    assert float(fit.alignment.scale) == pytest.approx(0.1, rel=1e-12)
+    assert int(fit.points) == int((~other).sum())
+
+
+def test_a_batch_gives_what_each_image_gives():
+    depth = random_depth(3)
+    prediction = relative(depth, "inverse", [0.1, 0.2, 0.3], [0.1, 0.0, -0.02])
+    noisy = depth * (1 + 0.05 * (random_depth(3, seed=9) - 4))
+    valid = torch.stack([sparse(SIZE, share) for share in (0.05, 0.3, 1.0)])
+    together = fit_inverse_depth(prediction, noisy, valid)
+    for image in range(3):
+        one = fit_inverse_depth(*(value[image : image + 1] for value in (prediction, noisy, valid)))
+        torch.testing.assert_close(together.alignment.scale[image : image + 1], one.alignment.scale, rtol=1e-12, atol=0)
+        assert together.inliers[image] == one.inliers[0]
+
+
+def test_pooled_images_get_one_alignment_and_so_do_sums_over_a_stream():
+    depth = random_depth(3)
+    prediction = relative(depth, "inverse", 0.1, 0.05) + 0.01 * random_depth(3, seed=8)
+    pooled = fit_inverse_depth(prediction, depth, pooled=True, robust=False, max_depth=9.0)
+    assert pooled.alignment.scale.shape == pooled.points.shape == ()
+    total = None
+    for image in range(3):
+        one = fit_inverse_depth(prediction[image : image + 1], depth[image : image + 1], pooled=True, robust=False)
+        total = one.sums if total is None else total + one.sums
+    streamed = total.alignment(max_depth=9.0)
+    torch.testing.assert_close(streamed.scale, pooled.alignment.scale, rtol=1e-10, atol=0)
+    torch.testing.assert_close(streamed.shift, pooled.alignment.shift, rtol=1e-10, atol=0)
+    assert streamed.max_depth == pooled.alignment.max_depth == 9.0
+    known = fit_inverse_depth(prediction, depth, pooled=True, robust=False, shift=0.05)
+    torch.testing.assert_close(total.alignment(shift=0.05).scale, known.alignment.scale, rtol=1e-10, atol=0)
+    with pytest.raises(ValueError, match="cannot add"):
+        _ = total + fit_affine_depth(depth, depth, pooled=True).sums
+
+
+def test_unusable_measurements_are_left_out():
+    depth = random_depth(1)
+    prediction = relative(depth, "inverse", 0.1, 0.05)
+    for place, value in enumerate((0.0, -1.0, math.nan, math.inf)):
+        depth[0, 0, place] = value
+    prediction[0, 1, :2] = torch.tensor([math.nan, math.inf], dtype=torch.float64)
+    before = depth.clone(), prediction.clone()
+    fit = fit_inverse_depth(prediction, depth)
+    assert int(fit.points) == depth.numel() - 6
+    assert float(fit.alignment.scale) == pytest.approx(0.1, rel=1e-10)
+    assert torch.equal(depth, before[0].nan_to_num(math.nan)) or torch.allclose(depth, before[0], equal_nan=True)
+    assert torch.allclose(prediction, before[1], equal_nan=True)
+
+
+def test_single_precision_predictions_are_fitted_in_double():
+    depth = random_depth(1)
+    prediction = relative(depth, "inverse", 0.001, 0.05).float()
+    fit = fit_inverse_depth(prediction, depth.float())
+    assert fit.alignment.scale.dtype == torch.float64
+    assert float(fit.alignment.scale) == pytest.approx(0.001, rel=1e-5)
+    assert fit.alignment.depth(prediction).dtype == torch.float32
+
+
+def test_what_cannot_be_told_is_refused_and_the_image_named():
+    depth = random_depth(2)
+    prediction = relative(depth, "inverse", 0.1, 0.05)
+    few = torch.ones(2, *SIZE, dtype=torch.bool)
+    few[1] = sparse(SIZE, 1.0) & (torch.arange(SIZE[0] * SIZE[1]).view(SIZE) < 9)
+    with pytest.raises(ValueError, match="image 1 needs at least 10 measurements with a prediction, has 9"):
+        fit_inverse_depth(prediction, depth, few)
+    assert int(fit_inverse_depth(prediction, depth, few, min_points=9).points[1]) == 9
+    flat = prediction.clone()
+    flat[1] = 3.0
+    for robust in (True, False):
+        with pytest.raises(ValueError, match="image 1 has predictions that hardly differ"):
+            fit_inverse_depth(flat, depth, robust=robust)
+    assert fit_inverse_depth(flat, torch.full_like(depth, 2.0), shift=0.0).alignment.scale[1] == pytest.approx(1 / 6)
+    with pytest.raises(ValueError, match="image 0 does not grow with nearness, as kind 'inverse'"):
+        fit_inverse_depth(depth, depth)
+    with pytest.raises(ValueError, match="image 0 does not grow with distance, as kind 'affine'"):
+        fit_affine_depth(1 / depth, depth, shift=None)
+
+
+def test_wrong_arguments_are_named():
+    depth = random_depth(2)
+    for arguments, message in (
+        ((depth[0], depth), r"prediction must be floating-point \[B, H, W\]"),
+        ((depth, depth[:1]), r"depth must be \(2, 24, 32\)"),
+        ((depth, depth, depth), "valid must be bool"),
+        ((depth, depth.long()), "depth must be floating-point"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fit_inverse_depth(*arguments)
+    with pytest.raises(ValueError, match="weights must be finite and not negative"):
+        fit_inverse_depth(depth, depth, weights=-depth)
+    with pytest.raises(ValueError, match="min_points must be at least 2"):
+        fit_inverse_depth(depth, depth, min_points=1)
+
+
+# ---- the alignment ----
+
+
+def test_pixels_without_positive_depth_are_invalid_and_can_be_counted():
+    alignment = Alignment("inverse", 0.5, -0.5, max_depth=10.0)
+    prediction = torch.tensor([[[0.0, 1.0, 1.1, 1.4, 3.0, math.nan, math.inf]]])
+    torch.testing.assert_close(alignment.depth(prediction), torch.tensor([[[0, 0, 0, 5.0, 1.0, 0, 0]]]))
+    assert (~alignment.valid(prediction)).sum((1, 2)).tolist() == [5]
+    unlimited = Alignment("inverse", 0.5, -0.5).depth(prediction)
+    assert float(unlimited[0, 0, 2]) == pytest.approx(20.0, rel=1e-5)
+    affine = Alignment("affine", 2.0, -1.0).depth(torch.tensor([[[0.2, 0.5, 1.0, math.inf]]]))
+    assert affine.tolist() == [[[0, 0, 1.0, 0]]]
+
+
+def test_invalid_pixels_are_no_prediction_for_ufm_and_give_finite_gradients():
+    prediction = random_depth(1).float()
+    prediction[0, :5] = 0.0
+    alignment = Alignment("inverse", 0.3, -0.1)
+    leaf = prediction.clone().requires_grad_()
+    depth = alignment.depth(leaf)
+    depth.sum().backward()
+    assert leaf.grad.isfinite().all()
+    pose, K = torch.eye(4, dtype=torch.float64), torch.tensor([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]]).double()
+    out = UfMStar()(depth.detach(), pose[None], K[None])
+    assert out.variance[0, :5].isnan().all() or (out.variance[0, :5] == 0).all()
+    assert out.variance[0, 5:].isfinite().all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(scale=st.floats(1e-3, 10), shift=st.floats(-0.5, 0.5), seed=st.integers(0, 100))
+def test_depth_falls_with_the_prediction_and_inverts_it(scale, shift, seed):
+    prediction = random_depth(1, seed=seed).flatten().sort().values.view(1, *SIZE)
+    alignment = Alignment("inverse", scale, shift)
+    depth, valid = alignment.depth(prediction), alignment.valid(prediction)
+    torch.testing.assert_close(1 / depth[valid], scale * prediction[valid] + shift, rtol=1e-9, atol=0)
+    assert (depth[valid].diff() <= 0).all()
+    assert torch.equal(valid, scale * prediction + shift > 0)
+
+
+def test_an_alignment_for_each_stream_of_a_batch():
+    alignment = Alignment("affine", torch.tensor([1.0, 3.0]), torch.tensor([0.0, 1.0]))
+    depth = alignment.depth(torch.full((2, 1, 1), 2.0))
+    assert depth.flatten().tolist() == [2.0, 7.0]
+    assert depth.dtype == torch.float32
+    with pytest.raises(ValueError, match="prediction must have the alignment's 2 images, got 3"):
+        alignment.depth(torch.ones(3, 1, 1))
+
+
+def test_alignments_go_through_json_exactly_and_check_their_values():
+    for alignment in (
+        Alignment("inverse", 0.1, 1 / 3, max_depth=20.0),
+        Alignment("affine", torch.tensor([0.1, 1 / 7]), torch.tensor([0.0, 0.0])),
+    ):
+        again = Alignment.from_dict(json.loads(json.dumps(alignment.to_dict())))
+        assert torch.equal(again.scale, alignment.scale)
+        assert torch.equal(again.shift, alignment.shift)
+        assert (again.kind, again.max_depth) == (alignment.kind, alignment.max_depth)
+    for values, message in (
+        (("metric", 1.0, 0.0), "kind must be one of"),
+        (("inverse", 0.0, 0.0), "scale must be positive"),
+        (("inverse", math.nan, 0.0), "scale must be finite"),
+        (("inverse", 1.0, math.inf), "shift must be finite"),
+        (("inverse", torch.ones(2), 0.0), "both be numbers or both"),
+        (("inverse", 1.0, 0.0, -1.0), "max_depth must be positive"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Alignment(*values)
+    with pytest.raises(ValueError, match="has no \\['offset'\\]"):
+        Alignment.from_dict({"kind": "inverse", "scale": 1, "shift": 0, "offset": 1})
+    with pytest.raises(ValueError, match="needs \\['shift'\\]"):
+        Alignment.from_dict({"kind": "inverse", "scale": 1})
+
+
+# ---- in front of UfM* ----
+
+
+class Nearness(torch.nn.Module):
+    """A relative "network": inverse depth up to scale and shift from brightness, which is depth / 10 m."""
+
+    def forward(self, image):
+        return (0.4 / (10 * image.mean(1, keepdim=True))).to(self.dtype) - 0.1
+
+    dtype = torch.float32
+
+
+def room(frames):
+    """Images whose brightness is depth, with depth, poses and K."""
+    K = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], dtype=torch.float64)
+    poses = [look((-0.5 + 0.1 * i, -0.2, -0.9), 0.035 * i, 0.05) for i in range(frames)]
+    depth = torch.stack([torch.from_numpy(render(T, K.numpy(), 48, 64)) for T in poses])
+    return (depth / 10)[:, None].expand(-1, 3, -1, -1).float(), depth, torch.from_numpy(np.stack(poses)), K
+
+
+def test_an_aligned_network_is_a_depth_network_for_ufm():
+    images, depth, poses, K = room(4)
+    relative_maps = Nearness()(images)[:, 0]
+    fit = fit_inverse_depth(relative_maps[:2], depth[:2].float(), sparse((2, 48, 64), 0.05), pooled=True)
+    network = AlignedNetwork(Nearness(), fit.alignment)
+    torch.testing.assert_close(network(images).depth.double(), depth, rtol=1e-4, atol=0)
+    pipeline, reference = UncertainDepth(network), UfMStar()
+    for image, pose, exact in zip(images, poses, depth, strict=True):
+        out = pipeline(image[None], pose[None], K[None])
+        expected = reference(exact[None].float(), pose[None], K[None])
+    torch.testing.assert_close(out.disagreement, expected.disagreement, rtol=0.05, atol=1e-5, equal_nan=True)
+
+
+def test_an_alignment_per_frame_is_seen_as_disagreement():
+    """Why the alignment has to stay: 2 % of scale, changing from frame to frame, before a curved wall 2 m away."""
+    v, u = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    depth, pose, K = (2 + 0.3 * torch.sin(v / 5) * torch.sin(u / 6))[None], torch.eye(4).double(), room(1)[3]
+    fixed, changing = UfMStar(), UfMStar()
+    for i in range(6):
+        still = fixed(depth, pose, K)
+        moved = changing(depth * (1.02 if i % 2 else 0.98), pose, K)
+    assert float(still.disagreement.nanmean()) < 1e-12
+    assert float(moved.disagreement.nanmean()) > 0.04**2  # a standard deviation of 4 cm; .11 m were observed
+
+
+def test_half_precision_outputs_are_aligned_in_single():
+    network = Nearness()
+    network.dtype = torch.float16
+    depth = AlignedNetwork(network, Alignment("inverse", 2.5, 0.25))(room(1)[0]).depth
+    assert depth.dtype == torch.float32
+    torch.testing.assert_close(depth.double(), room(1)[1], rtol=0.01, atol=0)
+
+
+def test_an_aligned_network_refuses_other_outputs():
+    class Wrong(torch.nn.Module):
+        def forward(self, image):
+            return image[:, :1, ::2]
+
+    with pytest.raises(ValueError, match="network must return"):
+        AlignedNetwork(Wrong(), Alignment("inverse", 1.0, 0.0))(torch.rand(1, 3, 8, 8))
+
+
+# ---- the camera's height ----
+
+K_GROUND = torch.tensor([[70.0, 0, 39.5], [0, 70, 29.5], [0, 0, 1]], dtype=torch.float64)
+
+
+def ground(pitch, roll, height, size=(60, 80), wall=6.0, clutter=True):
+    """Inverse depth [1, H, W] of a flat ground with a wall and a box on it, and the ground's normal (down)."""
+    down = torch.tensor(
+        [math.sin(roll), math.cos(roll) * math.cos(pitch), math.cos(roll) * math.sin(pitch)], dtype=torch.float64
+    )
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size), indexing="ij")
+    rays = torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(K_GROUND).T
+    inverse = (rays @ down / height).clamp_min(1 / wall)
+    if clutter:
+        inverse[35:55, 5:30] = inverse[35:55, 5:30].clamp_min(0.9 / height)
+    return inverse[None], down
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.3])
+@pytest.mark.parametrize("roll", [-0.15, 0.1])
+def test_height_gives_the_scale_and_finds_the_ground(pitch, roll):
+    inverse, down = ground(pitch, roll, 0.8)
+    fit = align_to_camera_height(inverse / 0.37, K_GROUND, 0.8)
+    assert float(fit.alignment.scale) == pytest.approx(0.37, rel=1e-9)
+    assert float(fit.alignment.shift) == 0
+    torch.testing.assert_close(fit.down_cam[0], down, rtol=0, atol=1e-9)
+    assert fit.ground.any()
+    assert not fit.ground[0, 36:44, 6:29].any()  # the box
+
+
+def test_height_with_a_known_value_at_infinity():
+    inverse, _ = ground(0.2, 0.0, 1.5)
+    fit = align_to_camera_height(inverse / 0.37 + 4.0, K_GROUND, 1.5, at_infinity=4.0)
+    torch.testing.assert_close(fit.alignment.depth(inverse / 0.37 + 4.0), 1 / inverse, rtol=1e-9, atol=0)
+
+
+def test_height_and_exact_direction_give_scale_and_shift():
+    inverse, down = ground(0.2, 0.1, 0.8)
+    prediction = inverse / 0.37 + 4.0
+    fit = align_to_camera_height(prediction, K_GROUND, 0.8, at_infinity=None, up_cam=-2 * down)
+    assert float(fit.alignment.scale) == pytest.approx(0.37, rel=1e-9)
+    assert float(fit.alignment.shift) == pytest.approx(-4.0 * 0.37, rel=1e-9)
+    with pytest.raises(ValueError, match="one height gives one number"):
+        align_to_camera_height(prediction, K_GROUND, 0.8, at_infinity=None)
+
+
+def test_an_unknown_shift_looks_like_a_tilt():
+    """Why the shift must be known: the wrong one fits the ground as well, with another scale and normal."""
+    inverse, down = ground(0.2, 0.0, 0.8, clutter=False)
+    wrong = align_to_camera_height(inverse / 0.37 + 0.3, K_GROUND, 0.8)
+    assert wrong.ground.sum() > 500
+    assert abs(float(wrong.alignment.scale) / 0.37 - 1) > 0.02
+    assert float((wrong.down_cam[0] * down).sum()) < 0.999
+
+
+def test_height_for_depth_up_to_scale():
+    inverse, _ = ground(0.2, 0.0, 0.8)
+    fit = align_to_camera_height(1 / inverse / 2.5, K_GROUND, 0.8, kind="affine")
+    assert fit.alignment.kind == "affine"
+    assert float(fit.alignment.scale) == pytest.approx(2.5, rel=1e-9)
+    with pytest.raises(ValueError, match="at_infinity must be 0 for kind 'affine'"):
+        align_to_camera_height(inverse, K_GROUND, 0.8, kind="affine", at_infinity=1.0)
+
+
+def test_height_with_noise_and_in_a_batch():
+    generator = torch.Generator().manual_seed(0)
+    scenes = [ground(pitch, 0.05, 0.8)[0] for pitch in (0.1, 0.2, 0.3)]
+    inverse = torch.cat(scenes)
+    noisy = inverse * (1 + 0.01 * torch.randn(inverse.shape, generator=generator, dtype=torch.float64)) / 0.37
+    together = align_to_camera_height(noisy.float(), K_GROUND.expand(3, 3, 3), 0.8)
+    torch.testing.assert_close(together.alignment.scale, torch.full((3,), 0.37).double(), rtol=0.01, atol=0)
+    one = align_to_camera_height(noisy[1:2].float(), K_GROUND, 0.8)
+    torch.testing.assert_close(one.alignment.scale, together.alignment.scale[1:2], rtol=1e-12, atol=0)
+    pooled = align_to_camera_height(noisy.float(), K_GROUND, 0.8, pooled=True).alignment
+    assert pooled.scale == together.alignment.scale.median()
+
+
+def test_the_floor_of_a_rendered_room_tells_the_camera_s_height():
+    """The room's floor lies 1.2 m below the world's origin (y down); the camera looks around at several heights."""
+    K = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], dtype=torch.float64)
+    for y in (-0.2, 0.3):
+        T = look((-0.5, y, -0.9), 0.2, 0.35)
+        depth = torch.from_numpy(render(T, K.numpy(), 48, 64, boxes=()))[None]
+        points = (depth[0, 47, 32] * torch.linalg.inv(K) @ torch.tensor([32.0, 47, 1]).double()).numpy()
+        floor = float((T[:3, :3] @ points)[1])  # the lowest pixel sees the floor
+        up_cam = torch.from_numpy(T[:3, :3].T @ np.array([0.0, -1, 0]))
+        fit = align_to_camera_height(3.0 / depth, K, floor, up_cam=up_cam)
+        torch.testing.assert_close(fit.alignment.depth(3.0 / depth), depth, rtol=1e-6, atol=0)
+
+
+def test_no_ground_is_refused():
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.2 + torch.rand(1, 60, 80, generator=generator, dtype=torch.float64)
+    with pytest.raises(ValueError, match="image 0 shows no ground plane on 30%"):
+        align_to_camera_height(noise, K_GROUND, 0.8)
+    inverse, down = ground(0.2, 0.0, 0.8)
+    with pytest.raises(ValueError, match="image 0 needs at least 10 pixels that look at the ground"):
+        align_to_camera_height(inverse, K_GROUND, 0.8, valid=torch.zeros(1, 60, 80, dtype=torch.bool))
+    with pytest.raises(ValueError, match="image 0 shows no plane within max_tilt_deg"):
+        align_to_camera_height(inverse, K_GROUND, 0.8, up_cam=down)  # down for up
+    with pytest.raises(ValueError, match="does not grow downwards"):
+        align_to_camera_height(-inverse, K_GROUND, 0.8, at_infinity=None, up_cam=-down)
+    wall = torch.full_like(inverse, 0.5)
+    with pytest.raises(ValueError, match="image 0 shows no "):
+        align_to_camera_height(wall, K_GROUND, 0.8)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"height_m": 0.0}, "height_m must be positive"),
+        ({"kind": "metric"}, "kind must be one of"),
+        ({"max_tilt_deg": 95.0}, "max_tilt_deg must be between 0 and 90"),
+        ({"tolerance": 0.0}, "tolerance must be"),
+        ({"up_cam": torch.zeros(3)}, "up_cam must be a direction"),
+        ({"up_cam": torch.zeros(2, 3)}, r"up_cam must be \[3\] or \[1, 3\]"),
+        ({"intrinsics": torch.eye(4)}, r"intrinsics must be \[3, 3\]"),
+        ({"valid": torch.ones(1, 60, 80)}, "valid must be bool"),
+        ({"prediction": torch.ones(60, 80)}, "prediction must be floating-point"),
+    ],
+)
+def test_wrong_arguments_of_the_height_are_named(change, message):
+    values = {"prediction": ground(0.2, 0, 0.8)[0], "intrinsics": K_GROUND, "height_m": 0.8} | change
+    prediction, intrinsics, height_m = (values.pop(name) for name in ("prediction", "intrinsics", "height_m"))
+    with pytest.raises(ValueError, match=message):
+        align_to_camera_height(prediction, intrinsics, height_m, **values)
+
+
+# ---- the robust regression ----
+
+
+def test_least_squares_says_what_it_cannot_determine():
+    design = torch.ones(2, 5, 2, dtype=torch.float64)
+    design[0, :, 0] = torch.arange(5)
+    theta, determined = least_squares(design, design @ torch.tensor([2.0, -1.0]).double(), torch.ones(2, 5).double())
+    assert determined.tolist() == [True, False]
+    torch.testing.assert_close(theta[0], torch.tensor([2.0, -1.0]).double())
+    assert theta[1].isnan().all()
+
+
+def test_masked_median_is_numpy_s_lower_one():
+    value = torch.tensor([[3.0, 1.0, 2.0, 9.0], [5.0, 4.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
+    valid = torch.tensor([[True, True, True, False], [True, True, False, False], [False] * 4])
+    assert masked_median(value, valid).tolist() == [2.0, 4.0, math.inf]
+
+
+def test_a_tolerance_lets_a_minority_win():
+    """60 % outliers spread over everything: the median follows them, the count of near points does not."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(1, 1000, generator=generator, dtype=torch.float64)
+    y = 2 * x + 1
+    y[:, :600] = 10 * torch.rand(1, 600, generator=generator, dtype=torch.float64)
+    design, ones = torch.stack([x, torch.ones_like(x)], -1), torch.ones_like(x)
+    fit = robust_fit(design, y, ones.bool(), ones, tolerance=0.01 * ones)
+    torch.testing.assert_close(fit.theta, torch.tensor([[2.0, 1.0]]).double(), rtol=0, atol=2e-3)
+    assert 400 <= int(fit.inlier.sum()) < 410
