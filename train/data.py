@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from pathlib import Path
 
-import numpy as np
-import torch
 from lightning.pytorch import LightningDataModule
 
-from ufmstar_torch.eval import synthetic
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.train.augment import Augmentation, AugmentationConfig
+from ufmstar_torch.train.augment import Augmentation
 from ufmstar_torch.train.batches import EpochBatches, EpochLoader
-from ufmstar_torch.train.samples import FrameSource, RawSample, SampleDataset
-
-
-@dataclass(frozen=True)
-class DataConfig:
-    """Where samples come from and how they are served."""
-
-    kind: str = "tour"
-    paths: tuple[str, ...] = ()
-    batch_size: int = 8
-    workers: int = 0
-    seed: int = 0
-    augmentation: AugmentationConfig | None = field(default_factory=AugmentationConfig)
-    on_bad_file: str = "raise"
+from ufmstar_torch.train.data_config import DataConfig as DataConfig
+from ufmstar_torch.train.nyu import NyuFrames
+from ufmstar_torch.train.parts import Part
+from ufmstar_torch.train.samples import FrameSource, SampleDataset
+from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
+from ufmstar_torch.train.tour_data import TourSettings, tour_frames
 
 
 class DepthDataModule(LightningDataModule):
-    """Train and validation loaders of samples at a network's size."""
+    """Train and validation loaders of samples at a network's size.
+
+    The trainer must not replace the order: ``Trainer(use_distributed_sampler=False)``.
+
+    Args:
+        config: where frames come from.
+        preprocess: the network's.
+    """
 
     def __init__(self, config: DataConfig, preprocess: Preprocess) -> None:
         super().__init__()
@@ -37,22 +33,37 @@ class DepthDataModule(LightningDataModule):
         self.train_set: SampleDataset | None = None
         self.validation_set: SampleDataset | None = None
 
+    def prepare_data(self) -> None:
+        """Renders tours that are not in the cache yet; Lightning calls it in one process per computer."""
+        if self.config.kind == "tour":
+            sources(self.config)
+
     def setup(self, stage: str | None = None) -> None:
-        """Opens both parts; every process does."""
+        """Opens both parts; every process does.
+
+        Raises:
+            OSError: a path does not exist, or cannot be written for rendered tours.
+            ValueError: a path holds nothing of the kind asked for, or the two parts overlap.
+        """
+        if self.train_set is not None:
+            return
         c = self.config
+        train, validation = sources(c)
         augmentation = None if c.augmentation is None else Augmentation(c.augmentation)
-        self.train_set = SampleDataset(
-            _Room(32, 0), self.preprocess, augmentation, seed=c.seed, on_bad_file=c.on_bad_file
-        )
-        self.validation_set = SampleDataset(_Room(8, 1), self.preprocess, on_bad_file=c.on_bad_file, evaluate=True)
+        self.train_set = SampleDataset(train, self.preprocess, augmentation, seed=c.seed, on_bad_file=c.on_bad_file)
+        self.validation_set = SampleDataset(validation, self.preprocess, on_bad_file=c.on_bad_file, evaluate=True)
 
     def train_dataloader(self) -> EpochLoader:
-        """Shuffled, this process's share of every batch."""
+        """Shuffled; this process's share of every batch."""
         return self._loader(self.train_set, shuffle=True)
 
     def val_dataloader(self) -> EpochLoader:
-        """Everything once over all processes."""
+        """Every frame once, over all processes together."""
         return self._loader(self.validation_set, shuffle=False)
+
+    def bad_files(self) -> tuple[str, ...]:
+        """The broken files met so far in either part, where they are skipped."""
+        return tuple(name for part in (self.train_set, self.validation_set) if part for name in part.bad_files())
 
     def _loader(self, dataset: SampleDataset | None, shuffle: bool) -> EpochLoader:
         if dataset is None:
@@ -63,22 +74,39 @@ class DepthDataModule(LightningDataModule):
         return EpochLoader(dataset, batches, workers=c.workers)
 
 
-class _Room(FrameSource):
-    """Skeleton source."""
+def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:
+    """The frames to train on and those to validate on.
 
-    def __init__(self, frames: int, seed: int) -> None:
-        self.room = synthetic.Room.furnished(20, seed)
-        self.poses = list(synthetic.walk(frames))
+    Raises:
+        OSError, ValueError: see :meth:`DepthDataModule.setup`.
+    """
+    c = config
+    if c.kind == "nyu":
+        return NyuFrames(c.paths[0], "train"), NyuFrames(c.paths[0], "val")
+    if c.kind == "tour":
+        settings = TourSettings(c.tour_frames, c.tour_stride, c.tour_size, c.tour_style, c.tour_fov)
+        seeds = range(c.first_tour, c.first_tour + c.tours + c.validation_tours)
+        frames = [
+            tour_frames(some, settings, c.cache or None, workers=c.render_workers)
+            for some in (seeds[: c.tours], seeds[c.tours :])
+        ]
+        return frames[0], frames[1]
+    return _sequences(c)
 
-    def __len__(self) -> int:
-        return len(self.poses)
 
-    def name(self, index: int) -> str:
-        return f"room:{index}"
+def _sequences(c: DataConfig) -> tuple[SequenceFrames, SequenceFrames]:
+    opened = [open_rgbd(path) for path in c.paths]
+    part, held_back = Part.parse(c.part), Part.parse(c.validation_part)
+    same = {_resolved(path) for path in c.paths} & {_resolved(path) for path in c.validation_paths or c.paths}
+    for sequence, path in zip(opened, c.paths, strict=True):
+        both = set(part.frames(len(sequence))) & set(held_back.frames(len(sequence)))
+        if both and _resolved(path) in same:
+            raise ValueError(
+                f"DataConfig.part {part} and validation_part {held_back} share {len(both)} frames of {sequence.name}"
+            )
+    others = [open_rgbd(path) for path in c.validation_paths] or opened
+    return SequenceFrames(opened, part), SequenceFrames(others, held_back)
 
-    def load(self, index: int) -> RawSample:
-        K = synthetic.intrinsics(60, 80)
-        depth = synthetic.render(self.room, self.poses[index], K, 60, 80)
-        grey = (255 * np.exp(-depth / 3)).astype(np.uint8)
-        image = torch.from_numpy(grey).expand(3, -1, -1)
-        return RawSample(image, torch.from_numpy(depth).float(), torch.from_numpy(K))
+
+def _resolved(path: str) -> str:
+    return str(Path(path).resolve())

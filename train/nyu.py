@@ -1,0 +1,193 @@
+"""NYU Depth V2 in FastDepth's layout: ``train|val/<scene>/*.h5`` with ``rgb`` and ``depth``, and its conversion.
+
+``rgb`` is uint8 [3, H, W], ``depth`` floating-point [H, W] in metres along the optical axis, registered to
+``rgb``; 0 or not finite = none. The archive that FastDepth names is gone; :func:`convert_labelled` makes the
+layout from the labelled file that the dataset's own site offers (docs/training.md).
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.files import write_atomic
+from ufmstar_torch.eval.sequences.images import natural_key
+from ufmstar_torch.train.samples import RawSample, SampleError
+
+if TYPE_CHECKING:
+    import h5py
+
+# The colour camera's calibration in the dataset's toolbox [px], for images of 640 x 480.
+INTRINSICS = (518.857901, 519.469611, 325.582449, 253.736166)
+_SIZE = (480, 640)
+# [1] Files whose aspect ratio differs by more were cropped, so that the calibration does not hold for them.
+_ASPECT_TOLERANCE = 0.02
+# What h5py raises for files that are damaged in one way or another, and for datasets that are missing.
+_BROKEN = (OSError, KeyError, RuntimeError, ValueError)
+# Of scenes, taken in alphabetical order, every this many goes into the validation part where no split is given.
+_VALIDATION_EVERY = 4
+
+
+class NyuFrames:
+    """The frames of one part of the dataset, in the order of scenes and numbers.
+
+    Args:
+        root: folder with ``train`` and ``val``.
+        part: "train" or "val".
+
+    Raises:
+        ValueError: another part.
+        FileNotFoundError: no such folder, or no h5 file in it.
+    """
+
+    def __init__(self, root: str | Path, part: str) -> None:
+        if part not in ("train", "val"):
+            raise ValueError(f"part must be 'train' or 'val', got {part!r}")
+        folder = Path(root) / part
+        found = sorted(folder.glob("*/*.h5"), key=lambda path: (path.parent.name, natural_key(path)))
+        if not found:
+            raise FileNotFoundError(f"{folder} holds no <scene>/*.h5: expected FastDepth's layout of NYU Depth V2")
+        self.files = tuple(found)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def name(self, index: int) -> str:
+        """The file."""
+        return str(self.files[index])
+
+    def load(self, index: int) -> RawSample:
+        """Reads a file; nothing stays open, so that worker processes share nothing.
+
+        Raises:
+            SampleError: it cannot be read, lacks ``rgb`` or ``depth``, or they have other types or shapes.
+        """
+        path = self.files[index]
+        rgb, depth = _read(path)
+        _check(path, rgb, depth)
+        return RawSample(
+            image=torch.from_numpy(rgb),
+            depth=torch.from_numpy(depth.astype(np.float32)),
+            intrinsics=_intrinsics(path, depth.shape[0], depth.shape[1]),
+        )
+
+
+def convert_labelled(
+    mat: str | Path,
+    out: str | Path,
+    splits: str | Path | None = None,
+    *,
+    raw: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, int]:
+    """Writes ``nyu_depth_v2_labeled.mat`` (MATLAB 7.3, which is HDF5) in FastDepth's layout.
+
+    Files are written atomically; those that exist are left as they are, so that an interrupted conversion goes on.
+
+    Args:
+        mat: the labelled dataset: ``images`` [N, 3, W, H], ``depths`` and ``rawDepths`` [N, W, H] [m]
+            (MATLAB stores columns first), ``scenes``.
+        out: folder that gets ``train/<scene>/NNNNN.h5`` and ``val/...``, NNNNN the number in ``mat`` from 1.
+        splits: the site's ``splits.mat`` (``trainNdxs``, ``testNdxs``), whose 654 test frames become "val". None:
+            every fourth scene does, as a whole.
+        raw: the sensor's depth with its holes, and not the one with holes filled in.
+        progress: called with the number of frames done and of all.
+
+    Returns:
+        The number of frames of each part.
+
+    Raises:
+        ValueError: ``mat`` has not these arrays, or ``splits`` does not cover its frames.
+        OSError: a file cannot be read or written.
+    """
+    import h5py
+
+    key = "rawDepths" if raw else "depths"
+    with h5py.File(mat, "r") as file:
+        if missing := sorted({"images", key, "scenes"} - set(file)):
+            raise ValueError(f"{mat} has no {', '.join(missing)}: expected nyu_depth_v2_labeled.mat")
+        images, depths = file["images"], file[key]
+        scenes = [_matlab_string(file[reference]) for reference in np.asarray(file["scenes"]).ravel()]
+        if images.ndim != 4 or images.shape[1] != 3 or depths.shape != (images.shape[0], *images.shape[2:]):
+            raise ValueError(f"{mat}: images {images.shape} and {key} {depths.shape} must be [N, 3, W, H], [N, W, H]")
+        if len(scenes) != len(images):
+            raise ValueError(f"{mat}: there are {len(scenes)} scenes for {len(images)} images")
+        validation = _validation(scenes, splits)
+        for i, scene in enumerate(scenes):
+            path = Path(out) / ("val" if i in validation else "train") / scene / f"{i + 1:05d}.h5"
+            if not path.exists():
+                _write(path, images[i].transpose(0, 2, 1), depths[i].T)
+            if progress is not None:
+                progress(i + 1, len(scenes))
+    return {"train": len(scenes) - len(validation), "val": len(validation)}
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return _array(file, "rgb"), _array(file, "depth")
+    except _BROKEN as error:
+        raise SampleError(str(path), f"cannot be read: {error}") from error
+
+
+def _array(file: h5py.File, key: str) -> np.ndarray:
+    if key not in file:
+        raise KeyError(f"no dataset {key!r}, only {sorted(file)}")
+    return np.asarray(file[key])
+
+
+def _check(path: Path, rgb: np.ndarray, depth: np.ndarray) -> None:
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3 or 0 in rgb.shape:
+        raise SampleError(str(path), f"rgb must be uint8 [3, H, W], got {rgb.dtype} {list(rgb.shape)}")
+    if not np.issubdtype(depth.dtype, np.floating) or depth.shape != rgb.shape[1:]:
+        expected = f"floating-point {list(rgb.shape[1:])}"
+        raise SampleError(str(path), f"depth must be {expected} as rgb is, got {depth.dtype} {list(depth.shape)}")
+
+
+def _intrinsics(path: Path, height: int, width: int) -> torch.Tensor:
+    """[3, 3] of images of that size."""
+    if abs(width / height / (_SIZE[1] / _SIZE[0]) - 1) > _ASPECT_TOLERANCE:
+        raise SampleError(str(path), f"is {width} x {height}, not a resized 640 x 480: its intrinsics are not known")
+    fx, fy, cx, cy = INTRINSICS
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return resize_intrinsics(K, _SIZE, (height, width))
+
+
+def _matlab_string(characters: h5py.Dataset) -> str:
+    """MATLAB 7.3 keeps a string as a column of UTF-16 code units."""
+    return "".join(chr(code) for code in np.asarray(characters).ravel())
+
+
+def _validation(scenes: list[str], splits: str | Path | None) -> set[int]:
+    """Frame numbers (0-based) of the validation part."""
+    if splits is None:
+        held_back = set(sorted(set(scenes))[_VALIDATION_EVERY - 1 :: _VALIDATION_EVERY])
+        return {i for i, scene in enumerate(scenes) if scene in held_back}
+    from scipy.io import loadmat
+
+    content = loadmat(splits)
+    if missing := sorted({"trainNdxs", "testNdxs"} - set(content)):
+        raise ValueError(f"{splits} has no {', '.join(missing)}: expected the dataset's splits.mat")
+    train, test = ({int(n) - 1 for n in content[name].ravel()} for name in ("trainNdxs", "testNdxs"))
+    if train & test or train | test != set(range(len(scenes))):
+        raise ValueError(f"{splits}: trainNdxs and testNdxs must divide the frames 1 to {len(scenes)} between them")
+    return test
+
+
+def _write(path: Path, rgb: np.ndarray, depth: np.ndarray) -> None:
+    import h5py
+
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        file.create_dataset("rgb", data=np.ascontiguousarray(rgb, np.uint8), compression="gzip")
+        file.create_dataset("depth", data=np.ascontiguousarray(depth, np.float32), compression="gzip")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, lambda target: target.write(buffer.getbuffer()))

@@ -1,0 +1,90 @@
+"""Any RGB-D sequence as training frames: those that ``open_sequence`` reads, and folders without poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Items
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ufmstar_torch.eval.ground_truth import truth_at
+from ufmstar_torch.eval.sequences.frame import FrameError, Sequence
+from ufmstar_torch.eval.sequences.layout import detect_layout, open_sequence
+from ufmstar_torch.train.parts import Part
+from ufmstar_torch.train.samples import RawSample, SampleError
+from ufmstar_torch.train.unposed import is_unposed, open_unposed
+
+
+class SequenceFrames:
+    """The frames with depth of the same part of several sequences, one after the other.
+
+    Depth maps with a camera of their own are seen at the image's pixels (``eval.ground_truth``).
+
+    Args:
+        sequences: as the readers return them.
+        part: of each sequence; counted over all its usable frames, also those without a depth map.
+
+    Raises:
+        ValueError: no sequence, or one whose part has no frame with depth.
+    """
+
+    def __init__(self, sequences: Items[Sequence], part: str | Part = "0:100%") -> None:
+        part = Part.parse(part) if isinstance(part, str) else part
+        if not sequences:
+            raise ValueError("sequences must hold at least one sequence, got none")
+        self.sequences = tuple(sequences)
+        self._frames: list[tuple[int, int]] = []
+        for number, sequence in enumerate(self.sequences):
+            entries = sequence.entries
+            with_depth = [i for i in part.frames(len(sequence)) if entries[i].load_depth and entries[i].load_image]
+            if not with_depth:
+                raise ValueError(f"{sequence.name}: no frame of the part {part} has an image and a depth map")
+            self._frames += [(number, i) for i in with_depth]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def name(self, index: int) -> str:
+        """Sequence and frame."""
+        number, frame = self._frames[index]
+        sequence = self.sequences[number]
+        return f"{sequence.name}/{sequence.entries[frame].name}"
+
+    def load(self, index: int) -> RawSample:
+        """Decodes a frame.
+
+        Raises:
+            SampleError: a file is missing, cannot be decoded, or has not the sequence's size.
+        """
+        number, i = self._frames[index]
+        try:
+            frame = self.sequences[number][i]
+            if frame.image is None:
+                raise FrameError(frame.name, "has no image")
+            depth = truth_at(frame, frame.intrinsics, (frame.image.shape[0], frame.image.shape[1]))
+        except FrameError as error:
+            raise SampleError(self.name(index), str(error)) from error
+        if depth is None:
+            raise SampleError(self.name(index), "has no depth map")
+        return RawSample(
+            image=torch.from_numpy(np.ascontiguousarray(frame.image.transpose(2, 0, 1))),
+            depth=torch.from_numpy(np.ascontiguousarray(depth, np.float32)),
+            intrinsics=torch.from_numpy(frame.intrinsics),
+        )
+
+
+def open_rgbd(source: str | Path) -> Sequence:
+    """A sequence as ``open_sequence`` detects it, or else a folder of images and depth maps without poses.
+
+    Raises:
+        FileNotFoundError: no such path.
+        ValueError: neither of them, with what was looked for.
+    """
+    path = Path(source)
+    if is_unposed(path):
+        try:
+            detect_layout(path)
+        except ValueError:  # no layout with poses
+            return open_unposed(path)
+    return open_sequence(source)

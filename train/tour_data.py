@@ -1,0 +1,216 @@
+"""Rendered tours as training frames, rendered once into memory-mapped files.
+
+A tour's files are ``<seed>.image.npy`` (uint8 [F, 3, H, W]), ``<seed>.depth.npy`` (uint16 [F, H, W] in
+millimetres, 0 = none) and ``<seed>.camera.npy`` (float64 [3, 3]), written atomically and the camera last, so
+that its presence says that the tour is complete. They lie in a folder whose name is a digest of everything that
+decides what they show, the renderer's source included: another setting or another version never finds them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import multiprocessing
+import os
+import random
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.files import write_together
+from ufmstar_torch.eval.tour.style import TourStyle, style_of
+from ufmstar_torch.train.samples import RawSample, SampleError
+
+_LOG = logging.getLogger(__name__)
+# [m] Half of it is the error of a stored depth; 65 m are the farthest.
+_UNIT = 1e-3
+_FARTHEST = np.iinfo(np.uint16).max
+
+
+@dataclass(frozen=True)
+class TourSettings:
+    """What a tour's stored frames show, apart from its seed.
+
+    Attributes:
+        frames: of each tour.
+        stride: every how many steps of the walk a frame is taken.
+        size: (height, width) [px].
+        style: of the rooms.
+        fov: horizontal field of view [degrees].
+
+    Raises:
+        ValueError: a number out of range, or no such style.
+    """
+
+    frames: int = 40
+    stride: int = 6
+    size: tuple[int, int] = (160, 224)
+    style: str | TourStyle = "home"
+    fov: float = 70.0
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.stride) < 1:
+            raise ValueError(f"frames and stride must be at least 1, got {self.frames} and {self.stride}")
+        if len(self.size) != 2 or min(self.size) < 8:
+            raise ValueError(f"size must be (height, width) of at least 8 px each, got {self.size}")
+        if not 20 <= self.fov <= 120:
+            raise ValueError(f"fov must be 20 to 120 degrees, got {self.fov}")
+        style_of(self.style)
+
+    def digest(self) -> str:
+        """16 hexadecimal digits that change with every setting and with the renderer's source."""
+        import ufmstar_torch.eval.tour as package
+        from ufmstar_torch.eval import synthetic
+
+        told = {**asdict(self), "style": asdict(style_of(self.style))}
+        sources = [Path(str(synthetic.__file__)), *sorted(Path(str(package.__file__)).parent.glob("*.py"))]
+        digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+        for source in (*sources, Path(__file__)):
+            digest.update(source.read_bytes())
+        return digest.hexdigest()[:16]
+
+
+class TourFrames:
+    """The stored frames of some tours. Build one with :func:`tour_frames`.
+
+    Args:
+        folder: with the tours' files.
+        seeds: of the tours.
+        frames: of each tour.
+    """
+
+    def __init__(self, folder: Path, seeds: Iterable[int], frames: int) -> None:
+        self.folder, self.seeds, self.frames = folder, tuple(seeds), frames
+        self._maps: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.float64]]] = {}
+
+    def __getstate__(self) -> dict[str, object]:
+        # A worker process maps the files itself: a pickled map would be a copy of all of it.
+        return {**self.__dict__, "_maps": {}}
+
+    def __len__(self) -> int:
+        return len(self.seeds) * self.frames
+
+    def name(self, index: int) -> str:
+        """The tour's file and the frame."""
+        return f"{self.folder / str(self.seeds[index // self.frames])}.image.npy[{index % self.frames}]"
+
+    def load(self, index: int) -> RawSample:
+        """Reads a frame.
+
+        Raises:
+            SampleError: the tour's files are missing or truncated.
+        """
+        seed, frame = self.seeds[index // self.frames], index % self.frames
+        try:
+            image, depth, camera = self._mapped(seed)
+            return RawSample(
+                image=torch.from_numpy(image[frame].copy()),
+                depth=torch.from_numpy(depth[frame].astype(np.float32) * np.float32(_UNIT)),
+                intrinsics=torch.from_numpy(camera.copy()),
+            )
+        except (OSError, ValueError, IndexError) as error:
+            raise SampleError(self.name(index), f"cannot be read: {error}") from error
+
+    def _mapped(self, seed: int) -> tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.float64]]:
+        if seed not in self._maps:
+            image, depth, camera = tour_files(self.folder, seed)
+            self._maps[seed] = np.load(image, mmap_mode="r"), np.load(depth, mmap_mode="r"), np.load(camera)
+        return self._maps[seed]
+
+
+def tour_frames(
+    seeds: Iterable[int],
+    settings: TourSettings,
+    cache: str | Path | None = None,
+    *,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> TourFrames:
+    """The frames of tours, rendered where that has not been done before.
+
+    Interrupted, it goes on with the tours that are missing. Several processes may call it at the same time
+    (those of a distributed run do): they render in different orders, and each leaves out what is there by then.
+
+    Args:
+        seeds: of the tours.
+        settings: what is rendered.
+        cache: folder; None = ``ufmstar_torch/tours`` in the user's cache folder.
+        workers: processes that render; 1 = this one.
+        progress: called with the number of tours that are there and of all.
+
+    Raises:
+        ValueError: no seed, or a number out of range.
+        OSError: the cache cannot be written.
+    """
+    seeds = tuple(seeds)
+    if not seeds or workers < 1:
+        raise ValueError(f"seeds must hold at least one and workers be at least 1, got {len(seeds)} and {workers}")
+    folder = (default_cache() if cache is None else Path(cache)) / f"tours-{settings.digest()}"
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [seed for seed in seeds if not tour_files(folder, seed)[2].exists()]
+    random.Random(os.getpid()).shuffle(missing)
+    done = len(seeds) - len(missing)
+    if missing:
+        _LOG.info("rendering %d tours of %d frames into %s", len(missing), settings.frames, folder)
+    for _ in _rendered(folder, missing, settings, min(workers, max(1, len(missing)))):
+        done += 1
+        if progress is not None:
+            progress(done, len(seeds))
+    return TourFrames(folder, seeds, settings.frames)
+
+
+def tour_files(folder: Path, seed: int) -> tuple[Path, Path, Path]:
+    """A tour's images, depth maps and camera."""
+    return folder / f"{seed}.image.npy", folder / f"{seed}.depth.npy", folder / f"{seed}.camera.npy"
+
+
+def default_cache() -> Path:
+    """``ufmstar_torch/tours`` where the user's system keeps caches."""
+    named = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(named) if named else Path.home() / ".cache") / "ufmstar_torch" / "tours"
+
+
+def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
+    """Renders one tour into its files, unless they are there by now."""
+    from ufmstar_torch.eval.tour import tour_sequence
+
+    files = tour_files(folder, seed)
+    if files[2].exists():
+        return
+    sequence = tour_sequence(
+        seed,
+        frames=settings.frames * settings.stride,
+        size=settings.size,
+        style=settings.style,
+        fov=settings.fov,
+        path_seed=0,  # the longest way, from anywhere on it
+    )
+    image = np.empty((settings.frames, 3, *settings.size), np.uint8)
+    depth = np.empty((settings.frames, *settings.size), np.uint16)
+    for i in range(settings.frames):
+        frame = sequence[i * settings.stride]
+        if frame.image is None or frame.depth is None:
+            raise ValueError(f"tour {seed}: frame {frame.name} has no image or depth")
+        image[i] = frame.image.transpose(2, 0, 1)
+        depth[i] = np.rint(frame.depth / _UNIT).clip(0, _FARTHEST)
+    arrays = zip(files, (image, depth, sequence.intrinsics), strict=True)
+    write_together({path: partial(np.save, arr=array) for path, array in arrays})
+
+
+def _rendered(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> Iterable[None]:
+    """One item per tour as it gets ready."""
+    task = partial(render_tour, folder, settings)
+    if workers == 1:
+        yield from map(task, seeds)
+        return
+    # "spawn" as for the loader's workers; each process renders with one thread, there is one for each core.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        yield from pool.map(task, seeds)
