@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.eval.tour.furniture import AT_WALLS, FREE_STANDING, IN_HALLS, Piece, chair
 from ufmstar_torch.eval.tour.palette import Palette
 from ufmstar_torch.eval.tour.rooms import Door, Room
-from ufmstar_torch.eval.tour.shapes import Finish, Part, ball, box, tube, turn
+from ufmstar_torch.eval.tour.shapes import Part, ball, box, tube, turn
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np
 def _furniture(found: Furnished, room: Room, way: Array, palette: Palette, rng: np.random.Generator) -> None:
     size = room.upper - room.lower
     large = size.max() >= _HALL_FROM
-    wanted, placed = int(round(room.style.furniture * size.prod())), 0
+    wanted, placed = round(float(room.style.furniture * size.prod())), 0
     scale = float(rng.uniform(*room.style.scale))
     for _ in range(12 * wanted):
         if placed >= wanted:
@@ -182,7 +182,7 @@ def _ceiling_lamps(found: Furnished, room: Room, palette: Palette, rng: np.rando
     count = 2 if size.max() > 5 else 1
     warm = float(rng.uniform(*style.warmth))
     color = np.array([1.0 + 0.18 * warm, 1.0 + 0.02 * warm, 1.0 - 0.28 * warm])
-    shade = Finish("plain", (0.95, 0.9, 0.8), (0.9, 0.9, 0.8), glow=float(1.2 * style.brightness[1]))
+    shade = palette.solid((0.95, 0.9, 0.8), 1.2 * style.brightness[1])
     what, metal = int(rng.integers(3)), palette.finish("metal")
     for k in range(count):
         offset = np.zeros(2)

@@ -95,7 +95,7 @@ def table(rng: np.random.Generator, palette: Palette) -> Piece:
 
 def desk(rng: np.random.Generator, palette: Palette) -> Piece:
     """A desk with a screen, and a drawer unit beneath."""
-    wood, dark = palette.finish("wood"), Finish("plain", (0.02, 0.02, 0.025), (0.05, 0.05, 0.05))
+    wood, dark = palette.finish("wood"), palette.solid((0.02, 0.02, 0.025))
     w, d, h = rng.uniform(1.1, 1.5), rng.uniform(0.6, 0.75), 0.74
     screen = rng.uniform(0.22, 0.34)
     parts = [
@@ -177,7 +177,7 @@ def cabinet(rng: np.random.Generator, palette: Palette) -> Piece:
 
 def television(rng: np.random.Generator, palette: Palette) -> Piece:
     """A low board with a television."""
-    dark, w, d, h = Finish("plain", (0.015, 0.015, 0.02), (0.05, 0.05, 0.05)), rng.uniform(1.2, 1.7), 0.42, 0.45
+    dark, w, d, h = palette.solid((0.015, 0.015, 0.02)), rng.uniform(1.2, 1.7), 0.42, 0.45
     half = rng.uniform(0.4, 0.6)
     parts = [
         box((0, -h / 2 - 0.05, d / 2), (w / 2, h / 2 - 0.05, d / 2), palette.finish("wood")),
@@ -191,7 +191,7 @@ def television(rng: np.random.Generator, palette: Palette) -> Piece:
 def lamp(rng: np.random.Generator, palette: Palette) -> Piece:
     """A floor lamp with a shade that glows."""
     metal, h = palette.finish("metal"), rng.uniform(1.35, 1.65)
-    shade = Finish("plain", (0.9, 0.8, 0.6), (0.8, 0.7, 0.5), glow=0.9)
+    shade = palette.solid((0.9, 0.8, 0.6), 0.9)
     parts = [
         tube((0, -0.015, 0.2), 0.15, 0.015, metal),
         tube((0, -h / 2, 0.2), 0.014, h / 2, metal),

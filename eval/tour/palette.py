@@ -16,12 +16,17 @@ _PICTURES = ("books", "painting", "window")
 # What a surface may be made of: textures, ranges of saturation and value of its first colour, and of its
 # pattern's period [m].
 _ROLES: dict[str, tuple[tuple[str, ...], tuple[float, float], tuple[float, float], tuple[float, float]]] = {
-    "wall": (("plaster", "plaster", "plain", "stripes", "bricks"), (0.03, 0.4), (0.5, 0.92), (0.2, 0.4)),
+    "wall": (
+        ("plaster", "plaster", "plaster", "plain", "plain", "stripes", "bricks"),
+        (0.03, 0.4),
+        (0.5, 0.9),
+        (0.2, 0.4),
+    ),
     "floor": (("wood", "wood", "tiles", "checks", "fabric"), (0.1, 0.6), (0.3, 0.75), (0.2, 0.5)),
     "ceiling": (("plain", "plaster"), (0.0, 0.06), (0.8, 0.95), (0.3, 0.5)),
     "wood": (("wood", "wood", "plain"), (0.3, 0.65), (0.25, 0.8), (0.08, 0.16)),
-    "cloth": (("fabric", "stripes", "checks", "plain"), (0.1, 0.8), (0.2, 0.85), (0.05, 0.2)),
-    "paint": (("plain", "plaster"), (0.0, 0.8), (0.25, 0.95), (0.2, 0.4)),
+    "cloth": (("fabric", "stripes", "checks", "plain"), (0.1, 0.65), (0.2, 0.85), (0.05, 0.2)),
+    "paint": (("plain", "plaster"), (0.0, 0.6), (0.25, 0.95), (0.2, 0.4)),
     "metal": (("plain",), (0.0, 0.1), (0.15, 0.7), (0.2, 0.4)),
     "leaf": (("plaster", "fabric"), (0.5, 0.8), (0.25, 0.55), (0.05, 0.12)),
 }
@@ -52,6 +57,12 @@ class Palette:
             return self._draw(fallback)
         first, second = self._colors((0.4, 0.8), (0.3, 0.9), (0.0, 1.0))
         return Finish(texture, first, second, period, glow)
+
+    def solid(self, color: Color, glow: float = 0.0) -> Finish:
+        """One colour, as far as the style's textures allow."""
+        other = (0.8 * color[0], 0.8 * color[1], 0.8 * color[2])
+        texture = "plain" if "plain" in self._style.textures else self._draw("metal").texture
+        return Finish(texture, color, other, 0.12, glow)
 
     def _draw(self, role: str, glow: float = 0.0) -> Finish:
         wanted, saturation, value, period = _ROLES[role]

@@ -46,6 +46,8 @@ def _circuit(rooms: list[Room], doors: list[Door], full: bool) -> list[Array]:
         room, children = rooms[index], [(i + 1, door) for i, door in enumerate(doors) if door.rooms[0] == index]
         first = entrance or (children[0][1] if children else None)
         start = 0.0 if first is None else _angle(room, first.middle)
+        if entrance is None:
+            start += np.pi  # the way begins at the far side, so that the first room is seen before the others
         at = start
         if entrance is not None:
             points.extend(_through(entrance, inward=True))
@@ -96,6 +98,6 @@ def _sampled(points: Array) -> Array:
     dense = (weights[:, None] * corners[:, :, None]).sum(0).reshape(-1, 2)
     closed = np.concatenate([dense, dense[:1]])
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
-    count = max(int(round(length[-1] / SPACING)), 8)
+    count = max(round(float(length[-1]) / SPACING), 8)
     s = length[-1] * np.arange(count) / count
     return np.stack([np.interp(s, length, closed[:, k]) for k in (0, 1)], axis=1)

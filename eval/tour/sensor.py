@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
 
-_EXPOSURE = 1.0
-_SHOULDER = 0.9  # brightness from which highlights are compressed
+_EXPOSURE = 0.85
+_SHOULDER = 0.65  # brightness from which highlights are compressed
+_SOFT = 1 - _SHOULDER  # so that the slope is steady there
 _EXPOSURE_SPREAD, _VIGNETTE, _SHOT, _READ = 0.08, 0.25, 0.012, 0.006
 
 
@@ -22,7 +22,7 @@ def develop(color: Tensor, seed: int | None = None) -> Tensor:
     if seed is not None:
         light = _sensed(light, seed)
     light = light.clamp_min(0)
-    shown = torch.where(light < _SHOULDER, light, 1 - (1 - _SHOULDER) * torch.exp(-(light - _SHOULDER) / 0.3))
+    shown = torch.where(light < _SHOULDER, light, 1 - (1 - _SHOULDER) * torch.exp(-(light - _SHOULDER) / _SOFT))
     encoded = torch.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown.clamp_min(1e-6) ** (1 / 2.4) - 0.055)
     return (encoded * 255).round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous()
 
@@ -35,10 +35,15 @@ def _sensed(light: Tensor, seed: int) -> Tensor:
     exposure = float(1 + _EXPOSURE_SPREAD * draws[0].clamp(-2, 2))
     strength = _VIGNETTE * float((0.5 + 0.25 * draws[1]).clamp(0, 1))
     noise = torch.randn(light.shape, generator=rng).to(light.device)
-    kernel = torch.tensor([1.0, 6.0, 1.0], device=light.device) / 8
-    blurred = pad(light[:, None], (1, 1, 1, 1), mode="replicate")
-    blurred = conv2d(conv2d(blurred, kernel.view(1, 1, 3, 1)), kernel.view(1, 1, 1, 3))[:, 0]
+    blurred = _blurred(_blurred(light).transpose(1, 2)).transpose(1, 2)
     y = torch.linspace(-1, 1, height, device=light.device)[:, None]
     x = torch.linspace(-1, 1, width, device=light.device)
     shaded = exposure * blurred * (1 - strength * (x * x + y * y) / 2)
     return shaded + noise * (_SHOT * shaded.clamp_min(0).sqrt() + _READ)
+
+
+def _blurred(light: Tensor) -> Tensor:
+    """[C, H, W] with a little of the neighbours in a row."""
+    before = torch.cat([light[..., :1], light[..., :-1]], dim=-1)
+    after = torch.cat([light[..., 1:], light[..., -1:]], dim=-1)
+    return (before + after + 6 * light) / 8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,32 +10,34 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD
-from ufmstar_torch.eval.tour.texture import Patch, albedo, noise_table
+from ufmstar_torch.eval.tour.style import TEXTURES
+from ufmstar_torch.eval.tour.texture import Patch, albedo
 from ufmstar_torch.eval.tour.tour import Tour
 
 _AMBIENT = 0.42  # light from everywhere, as a share of the lamps'
 _BEFORE = 0.1  # how far before a surface its shadow is looked up [m]
 _CORNER, _DARKNESS = 0.22, 0.3  # how far corners are darker [m], and by how much
+_TEXTURES = len(TEXTURES)
+Span = tuple[int, int, int]  # a value, and the first and last-but-one pixel that has it
 _CAP = 1e-3  # how near to a frustum's end a point is on its cap, in unit coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where pixels see a surface; P of them, float32.
+    """Where pixels see a surface; P of them, float32, pixels of the same room, kind and texture side by side.
 
     Attributes:
         surface: [P] int64.
         point: [3, P] [m].
         normal: [3, P] unit, towards the camera.
-        u, v: [P] coordinates on the surface [m].
+        uv: [2, P] coordinates on the surface [m].
         footprint: [P] size of a pixel there [m].
     """
 
     surface: Tensor
     point: Tensor
     normal: Tensor
-    u: Tensor
-    v: Tensor
+    uv: Tensor
     footprint: Tensor
 
 
@@ -49,13 +52,39 @@ def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin:
         origin: [3] of the camera [m].
         pixel_angle: size of a pixel at depth 1 [m].
     """
-    hits = _hits(tour, surface, depth, direction, origin, pixel_angle)
-    color = _albedo(tour, hits)
-    glow = tour.surfaces.look[:, 7][surface]
-    return color * torch.maximum(_light(tour, hits), glow)
+    s = tour.surfaces
+    group, order = torch.sort((s.rooms[:, 0] * 4 + s.kind)[surface] * _TEXTURES + s.texture[surface], stable=True)
+    values, counts = torch.unique_consecutive(group, return_counts=True)
+    ends = torch.cumsum(counts, 0).tolist()
+    spans = [(value, end - n, end) for value, end, n in zip(values.tolist(), ends, counts.tolist(), strict=True)]
+    own = surface[order]
+    kinds, rooms = _merged(spans, _TEXTURES), _merged(spans, 4 * _TEXTURES)
+    hits = _hits(tour, own, depth[order], direction.index_select(1, order), origin, pixel_angle, kinds)
+    light = torch.maximum(_light(tour, hits, rooms), s.look[:, 7][own])
+    found = torch.empty_like(light)
+    return found.index_copy_(1, order, _albedo(tour, hits, spans) * light)
 
 
-def _hits(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float) -> Hits:
+def _merged(spans: list[Span], divisor: int) -> list[Span]:
+    """Neighbouring spans whose values agree after division."""
+    merged: list[Span] = []
+    for value, start, end in spans:
+        if merged and merged[-1][0] == value // divisor:
+            merged[-1] = (merged[-1][0], merged[-1][1], end)
+        else:
+            merged.append((value // divisor, start, end))
+    return merged
+
+
+def _hits(
+    tour: Tour,
+    surface: Tensor,
+    depth: Tensor,
+    direction: Tensor,
+    origin: Tensor,
+    pixel_angle: float,
+    kinds: list[Span],
+) -> Hits:
     s = tour.surfaces
     geometry = torch.cat([s.rotation.flatten(1), s.centre, s.half, s.taper[:, None]], dim=1).float().T.contiguous()
     g = geometry.index_select(1, surface)
@@ -63,17 +92,17 @@ def _hits(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin:
     point = origin[:, None] + depth * direction
     d = point - g[9:12]
     q = R[0] * d[0] + R[1] * d[1] + R[2] * d[2]
-    kind = s.kind[surface]
-    normal, uv = torch.zeros_like(q), torch.zeros_like(q[:2])
-    for number, local in ((QUAD, _quad), (BOX, _box), (ELLIPSOID, _ellipsoid), (FRUSTUM, _frustum)):
-        chosen = torch.nonzero(kind == number).flatten()
-        if len(chosen):
-            normal[:, chosen], uv[:, chosen] = local(q[:, chosen], g[:, chosen])
-    n = R[:, 0] * normal[0] + R[:, 1] * normal[1] + R[:, 2] * normal[2]
+    normals, uvs = [], []
+    for value, start, end in kinds:
+        normal, uv = _LOCAL[value % 4](q[:, start:end], g[:, start:end])
+        normals.append(normal)
+        uvs.append(uv)
+    local = torch.cat(normals, dim=1)
+    n = R[:, 0] * local[0] + R[:, 1] * local[1] + R[:, 2] * local[2]
     n = n * _dot(n, n).clamp_min(1e-12).rsqrt()
     cosine = _dot(n, direction) * _dot(direction, direction).rsqrt()
     footprint = pixel_angle * depth / cosine.abs().clamp_min(0.25)
-    return Hits(surface, point, torch.where(cosine > 0, -n, n), uv[0], uv[1], footprint)
+    return Hits(surface, point, n * -torch.copysign(torch.ones_like(cosine), cosine), torch.cat(uvs, dim=1), footprint)
 
 
 def _quad(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,29 +140,31 @@ def _frustum(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(cap, flat, side), uv
 
 
-def _albedo(tour: Tour, hits: Hits) -> Tensor:
-    look, texture = tour.surfaces.look.T.contiguous(), tour.surfaces.texture[hits.surface]
-    table = noise_table(tour.device)
-    color = torch.empty_like(hits.point)
-    for number in torch.unique(texture).tolist():
-        chosen = torch.nonzero(texture == number).flatten()
-        own = look.index_select(1, hits.surface[chosen])
-        period = own[6]
-        u, v = hits.u[chosen] / period, hits.v[chosen] / period
-        pixel = hits.footprint[chosen] / period
-        shift = own[8:10]
-        color[:, chosen] = albedo(number, Patch(u + shift[0], v + shift[1], u, v, pixel, own[:3], own[3:6], table))
-    return color
+_LOCAL: dict[int, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
+    QUAD: _quad,
+    BOX: _box,
+    ELLIPSOID: _ellipsoid,
+    FRUSTUM: _frustum,
+}
 
 
-def _light(tour: Tour, hits: Hits) -> Tensor:
+def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:
+    look = tour.surfaces.look.T.contiguous().index_select(1, hits.surface)
+    own = hits.uv / look[6]
+    shifted, pixel = own + look[8:10], hits.footprint / look[6]
+    found = []
+    for value, start, end in spans:
+        part = slice(start, end)
+        first, second = look[:3, part], look[3:6, part]
+        patch = Patch(*shifted[:, part], *own[:, part], pixel[part], first, second, tour.noise)
+        found.append(albedo(value % _TEXTURES, patch))
+    return torch.cat(found, dim=1)
+
+
+def _light(tour: Tour, hits: Hits, rooms: list[Span]) -> Tensor:
     """[3, P] what the room's lamps and the light from everywhere bring to a surface."""
-    room = tour.surfaces.rooms[:, 0][hits.surface]
-    light = torch.empty_like(hits.point)
-    for r in torch.unique(room).tolist():
-        chosen = torch.nonzero(room == r).flatten()
-        light[:, chosen] = _light_of(tour, r, hits.point[:, chosen], hits.normal[:, chosen])
-    return light
+    parts = [_light_of(tour, r, hits.point[:, a:b], hits.normal[:, a:b]) for r, a, b in rooms]
+    return torch.cat(parts, dim=1)
 
 
 def _light_of(tour: Tour, room: int, point: Tensor, normal: Tensor) -> Tensor:

@@ -79,6 +79,7 @@ class Surfaces:
         taper: [N] float64.
         rooms: [N, 2] int64.
         texture: [N] int64, index into ``TEXTURES``.
+        corners: [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m].
         look: [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m].
     """
 
@@ -89,6 +90,7 @@ class Surfaces:
     taper: Tensor
     rooms: Tensor
     texture: Tensor
+    corners: Tensor
     look: Tensor
 
     def __len__(self) -> int:
@@ -167,5 +169,15 @@ def surfaces(parts: Sequence[Part], rng: np.random.Generator) -> Surfaces:
         taper=torch.tensor([p.taper for p in parts], dtype=torch.float64),
         rooms=torch.tensor([p.rooms for p in parts]),
         texture=torch.tensor([TEXTURES.index(p.finish.texture) for p in parts]),
+        corners=stack([_around(p) for p in parts]),
         look=torch.tensor(looks, dtype=torch.float32),
     )
+
+
+def _around(p: Part) -> Array:
+    """[8, 3] corners of the box around a primitive [m]."""
+    signs = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) * 2.0 - 1.0
+    wide = max(p.taper, 1.0)
+    half = p.half * [wide, 0.0 if p.kind == QUAD else 1.0, wide]
+    corners: Array = p.centre + (signs * half) @ p.rotation.T
+    return corners

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from ufmstar_torch.eval.tour.style import TEXTURES
 
-_TABLE = 64  # side of the table of random numbers behind all noise; patterns repeat after so many cells
+_CELLS, _FINE = 64, 8  # noise repeats after so many cells, of so many table entries a side
+_SIDE = _CELLS * _FINE
+_POSITIVE = 4096.0  # cells added so that truncation rounds down; a multiple of _CELLS
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +28,7 @@ class Patch:
         own_u, own_v: [P] the same from the surface's middle.
         pixel: [P] size of a pixel there [periods].
         first, second: [3, P] the texture's colours.
-        table: [64, 64] random numbers in [0, 1).
+        table: see :func:`noise_table`.
     """
 
     u: Tensor
@@ -49,22 +51,26 @@ class Patch:
         return 1 + contrast * seen * (values - 0.5)
 
     def cell(self, i: Tensor, j: Tensor) -> Tensor:
-        """[P] a random number in [0, 1) for each cell (i, j)."""
-        return self.table.flatten()[(i.long() & _TABLE - 1) * _TABLE + (j.long() & _TABLE - 1)]
+        """[P] a random number in [0, 1) for each cell (i, j) of integers."""
+        return self._look_up(i * _FINE, j * _FINE, _POSITIVE * _FINE)
 
     def noise(self, u: Tensor, v: Tensor) -> Tensor:
         """[P] smooth noise in [0, 1) with cells of size 1."""
-        i, j = u.floor(), v.floor()
-        a, b = u - i, v - j
-        a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
-        top = self.cell(i, j) * (1 - a) + self.cell(i + 1, j) * a
-        bottom = self.cell(i, j + 1) * (1 - a) + self.cell(i + 1, j + 1) * a
-        return top * (1 - b) + bottom * b
+        return self._look_up(u * _FINE, v * _FINE, _POSITIVE * _FINE)
+
+    def _look_up(self, row: Tensor, column: Tensor, shift: float) -> Tensor:
+        i, j = (row + shift).long() & (_SIDE - 1), (column + shift).long() & (_SIDE - 1)
+        return self.table.index_select(0, i.mul_(_SIDE).add_(j))
 
 
-def noise_table(device: torch.device) -> Tensor:
-    """[64, 64] the same random numbers everywhere."""
-    return torch.rand(_TABLE, _TABLE, generator=torch.Generator().manual_seed(3)).to(device)
+def noise_table() -> Tensor:
+    """[512 * 512] smooth noise whose value in each cell's first corner is a random number of its own."""
+    corners = torch.rand(_CELLS, _CELLS, generator=torch.Generator().manual_seed(3))
+    share = torch.arange(_FINE) / _FINE
+    share = share * share * (3 - 2 * share)
+    rows = corners[:, None] * (1 - share)[None, :, None] + corners.roll(-1, 0)[:, None] * share[None, :, None]
+    rows = rows.reshape(_SIDE, _CELLS)
+    return (rows[..., None] * (1 - share) + rows.roll(-1, 1)[..., None] * share).reshape(-1)
 
 
 def albedo(texture: int, patch: Patch) -> Tensor:

@@ -13,8 +13,9 @@ from ufmstar_torch.eval.tour.furnish import LIGHTS, Light, furnish
 from ufmstar_torch.eval.tour.palette import Palette
 from ufmstar_torch.eval.tour.rooms import Door, Room, frame, lay_out, shell
 from ufmstar_torch.eval.tour.route import ways
-from ufmstar_torch.eval.tour.shapes import Part, Surfaces, surfaces
+from ufmstar_torch.eval.tour.shapes import QUAD, Part, Surfaces, surfaces
 from ufmstar_torch.eval.tour.style import TourStyle, style_of
+from ufmstar_torch.eval.tour.texture import noise_table
 from ufmstar_torch.eval.tour.volume import light_volumes
 
 Array = NDArray[np.float64]
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 _PLAN, _HEIGHT, _LOOKS, _THINGS, _SHIFTS = range(5)
 # A doorway lets see at most what its opening and its frame enclose, and a bit more [m].
 _FRAME = 0.12
+_SHADOWLESS = ("window", "picture", "clock", "skirting")  # flat on the wall
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,7 @@ class Tour:
         labels: what each primitive is part of.
         lights: [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark.
         volumes: [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room.
+        noise: behind the textures, see ``texture.noise_table``.
         ways: [M, 2] float64 closed ways of x and z [m], see ``route.ways``.
         camera_height: above the floor [m].
     """
@@ -54,6 +57,7 @@ class Tour:
     labels: tuple[str, ...]
     lights: Tensor
     volumes: Tensor
+    noise: Tensor
     ways: tuple[Tensor, ...]
     camera_height: float
 
@@ -64,7 +68,7 @@ class Tour:
 
     def to(self, device: torch.device | str) -> Tour:
         """The same tour on another device."""
-        names = ("rooms", "doors", "door_rooms", "surfaces", "lights", "volumes")
+        names = ("rooms", "doors", "door_rooms", "surfaces", "lights", "volumes", "noise")
         return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def room_at(self, position: Tensor) -> Tensor:
@@ -108,6 +112,7 @@ def make_tour(seed: int, style: str | TourStyle = "home") -> Tour:
     table = surfaces(parts, stream(_SHIFTS))
     corners = torch.tensor(np.array([_corners(room) for room in rooms]))
     light_table = _light_table(lights)
+    casts = torch.tensor([p.kind != QUAD and p.finish.glow == 0 and p.label not in _SHADOWLESS for p in parts])
     sizes = torch.tensor([[light.size for light in of_room] + [0.0] * (LIGHTS - len(of_room)) for of_room in lights])
     return Tour(
         seed=seed,
@@ -119,7 +124,8 @@ def make_tour(seed: int, style: str | TourStyle = "home") -> Tour:
         surfaces=table,
         labels=tuple(p.label for p in parts),
         lights=light_table,
-        volumes=light_volumes(corners, table, light_table, sizes),
+        volumes=light_volumes(corners, table, light_table, sizes, casts),
+        noise=noise_table(),
         ways=tuple(torch.from_numpy(way) for way in routes),
         camera_height=float(stream(_HEIGHT).uniform(*chosen.camera_height)),
     )

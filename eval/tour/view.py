@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from ufmstar_torch.eval.tour.intersect import entry
 from ufmstar_torch.eval.tour.sensor import develop
 from ufmstar_torch.eval.tour.shade import shade
 from ufmstar_torch.eval.tour.tour import Tour
-from ufmstar_torch.eval.tour.visibility import surface_windows
+from ufmstar_torch.eval.tour.visibility import Window, surface_windows
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,29 +74,35 @@ def cast(
         tour, T_world_cam, K, height, width: as :func:`render` takes them, on one device.
         cull: leave out where a primitive cannot be seen; the result is the same without, but slow.
     """
-    s = tour.surfaces
-    origin = ((T_world_cam[:3, 3] - s.centre)[:, :, None] * s.rotation).sum(1) / s.half
-    # Directions in unit coordinates are linear in the pixel's column u and row v: M (u, v, 1).
-    camera = (s.rotation[:, :, :, None] * T_world_cam[:3, None, :3]).sum(1) / s.half[:, :, None]
-    M = (camera[..., None] * torch.linalg.inv(K)).sum(2)
     if cull:
-        windows = surface_windows(tour, T_world_cam, K, height, width).tolist()
+        seen = surface_windows(tour, T_world_cam, K, height, width)
     else:
-        windows = [[0, height, 0, width]] * len(s)
+        seen = [(i, (0, height, 0, width)) for i in range(len(tour.surfaces))]
     u = torch.arange(width, dtype=torch.float64, device=tour.device)
     v = torch.arange(height, dtype=torch.float64, device=tour.device)[:, None]
     depth = torch.full((height, width), float("inf"), dtype=torch.float64, device=tour.device)
     surface = torch.full((height, width), -1, dtype=torch.int64, device=tour.device)
-    table = zip(windows, s.kind.tolist(), s.taper.tolist(), origin.tolist(), M.tolist(), strict=True)
-    for i, ((top, bottom, left, right), kind, taper, o, m) in enumerate(table):
-        if top >= bottom or left >= right:
-            continue
-        x, y, z = (u[left:right] * row[0] + (v[top:bottom] * row[1] + row[2]) for row in m)
+    for (i, (top, bottom, left, right)), (kind, taper, o, M) in zip(
+        seen, _rays(tour, T_world_cam, K, seen), strict=True
+    ):
+        x, y, z = (u[left:right] * m[0] + (v[top:bottom] * m[1] + m[2]) for m in M)
         t = entry(kind, (o[0], o[1], o[2]), (x, y, z), taper)
         part = depth[top:bottom, left:right]
         surface[top:bottom, left:right].masked_fill_(t < part, i)
         torch.minimum(part, t, out=part)
     return depth, surface
+
+
+def _rays(
+    tour: Tour, T_world_cam: Tensor, K: Tensor, seen: list[tuple[int, Window]]
+) -> Iterator[tuple[int, float, list[float], list[list[float]]]]:
+    """Kind, taper, camera o [3] and M [3, 3] of primitives, in whose unit coordinates a ray is o + t M (u, v, 1)."""
+    s, chosen = tour.surfaces, torch.tensor([i for i, _ in seen], dtype=torch.int64, device=tour.device)
+    R, half = s.rotation[chosen], s.half[chosen]
+    o = ((T_world_cam[:3, 3] - s.centre[chosen])[:, :, None] * R).sum(1) / half
+    camera = (R[:, :, :, None] * T_world_cam[:3, None, :3]).sum(1) / half[:, :, None]
+    M = (camera[..., None] * torch.linalg.inv(K)).sum(2)
+    return zip(s.kind[chosen].tolist(), s.taper[chosen].tolist(), o.tolist(), M.tolist(), strict=True)
 
 
 def _directions(T_world_cam: Tensor, K: Tensor, height: int, width: int) -> Tensor:

@@ -5,98 +5,84 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.tour.shapes import NOBODY, QUAD, Surfaces
+from ufmstar_torch.eval.tour.shapes import NOBODY
 from ufmstar_torch.eval.tour.tour import Tour
 
 # Outlines are cut at this depth [m]: what is nearer lies thousands of pixels beside the image, as a camera
 # keeps away from everything.
 _NEAR = 1e-3
-_SIGNS = [[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
-_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if sum(p != q for p, q in zip(_SIGNS[a], _SIGNS[b])) == 1]
+# Corners are numbered by their signs along x, y, z as binary digits; edges join those that differ in one.
+_EDGES = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
+Window = tuple[int, int, int, int]
+_EMPTY: Window = (0, 0, 0, 0)
 
 
-def surface_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> Tensor:
-    """[N, 4] int64 first and last-but-one row, first and last-but-one column that each primitive can touch.
+def surface_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> list[tuple[int, Window]]:
+    """The primitives that can be seen, with the first and last-but-one row and column that each can touch.
 
     A primitive lies within the outline of its corners, and is seen through the doorways that lead to its room.
     """
-    windows = _outlines(_corners(tour.surfaces), T_world_cam, K, height, width)
-    rooms = _room_windows(tour, T_world_cam, K, height, width)
+    rooms = room_windows(tour, T_world_cam, K, height, width)
+    seen = torch.tensor([top < bottom for top, bottom, _, _ in rooms], device=tour.device)
     first, second = tour.surfaces.rooms.unbind(1)
-    seen = rooms[first]
-    both = torch.where((second == NOBODY)[:, None], seen, _union(seen, rooms[second.clamp_min(0)]))
-    return _intersection(windows, both)
+    candidates = torch.nonzero(seen[first] | ((second != NOBODY) & seen[second.clamp_min(0)])).flatten()
+    outlines = _outlines(tour.surfaces.corners[candidates], T_world_cam, K, height, width)
+    found = []
+    for i, (a, b), outline in zip(candidates.tolist(), tour.surfaces.rooms[candidates].tolist(), outlines, strict=True):
+        window = _intersection(outline, rooms[a] if b == NOBODY else _union(rooms[a], rooms[b]))
+        if window is not _EMPTY:
+            found.append((i, window))
+    return found
 
 
-def _corners(surfaces: Surfaces) -> Tensor:
-    """[N, 8, 3] of the boxes around the primitives [m]."""
-    half = surfaces.half.clone()
-    half[:, 1] = torch.where(surfaces.kind == QUAD, 0.0, half[:, 1])
-    wide = surfaces.taper.clamp_min(1.0)
-    half[:, 0], half[:, 2] = half[:, 0] * wide, half[:, 2] * wide
-    local = torch.tensor(_SIGNS, dtype=half.dtype, device=half.device) * half[:, None]
-    turned = (surfaces.rotation[:, None] * local[:, :, None]).sum(-1)
-    return surfaces.centre[:, None] + turned
-
-
-def _outlines(corners: Tensor, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> Tensor:
-    """[N, 4] windows of convex hulls of corners [N, 8, 3], cut where they pass the camera."""
-    R, t = T_world_cam[:3, :3], T_world_cam[:3, 3]
-    camera = ((corners - t)[..., None] * R).sum(-2)  # R^T (p - t)
-    a, b = camera[:, [e[0] for e in _EDGES]], camera[:, [e[1] for e in _EDGES]]
-    crosses = (a[..., 2] < _NEAR) != (b[..., 2] < _NEAR)
-    share = (_NEAR - a[..., 2]) / torch.where(crosses, b[..., 2] - a[..., 2], 1.0)
-    points = torch.cat([camera, a + share[..., None] * (b - a)], dim=1)
-    valid = torch.cat([camera[..., 2] >= _NEAR, crosses], dim=1)
-    x, y, z = points[..., 0], points[..., 1], torch.where(valid, points[..., 2], 1.0).clamp_min(_NEAR / 2)
-    u = (K[0, 0] * x + K[0, 1] * y) / z + K[0, 2]
-    v = K[1, 1] * y / z + K[1, 2]
-    bounds = []
-    for values, size in ((v, height), (u, width)):
-        low = values.masked_fill(~valid, float("inf")).amin(1).floor()
-        high = values.masked_fill(~valid, float("-inf")).amax(1).ceil() + 1
-        bounds += [low.clamp(0, size), high.clamp(0, size)]
-    return torch.stack(bounds, dim=1).long()
-
-
-def _room_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> Tensor:
-    """[R, 4] windows in which each room can be seen, through the doorways from the camera's room."""
-    windows = torch.zeros(len(tour.rooms), 4, dtype=torch.int64)
-    windows[int(tour.room_at(T_world_cam[:3, 3]))] = torch.tensor([0, height, 0, width])
+def room_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> list[Window]:
+    """Where each room can be seen from the camera's own, through the doorways."""
+    windows = [_EMPTY] * len(tour.rooms)
+    windows[int(tour.room_at(T_world_cam[:3, 3]))] = (0, height, 0, width)
     if len(tour.doors) == 0:
-        return windows.to(tour.device)
-    portals = _outlines(_box_corners(tour.doors), T_world_cam, K, height, width).cpu()
+        return windows
+    portals = _outlines(box_corners(tour.doors), T_world_cam, K, height, width)
     pairs = tour.door_rooms.tolist()
     for _ in pairs:  # the rooms are a tree: as many rounds as doorways reach every room
         for portal, (a, b) in zip(portals, pairs, strict=True):
             for here, there in ((a, b), (b, a)):
                 windows[there] = _union(windows[there], _intersection(windows[here], portal))
-    return windows.to(tour.device)
+    return windows
 
 
-def _box_corners(boxes: Tensor) -> Tensor:
-    signs = torch.tensor(_SIGNS, dtype=boxes.dtype, device=boxes.device)
-    low, high = boxes[:, None, 0], boxes[:, None, 1]
-    return torch.where(signs < 0, low, high)
+def box_corners(boxes: Tensor) -> Tensor:
+    """[N, 8, 3] of axis-aligned boxes [N, 2, 3], in the order of their signs as binary digits."""
+    pick = torch.tensor([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], device=boxes.device)
+    return boxes.gather(1, pick.expand(len(boxes), 8, 3))
 
 
-def _intersection(a: Tensor, b: Tensor) -> Tensor:
-    """Windows [..., 4] in both; an empty one has as many rows or columns as none."""
-    low, high = torch.maximum(a[..., 0::2], b[..., 0::2]), torch.minimum(a[..., 1::2], b[..., 1::2])
-    empty = (low >= high).any(-1, keepdim=True)
-    return _interleave(torch.where(empty, 0, low), torch.where(empty, 0, high))
+def _outlines(corners: Tensor, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> list[Window]:
+    """Windows of convex hulls of corners [N, 8, 3], cut where they pass the camera."""
+    R, p = T_world_cam[:3, :3].tolist(), (corners - T_world_cam[:3, 3]).unbind(-1)
+    x, y, z = (p[0] * R[0][k] + p[1] * R[1][k] + p[2] * R[2][k] for k in range(3))  # R^T (p - t)
+    start, end = [a for a, _ in _EDGES], [b for _, b in _EDGES]
+    z_a, z_b = z[:, start], z[:, end]
+    crosses = (z_a < _NEAR) != (z_b < _NEAR)
+    share = (_NEAR - z_a) / torch.where(crosses, z_b - z_a, 1.0)
+    x, y = (torch.cat([c, c[:, start] + share * (c[:, end] - c[:, start])], dim=1) for c in (x, y))
+    valid = torch.cat([z >= _NEAR, crosses], dim=1)
+    z = torch.where(valid, torch.cat([z, torch.full_like(z_a, _NEAR)], dim=1), 1.0)
+    k = K.tolist()
+    bounds = []
+    for values, size in (((k[1][1] * y) / z + k[1][2], height), ((k[0][0] * x + k[0][1] * y) / z + k[0][2], width)):
+        low = values.masked_fill(~valid, float("inf")).amin(1).floor()
+        high = values.masked_fill(~valid, float("-inf")).amax(1).ceil() + 1
+        bounds += [low.clamp(0, size), high.clamp(0, size)]
+    return [_intersection((a, b, c, d), (0, height, 0, width)) for a, b, c, d in torch.stack(bounds, 1).long().tolist()]
 
 
-def _union(a: Tensor, b: Tensor) -> Tensor:
-    """The smallest windows [..., 4] around both; an empty one adds nothing."""
-    low, high = torch.minimum(a[..., 0::2], b[..., 0::2]), torch.maximum(a[..., 1::2], b[..., 1::2])
-    no_a, no_b = (
-        (a[..., 1::2] <= a[..., 0::2]).any(-1, keepdim=True),
-        (b[..., 1::2] <= b[..., 0::2]).any(-1, keepdim=True),
-    )
-    around = _interleave(low, high)
-    return torch.where(no_a, b, torch.where(no_b, a, around))
+def _intersection(a: Window, b: Window) -> Window:
+    top, bottom, left, right = max(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), min(a[3], b[3])
+    return (top, bottom, left, right) if top < bottom and left < right else _EMPTY
 
 
-def _interleave(low: Tensor, high: Tensor) -> Tensor:
-    return torch.stack([low, high], dim=-1).flatten(-2)
+def _union(a: Window, b: Window) -> Window:
+    """The smallest window around both; an empty one adds nothing."""
+    if a is _EMPTY or b is _EMPTY:
+        return b if a is _EMPTY else a
+    return min(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), max(a[3], b[3])

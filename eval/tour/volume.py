@@ -9,30 +9,30 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.tour.intersect import entry
-from ufmstar_torch.eval.tour.shapes import NOBODY, QUAD, Surfaces
+from ufmstar_torch.eval.tour.shapes import NOBODY, Surfaces
 
 GRID = (11, 22, 22)  # points of a room along y, z, x
 # Where a light's rays end, as parts of its size: the corners of a tetrahedron.
 _SAMPLES = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, -1.0))
-_GLOW = 7  # column of ``Surfaces.look``
 _SMALL = 0.05  # half extents below this cast no shadow worth a ray [m]
 
 
-def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tensor) -> Tensor:
+def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tensor, casts: Tensor) -> Tensor:
     """[R, L, *GRID] float32 share of each light in [0, 1] at a room's points.
 
     Args:
         rooms: [R, 2, 3] corners [m].
-        surfaces: the primitives; quads and things that glow cast no shadow.
+        surfaces: the primitives.
         lights: [R, L, 7] positions first [m].
         sizes: [R, L] of the lights [m].
+        casts: [N] bool which primitives cast a shadow.
     """
     found = torch.ones(*lights.shape[:2], *GRID)
     for r, (lower, upper) in enumerate(rooms):
         points = torch.meshgrid(*(torch.linspace(0, 1, n, dtype=torch.float64) for n in GRID), indexing="ij")
         y, z, x = (p.reshape(-1) for p in points)
         xyz = [lower[k] + (upper[k] - lower[k]) * p for k, p in enumerate((x, y, z))]
-        casters = _casters(surfaces, r)
+        casters = _casters(surfaces, casts, r)
         for k in range(lights.shape[1]):
             if not lights[r, k, 3:6].any():
                 continue
@@ -44,10 +44,10 @@ def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tens
     return found
 
 
-def _casters(surfaces: Surfaces, room: int) -> list[int]:
-    own = (surfaces.rooms[:, 0] == room) & (surfaces.rooms[:, 1] == NOBODY) & (surfaces.kind != QUAD)
+def _casters(surfaces: Surfaces, casts: Tensor, room: int) -> list[int]:
+    own = (surfaces.rooms[:, 0] == room) & (surfaces.rooms[:, 1] == NOBODY) & casts
     large = surfaces.half.sort(dim=1).values[:, 1] > _SMALL
-    return [int(i) for i in torch.nonzero(own & large & (surfaces.look[:, _GLOW] == 0)).flatten()]
+    return [int(i) for i in torch.nonzero(own & large).flatten()]
 
 
 def _visible(xyz: list[Tensor], light: Tensor, surfaces: Surfaces, casters: list[int]) -> Tensor:
