@@ -1,16 +1,25 @@
-"""The members of an ensemble on disk: which are finished, and what came out."""
+"""The members of an ensemble: which are finished, and training those that are not, in turn or side by side."""
 
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from ufmstar_torch.models.checkpoints import fill, read_safetensors
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import read_info
-from ufmstar_torch.train.member import RESULT, Job
+from ufmstar_torch.train.member import RESULT, Job, train_member
+
+_POLL_SECONDS = 0.2
 
 
 def read_result(job: Job, member: int) -> dict[str, Any]:
@@ -19,14 +28,90 @@ def read_result(job: Job, member: int) -> dict[str, Any]:
     return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
 
 
-def finished(job: Job, member: int) -> bool:
-    """Whether a member needs no more training."""
-    return bool(read_result(job, member).get("finished"))
+def unfinished(job: Job) -> list[int]:
+    """The members that need training."""
+    return [member for member in range(job.recipe.members) if not read_result(job, member).get("finished")]
 
 
-def stored_networks(path: Path) -> DepthNetwork:
+def stored_network(path: Path) -> DepthNetwork:
     """The one network in a member's file, in the form that it is trained in."""
     network = build_network(read_info(path).spec)
     state, _ = read_safetensors(path, prefix="member.0.")
-    fill(network, {name: value.float() if value.is_floating_point() else value for name, value in state.items()}, str(path))
+    fill(network, {k: value.float() if value.is_floating_point() else value for k, value in state.items()}, str(path))
     return network
+
+
+def train_members(job: Job, *, end: float | None = None, asked: Callable[[], bool] | None = None) -> str | None:
+    """Train the members that are not finished.
+
+    Args:
+        job: what and how; ``settings.member_processes`` of them at the same time.
+        end: ``time.monotonic()`` at which all of it has to stop, or None. What is left of the time is divided evenly,
+            so that no member goes without.
+        asked: whether somebody wants it to stop.
+
+    Returns:
+        None when all are finished, otherwise why not.
+    """
+    members = unfinished(job)
+    if job.settings.member_processes > 1 and len(members) > 1:
+        return _side_by_side(job, members, end, asked)
+    reasons = []
+    for turn, member in enumerate(members):
+        if asked is not None and asked():
+            break
+        reasons.append(train_member(job, member, deadline=share_of_time(end, len(members) - turn), asked=asked))
+    return _why([*reasons, *([] if len(reasons) == len(members) else ["stopped"])])
+
+
+def share_of_time(end: float | None, turns: int) -> float | None:
+    """When the first of ``turns`` equal turns from now on to ``end`` is over, in ``time.monotonic()``'s seconds."""
+    now = time.monotonic()
+    return None if end is None else now + max(0.0, end - now) / turns
+
+
+def _side_by_side(
+    job: Job, members: Sequence[int], end: float | None, asked: Callable[[], bool] | None
+) -> str | None:
+    """Each member in a process of its own, on a GPU of its own where there are some."""
+    context = get_context("spawn")
+    count = min(job.settings.member_processes, len(members))
+    stop, slots = context.Event(), context.Queue()
+    for slot in range(count):
+        slots.put(slot)
+    job = replace(job, settings=replace(job.settings, progress=False))
+    with ProcessPoolExecutor(count, context, _join, (stop, slots, count)) as pool:
+        turns = [-(-(len(members) - i) // count) for i in range(len(members))]
+        waiting = [pool.submit(_in_worker, job, m, end, n) for m, n in zip(members, turns, strict=True)]
+        while not all(future.done() for future in waiting):
+            if asked is not None and asked():
+                stop.set()
+            if any(future.done() and future.exception() is not None for future in waiting):
+                stop.set()
+            time.sleep(_POLL_SECONDS)
+    return _why([future.result() for future in waiting])
+
+
+def _why(reasons: Sequence[str | None]) -> str | None:
+    return next((reason for reason in reasons if reason is not None), None)
+
+
+class _Worker:
+    """What a worker process knows of its place."""
+
+    stop: Any = None
+    slot: int = 0
+
+
+def _join(stop: Any, slots: Any, count: int) -> None:
+    _Worker.stop, _Worker.slot = stop, slots.get()
+    torch.set_num_threads(max(1, torch.get_num_threads() // count))
+
+
+def _in_worker(job: Job, member: int, end: float | None, turns: int) -> str | None:
+    if _Worker.stop.is_set():
+        return "stopped"
+    if torch.cuda.is_available() and job.settings.accelerator in ("auto", "gpu", "cuda"):
+        device = f"{_Worker.slot % torch.cuda.device_count()},"
+        job = replace(job, settings=replace(job.settings, devices=device))
+    return train_member(job, member, deadline=share_of_time(end, turns), asked=_Worker.stop.is_set)

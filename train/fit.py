@@ -1,54 +1,108 @@
-"""Train what a recipe says: every member in turn, then all of them in one file."""
+"""Train what a recipe says: every member, then all of them in one file, with a summary."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict
 from typing import Any
 
+import torch
+from lightning.pytorch.utilities import rank_zero_only
+
+from ufmstar_torch.eval.benchmark_machine import hardware, versions
 from ufmstar_torch.eval.files import write_json_atomic
 from ufmstar_torch.models.trained import save_trained
-from ufmstar_torch.train.ensemble import finished, read_result, stored_networks
-from ufmstar_torch.train.member import WEIGHTS, Job, train_member
+from ufmstar_torch.train.ensemble import read_result, stored_network, train_members
+from ufmstar_torch.train.folder import SUMMARY, open_folder
+from ufmstar_torch.train.member import WEIGHTS, Job
+
+# Figures that describe a validation, in metrics.csv's names.
+FIGURES = ("val_nll", "val_nll_constant", "val_nll_constant_best", "val_delta1", "val_rmse", "val_rel")
 
 
-def fit(job: Job, *, asked: Callable[[], bool] | None = None) -> dict[str, Any]:
+def fit(
+    job: Job,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    asked: Callable[[], bool] | None = None,
+    command: Sequence[str] = (),
+) -> dict[str, Any]:
     """Train all members that are not finished, and write OUT/trained.safetensors and OUT/summary.json.
 
     Args:
         job: what and how.
+        resume, overwrite: what to do with an earlier training in the folder; see ``folder.open_folder``.
         asked: whether somebody wants it to stop; the step in hand is finished and kept.
+        command: that was given, for the summary.
 
     Returns:
-        The summary.
+        The summary; its "stopped" says why not everything is finished.
+
+    Raises:
+        FolderError: the folder cannot be used as asked.
+        NonFiniteLossError: a training has diverged. The members that were finished are written before.
+        ResumeError: a checkpoint cannot be read.
     """
     began = time.monotonic()
-    r, s = job.recipe, job.settings
-    s.out.mkdir(parents=True, exist_ok=True)
-    stopped: str | None = None
-    for member in range(r.members):
-        if finished(job, member):
-            continue
-        deadline = None
-        if s.max_minutes:
-            # What is left of the time is divided among the members that are left, so that none goes without.
-            left = began + 60 * s.max_minutes - time.monotonic()
-            deadline = time.monotonic() + max(0.0, left) / sum(not finished(job, m) for m in range(member, r.members))
-        reason = train_member(job, member, deadline=deadline, asked=asked)
-        stopped = reason or stopped
-        if asked is not None and asked():
-            break
-    return _conclude(job, stopped, time.monotonic() - began)
+    end = began + 60 * job.settings.max_minutes if job.settings.max_minutes else None
+    # Other processes of a distributed training find the folder prepared by the first.
+    first = rank_zero_only.rank == 0
+    with open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext():
+        stopped: str | None = "failed"
+        try:
+            stopped = train_members(job, end=end, asked=asked)
+        finally:
+            if first:
+                summary = conclude(job, stopped, time.monotonic() - began, command)
+    return summary if first else {"stopped": stopped}
 
 
-def _conclude(job: Job, stopped: str | None, seconds: float) -> dict[str, Any]:
-    """One file of all members that have weights, and the summary."""
+def conclude(job: Job, stopped: str | None, seconds: float, command: Sequence[str] = ()) -> dict[str, Any]:
+    """Write one file of all members that have weights, and the summary."""
     r, out = job.recipe, job.settings.out
     members = [m for m in range(r.members) if (job.folder(m) / WEIGHTS).is_file()]
     results = [read_result(job, m) for m in members]
-    summary = {"recipe": r.to_dict(), "stopped": stopped, "seconds": round(seconds, 1), "members": results}
+    summary = {
+        "program": "ufmstar train",
+        "command": list(command),
+        "stopped": stopped,
+        "recipe": r.to_dict(),
+        "data": asdict(job.data),
+        "settings": asdict(job.settings),
+        "mean": mean_figures(results),
+        "members": results,
+        "seconds": round(seconds, 1),
+        "versions": versions(),
+        "hardware": {**hardware(), "threads": torch.get_num_threads(), "gpus": gpus()},
+    }
     if members:
-        networks = [stored_networks(job.folder(m) / WEIGHTS) for m in members]
-        save_trained(out / WEIGHTS, networks, r.network, half=r.half, info=summary)
-    write_json_atomic(out / "summary.json", summary)
+        networks = [stored_network(job.folder(m) / WEIGHTS) for m in members]
+        info = {"recipe": r.to_dict(), "mean": summary["mean"], "command": list(command)}
+        save_trained(out / WEIGHTS, networks, r.network, half=r.half, info=info)
+    write_json_atomic(out / SUMMARY, summary)
     return summary
+
+
+def mean_figures(results: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """The members' last validation figures, averaged over members (not: of the ensemble)."""
+    told = [result["figures"] for result in results if result.get("figures")]
+    common = [name for name in FIGURES if told and all(name in figures for figures in told)]
+    return {name: sum(figures[name] for figures in told) / len(told) for name in common}
+
+
+def report(summary: dict[str, Any]) -> str:
+    """The members' figures as a table."""
+    rows = [("member", "steps", "seconds", *FIGURES)]
+    for result in summary["members"]:
+        figures = [f"{result['figures'][name]:.4g}" if name in result["figures"] else "-" for name in FIGURES]
+        rows.append((str(result["member"]), str(result["steps"]), f"{result['seconds']:g}", *figures))
+    spaces = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join("  ".join(cell.rjust(s) for cell, s in zip(row, spaces, strict=True)) for row in rows)
+
+
+def gpus() -> list[str]:
+    """Names of the GPUs there are."""
+    return [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]

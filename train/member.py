@@ -11,18 +11,18 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from torch import nn
-
+from lightning.pytorch.callbacks import TQDMProgressBar
 from ufmstar_torch.eval.files import write_json_atomic
-from ufmstar_torch.models.spec import build_network
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, read_checkpoint
 from ufmstar_torch.train.data import DataConfig, DepthDataModule
+from ufmstar_torch.train.examples import Examples
 from ufmstar_torch.train.history import METRICS, History, read_rows
 from ufmstar_torch.train.module import TrainingModule, step_seed
 from ufmstar_torch.train.presets import Recipe
 from ufmstar_torch.train.settings import FitSettings
-from ufmstar_torch.train.start import start_from
+from ufmstar_torch.train.start import starting_network, train_only
 
 WEIGHTS, RESULT = "trained.safetensors", "result.json"
 
@@ -50,12 +50,13 @@ class Job:
         return self.settings.seed + member
 
 
-def new_network(job: Job, member: int) -> nn.Module:
+def new_network(job: Job, member: int) -> DepthNetwork:
     """The network that a member starts with; the same for the same seed, whatever was drawn before."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_seed(job.seed(member), 0, -1))
-        network = build_network(job.recipe.network)
-    return start_from(network, job.recipe.network, job.settings)
+        network = starting_network(job.recipe.network, job.settings.init, member)
+    train_only(network, job.settings.trainable)
+    return network.train()
 
 
 def train_member(
@@ -83,9 +84,12 @@ def train_member(
     start = (0, 0.0) if stored is None else (int(stored["global_step"]), float(stored["ufmstar_seconds"]))
     stops = Stops(deadline, asked)
     history = History(folder, s.log_every, start)
+    callbacks = [stops, history, Checkpoints(checkpoint, s.checkpoint_every)]
     with quiet_lightning(), torch.random.fork_rng():
-        trainer = make_trainer(job, member, [stops, history, Checkpoints(checkpoint, s.checkpoint_every)])
+        trainer = make_trainer(job, member, callbacks)
         data = make_data(job, member, trainer.world_size)
+        if s.examples:
+            trainer.callbacks.insert(0, Examples(folder, data, s.examples, epochs(job, data)))
         module = TrainingModule(new_network(job, member), job.recipe, total_steps(job, data), job.seed(member))
         trainer.fit(module, data, ckpt_path=None if stored is None else checkpoint, weights_only=True)
     if trainer.is_global_zero:
@@ -114,17 +118,26 @@ def total_steps(job: Job, data: DepthDataModule) -> int:
     Raises:
         ValueError: an epoch has no full batch.
     """
+    return job.recipe.max_steps or job.recipe.epochs * _steps_per_epoch(job, data)
+
+
+def epochs(job: Job, data: DepthDataModule) -> int:
+    """How many epochs are begun."""
+    return -(-total_steps(job, data) // _steps_per_epoch(job, data))
+
+
+def _steps_per_epoch(job: Job, data: DepthDataModule) -> int:
     images, batch = len(data.train_set or ()), job.recipe.batch_size
     if images < batch:
         raise ValueError(f"the training part has {images} images, fewer than batch_size {batch}")
-    return job.recipe.max_steps or job.recipe.epochs * (images // batch)
+    return images // batch
 
 
 def make_trainer(job: Job, member: int, callbacks: Sequence[pl.Callback]) -> pl.Trainer:
     """Lightning's trainer; nothing of it writes checkpoints but :class:`Checkpoints`."""
     r, s = job.recipe, job.settings
     return pl.Trainer(
-        accelerator=s.accelerator,
+        accelerator=("gpu" if torch.cuda.is_available() else "cpu") if s.accelerator == "auto" else s.accelerator,
         devices=s.devices,
         num_nodes=s.nodes,
         strategy=s.strategy,
@@ -133,7 +146,8 @@ def make_trainer(job: Job, member: int, callbacks: Sequence[pl.Callback]) -> pl.
         max_steps=r.max_steps or -1,
         gradient_clip_val=r.clip or None,
         logger=tensorboard(job, member),
-        callbacks=list(callbacks),
+        callbacks=[*callbacks, *([TQDMProgressBar(leave=True)] if s.progress else [])],
+        sync_batchnorm=s.sync_batchnorm,
         plugins=[AtomicCheckpointIO()],
         log_every_n_steps=1,
         enable_checkpointing=False,

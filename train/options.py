@@ -27,7 +27,7 @@ KINDS = ("nyu", "sequences", "tour")
 _TAKEN = ("kind", "paths", "batch_size", "seed", "augmentation")
 _SETTINGS_HELP = {
     "seed": "of member 0; member n has seed + n",
-    "init": "trained checkpoint, FastDepth's ONNX file, or ResNet weights to start from",
+    "init": "weights to start from: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth or the word imagenet",
     "trainable": "train only parameters whose names begin so",
     "accelerator": "cpu, gpu or auto",
     "devices": "number of processes or GPUs, as Lightning takes it",
@@ -37,6 +37,7 @@ _SETTINGS_HELP = {
     "member_processes": "members that are trained at the same time",
     "checkpoint_every": "steps between checkpoints within an epoch, 0 = at the end of epochs only",
     "log_every": "steps between rows of steps.csv",
+    "sync_batchnorm": "whether batch norm uses the batches of all processes (GPUs only)",
     "examples": "validation images in each epoch's picture, 0 = no pictures",
     "max_minutes": "after which this session stops in good order, all members together; --resume goes on",
 }
@@ -116,7 +117,9 @@ def recipe_from(options: Mapping[str, Any]) -> Recipe:
     recipe = preset(options["preset"])
     network = {k: v for k, v in options["network"].items() if v is not None}
     own = {f.name: options[f.name] for f in fields(Recipe) if f.name not in ("network", "members")}
-    recipe = replace(recipe, network=replace(recipe.network, **network), **{k: v for k, v in own.items() if v is not None})
+    recipe = replace(
+        recipe, network=replace(recipe.network, **network), **{k: v for k, v in own.items() if v is not None}
+    )
     return recipe if options["members"] is None else recipe.with_members(options["members"])
 
 

@@ -11,7 +11,7 @@ class FitSettings:
     """Attributes:
         out: folder for everything that is written.
         seed: of member 0; member n has seed + n.
-        init: checkpoint to start from, or None; see ``train.start``.
+        init: weights to start from, or None; see ``train.start.starting_network``.
         trainable: only parameters whose names begin so are trained; empty = all of them.
         accelerator, devices, nodes, strategy, precision: as Lightning's Trainer takes them.
         member_processes: members that are trained at the same time, each in a process of its own.
@@ -19,6 +19,7 @@ class FitSettings:
         log_every: steps between rows of steps.csv.
         examples: validation images in the picture that every epoch leaves, 0 = no pictures.
         max_minutes: after which this session stops in good order, over all members; 0 = never.
+        sync_batchnorm: whether batch norm uses the statistics of the batches of all processes (GPUs only).
         tensorboard: whether to write logs for TensorBoard.
         progress: whether to show a progress bar.
 
@@ -40,6 +41,7 @@ class FitSettings:
     log_every: int = 50
     examples: int = 4
     max_minutes: float = 0.0
+    sync_batchnorm: bool = False
     tensorboard: bool = True
     progress: bool = True
 

@@ -1,13 +1,120 @@
-"""Where a training starts: weights that are already there, and which parameters may change."""
+"""Where a training starts: from nothing or from weights that are there, and which parameters may change."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
 from torch import nn
 
-from ufmstar_torch.models.spec import NetworkSpec
-from ufmstar_torch.train.settings import FitSettings
+from ufmstar_torch.models.checkpoints import CheckpointError, fill, read_safetensors
+from ufmstar_torch.models.network import Backbone, DepthNetwork
+from ufmstar_torch.models.spec import NetworkSpec, build_backbone, build_network
+from ufmstar_torch.models.trained import read_info
+
+IMAGENET = "imagenet"
+WAYS = f"trained .safetensors, FastDepth's .onnx, ResNet weights (.pth, or {IMAGENET!r}), or Monodepth2's folder"
 
 
-def start_from(network: nn.Module, spec: NetworkSpec, settings: FitSettings) -> nn.Module:
-    """The network with the weights of ``settings.init``, and only ``settings.trainable`` left to train."""
-    return network
+def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> DepthNetwork:
+    """The network of a spec with the weights of a file; what the file does not have comes from torch's generator.
+
+    Args:
+        spec: what to build.
+        init: None, or one of: a file that this program trained (the same method: all of it; another one: its
+            encoder and decoder, below a new head); FastDepth's weights as .onnx; the ImageNet weights of a ResNet in
+            torchvision's keys, or "imagenet", which torchvision downloads; the folder with Monodepth2's
+            encoder.pth and depth.pth.
+        member: number in an ensemble; of a trained ensemble it starts from the same member.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: the file is damaged or does not fit.
+        ValueError: the file holds another architecture than the spec's; the message says which options fit.
+    """
+    if init is None:
+        return build_network(spec)
+    if init.suffix == ".safetensors" and _is_trained(init):
+        return _from_trained(spec, init, member)
+    if spec.architecture == "fastdepth":
+        return build_network(spec, _from_onnx(spec, init))
+    return build_network(spec, _from_resnet(spec, init))
+
+
+def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
+    """Leave only the parameters whose names begin with one of ``prefixes`` to be trained, in place.
+
+    Returns:
+        How many numbers that are.
+
+    Raises:
+        ValueError: a prefix fits no parameter; the message names the parts there are.
+    """
+    names = [name for name, _ in network.named_parameters()]
+    for prefix in prefixes:
+        if not any(name.startswith(prefix) for name in names):
+            parts = sorted({".".join(name.split(".")[:2]) for name in names})
+            raise ValueError(f"trainable: no parameter begins with {prefix!r}; there are {', '.join(parts)}")
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(not prefixes or name.startswith(tuple(prefixes)))
+    return sum(p.numel() for p in network.parameters() if p.requires_grad)
+
+
+def _is_trained(path: Path) -> bool:
+    try:
+        read_info(path)
+    except CheckpointError:
+        return False
+    return True
+
+
+def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
+    """The whole network where the spec is the file's but for input and dropout, otherwise its backbone."""
+    info = read_info(path)
+    state, _ = read_safetensors(path, prefix=f"member.{member % info.networks}.")
+    state = {key: value.float() if value.is_floating_point() else value for key, value in state.items()}
+    source = build_network(info.spec)
+    fill(source, state, str(path))
+    own = replace(info.spec, size=spec.size, preprocess=spec.preprocess, dropout=spec.dropout, method=spec.method)
+    own = replace(own, members=spec.members)
+    if own != spec:
+        raise ValueError(f"init: {path} holds {info.spec}, which does not fit {spec}")
+    if (info.spec.method, info.spec.members) == (spec.method, spec.members):
+        network: DepthNetwork = build_network(spec)
+        fill(network, source.state_dict(), str(path))
+        return network
+    if info.spec.method == "batch_ensemble":
+        raise ValueError(f"init: {path} holds a batch_ensemble, whose backbone is not one network's")
+    backbone = build_backbone(spec)
+    fill(backbone, source.backbone.state_dict(), str(path))
+    return build_network(spec, backbone)
+
+
+def _from_onnx(spec: NetworkSpec, path: Path) -> Backbone:
+    from ufmstar_torch.models.fastdepth import FastDepth
+
+    if path.suffix != ".onnx":
+        raise ValueError(f"init: a fastdepth starts from .onnx or a trained .safetensors, got {path}")
+    backbone = build_backbone(spec)
+    source = FastDepth.from_onnx(path, dropout=spec.dropout, size=spec.size)
+    if not isinstance(backbone, FastDepth) or source.widths != backbone.widths:
+        raise ValueError(f"init: {path} has the channels {source.widths}; --network.widths pruned or full may fit")
+    fill(backbone, source.state_dict(), f"{path} (--network.norm {'true' if spec.norm else 'false'})")
+    return backbone
+
+
+def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
+    from ufmstar_torch.models.monodepth2 import MonodepthResNet
+    from ufmstar_torch.models.monodepth2_import import load_monodepth2
+
+    backbone = build_backbone(spec)
+    if not isinstance(backbone, MonodepthResNet):
+        raise ValueError(f"init: {path} is no start for {spec.architecture}; expected {WAYS}")
+    if path.is_dir():
+        load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
+        return backbone
+    weights = None if str(path) == IMAGENET else path
+    source = MonodepthResNet.imagenet(weights, spec.layers, strides=spec.strides)
+    backbone.encoder.load_state_dict(source.encoder.state_dict())
+    return backbone

@@ -87,32 +87,39 @@ def bench(arguments: Sequence[str]) -> int:
 
 
 def train(arguments: Sequence[str]) -> int:
-    """networks with an uncertainty head, or ensembles of them"""
+    """a network with an uncertainty head, or an ensemble of them"""
     from jsonargparse import ArgumentError
 
     from ufmstar_torch.train.options import job_from, parse_train, train_parser
-    from ufmstar_torch.train.presets import table
 
     try:
         options = parse_train(train_parser(), arguments)
         if options["list"]:
+            from ufmstar_torch.train.presets import table
+
             print(table())
             return OK
         _set_threads(options["threads"])
         job = job_from(options)
-    except (ArgumentError, ImportError, OSError, TypeError, ValueError) as error:
+    except (ArgumentError, ImportError, OSError, ValueError) as error:
         raise UsageError(_one_line(error)) from error
-    from ufmstar_torch.train.fit import fit
+    from ufmstar_torch.train.fit import fit, report
 
+    how = {"resume": options["resume"], "overwrite": options["overwrite"]}
     try:
-        with _stop_signals(lambda text: print(text, file=sys.stderr)) as stop:
-            summary = fit(job, asked=stop)
+        with _stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
+            summary = fit(job, asked=stop, command=["ufmstar", "train", *arguments], **how)
     except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
         if options["debug"]:
             traceback.print_exc()
         return _told(f"ufmstar train: failed: {_one_line(error)}", FAILED)
-    print(f"{job.settings.out}: trained.safetensors, summary.json")
-    return OK if summary["stopped"] is None else _told(f"ufmstar train: {summary['stopped']}", INTERRUPTED)
+    if "members" not in summary:
+        return OK  # a further process of a distributed training: the first one tells
+    print(report(summary))
+    print(f"{job.settings.out}: trained.safetensors, summary.json, member_*/, tensorboard/")
+    if summary["stopped"] is None:
+        return OK
+    return _told(f"ufmstar train: {summary['stopped']}; --resume goes on", INTERRUPTED)
 
 
 def demo(arguments: Sequence[str]) -> int:
@@ -265,8 +272,8 @@ class _Bars:
 
 
 @contextmanager
-def _stop_signals(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM end the run after the frame in hand; a second one ends it at once.
+def _stop_signals(say: Callable[[str], None], what: str = "frame") -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM end the run after the frame (or step) in hand; a second one ends it at once.
 
     Yields:
         Whether one has come.
@@ -277,7 +284,7 @@ def _stop_signals(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
         received.append(number)
         if len(received) > 1:
             raise KeyboardInterrupt
-        say("stopping after this frame; once more stops at once")
+        say(f"stopping after this {what}; once more stops at once")
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -1,0 +1,92 @@
+"""Example predictions: after a validation, a picture of image, depth, sigma and error of some of its frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.plots import FramePanel, contact_sheet, fit_scales, map_columns
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.train.data import DepthDataModule
+from ufmstar_torch.train.module import TrainingModule
+from ufmstar_torch.train.samples import Sample
+
+FOLDER = "examples"
+# A long training leaves about so many pictures, not one per epoch.
+PICTURES = 20
+
+
+class Examples(pl.Callback):
+    """Draws ``examples/epoch_007.png`` in the member's folder, on the first process.
+
+    Args:
+        folder: of the member.
+        data: whose validation part is shown.
+        count: frames, spread over the validation part.
+        epochs: of the training; the last one is drawn always.
+    """
+
+    def __init__(self, folder: Path, data: DepthDataModule, count: int, epochs: int) -> None:
+        self.folder = folder / FOLDER
+        self.data = data
+        self.count = count
+        self.last = epochs - 1
+        self.every = max(1, epochs // PICTURES)
+
+    def on_validation_end(self, trainer: pl.Trainer, module: TrainingModule) -> None:
+        """Draw, if it is this epoch's turn."""
+        epoch = trainer.current_epoch
+        due = epoch % self.every == 0 or epoch == self.last or trainer.should_stop
+        frames = self.data.validation_set
+        if not (trainer.is_global_zero and due) or frames is None or not len(frames):
+            return
+        self.folder.mkdir(exist_ok=True)
+        chosen = sorted(set(np.linspace(0, len(frames) - 1, self.count).round().astype(int).tolist()))
+        samples = [(frames.source.name(n), frames[n]) for n in chosen]
+        title = f"epoch {epoch}, step {trainer.global_step}"
+        draw_examples(self.folder / f"epoch_{epoch:03}.png", module.result, self.data.preprocess, samples, title)
+
+
+@torch.no_grad()
+def draw_examples(
+    path: Path, network: torch.nn.Module, preprocess: Preprocess, samples: list[tuple[str, Sample]], title: str
+) -> None:
+    """Write a sheet of what a network says of some samples.
+
+    Args:
+        path: of the PNG.
+        network: a ``DepthNetwork`` in eval mode.
+        preprocess: the network's, to show the image as it was.
+        samples: names and samples.
+        title: of the sheet.
+    """
+    panels = [_panel(network, preprocess, name, sample) for name, sample in samples]
+    columns = map_columns(fit_scales(panels), with_error=True)
+    if not any(panel.sigma.any() for panel in panels):
+        columns = [column for column in columns if column.field != "sigma"]
+    contact_sheet(panels, path, title=title, columns=columns)
+
+
+def _panel(network: torch.nn.Module | DepthNetwork, preprocess: Preprocess, name: str, sample: Sample) -> FramePanel:
+    device = next(network.parameters()).device
+    prediction = network(sample["image"][None].to(device))
+    depth = prediction.depth[0].float().cpu().numpy()
+    variance = np.zeros_like(depth)
+    for part in (prediction.aleatoric_variance, prediction.epistemic_variance):
+        variance = variance if part is None else variance + part[0].float().cpu().numpy()
+    truth, valid = sample["depth"].numpy(), sample["valid"].numpy()
+    error = np.where(valid, np.abs(depth - truth), np.nan).astype(np.float32)
+    image = camera_image(sample["image"], preprocess)
+    return FramePanel(Path(name).name[-24:], image, depth, np.sqrt(variance), error)
+
+
+def camera_image(image: Tensor, preprocess: Preprocess) -> np.ndarray:
+    """[H, W, 3] uint8 what the camera saw, from the network's input [3, H, W]."""
+    std, mean = image.new_tensor(preprocess.std)[:, None, None], image.new_tensor(preprocess.mean)[:, None, None]
+    unit = (image * std + mean) / preprocess.value_range
+    return (unit.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
