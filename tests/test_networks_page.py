@@ -1,0 +1,71 @@
+"""docs/networks.md: every piece of code on the page runs, in order, on small files of the names it uses."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from onnx_files import small_network, write_fastdepth
+from test_monodepth2 import classifier_weights, published_decoder, write_published
+from torch import nn
+
+from ufmstar_torch.models.heads import UncertaintyNetwork
+from ufmstar_torch.models.monodepth2 import DECODER_WIDTHS
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "networks.md"
+TITLES = re.findall(r"^## (.+)$", PAGE.read_text(), flags=re.MULTILINE)
+
+
+def blocks() -> list[str]:
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+
+
+def write_glpn(folder: Path) -> None:
+    """A tiny GLPN with random weights, as ``save_pretrained`` leaves it."""
+    import transformers
+
+    config = transformers.GLPNConfig(
+        depths=[1, 1, 1, 1], hidden_sizes=[8, 8, 16, 16], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=8
+    )
+    transformers.GLPNForDepthEstimation(config).save_pretrained(folder)
+    processor = {"do_rescale": True, "do_resize": True, "do_normalize": False, "size": {"height": 64, "width": 64}}
+    (folder / "preprocessor_config.json").write_text(json.dumps({"image_processor_type": "X", **processor}))
+
+
+def write_files(folder: Path) -> None:
+    """Small networks under the names that the page uses."""
+    torch.manual_seed(0)
+    write_fastdepth(folder / "fastdepth_nyu.onnx", small_network())
+    weights = classifier_weights(50)
+    half = {k: v.half() if v.is_floating_point() else v for k, v in weights.items() if not k.startswith("fc.")}
+    torch.save(half, folder / "resnet50_v1.pth")
+    write_published(folder, classifier_weights(18), published_decoder((64, 64, 128, 256, 512), DECODER_WIDTHS))
+    network, image = nn.Conv2d(3, 1, 3, padding=1).eval(), torch.rand(1, 3, 64, 64)
+    torch.jit.save(torch.jit.trace(network, image), str(folder / "network.ts"))
+    torch.export.save(torch.export.export(network, (image,)), folder / "network.pt2")
+    write_fastdepth(folder / "network.onnx", small_network())
+    write_glpn(folder / "glpn-nyu")
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
+def test_every_piece_of_code_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    scope: dict[str, Any] = {}
+    for code in blocks():
+        exec(compile(code, PAGE.name, "exec"), scope)
+    assert len(blocks()) >= 4
+    printed = capsys.readouterr().out
+    assert "140 tensors; left as they were: ('head.bias', 'head.weight')" in printed
+    assert scope["baseline"].epistemic_variance.mean() > 0
+    assert isinstance(scope["single"].networks[0].network, UncertaintyNetwork)
+
+
+def test_the_sections_are_there() -> None:
+    assert {"FastDepth", "ResNet50-Monodepth2", "Any other network"} <= set(TITLES)
