@@ -27,9 +27,9 @@ from ufmstar_torch.pipeline import combine
 from ufmstar_torch.prediction import DepthPrediction
 
 INITS = ("normal", "sign")
-# [1] Spread of the factors around 1 for init="normal": the members start near the weights they are given,
-# which may be pretrained. The paper's random signs suit a start from scratch; they undo trained weights.
-INIT_STD = 0.1
+# [1] Spread of the factors around 1 for init="normal", as in the published implementations. Less of it keeps
+# the members nearer to pretrained weights and to each other; random signs undo trained weights altogether.
+INIT_STD = 0.5
 _PLAIN = (nn.Conv2d, nn.Linear)
 
 Network = TypeVar("Network", bound=nn.Module)

@@ -56,7 +56,8 @@ class LazyMember(DepthNetwork):
         preprocess: the network's, which is needed before it is loaded.
         name: for error messages.
         offload: keep the weights in host memory and copy them to the device for the length of a call only.
-            On the CPU there is nothing to copy.
+            On the CPU there is nothing to copy. Members that share weights (of a BatchEnsemble) must not be
+            called from several threads at once then.
     """
 
     _where: Tensor
@@ -71,7 +72,7 @@ class LazyMember(DepthNetwork):
         self._load = load
         # In a dict, so that nn.Module does not count it among its parts.
         self._held: dict[str, DepthNetwork] = {}
-        self._lock = threading.Lock()
+        self._loading, self._turn = threading.Lock(), threading.Lock()
         self.register_buffer("_where", torch.zeros(0), persistent=False)
         self.eval()
 
@@ -86,7 +87,7 @@ class LazyMember(DepthNetwork):
         Raises:
             CheckpointError: it cannot be loaded; the message has its name and the reason.
         """
-        with self._lock:  # a second thread waits instead of loading it twice
+        with self._loading:  # a second thread waits instead of loading it twice
             if not self._held:
                 self._held["network"] = self._placed(self._loaded())
             return self._held["network"]
@@ -95,6 +96,8 @@ class LazyMember(DepthNetwork):
         try:
             network = self._load()
         except (OSError, RuntimeError, ValueError) as error:
+            if isinstance(error, CheckpointError) and self.name in str(error):
+                raise
             raise CheckpointError(f"{self.name} cannot be loaded: {error}") from error
         if not isinstance(network, DepthNetwork):
             raise CheckpointError(f"{self.name} must be a DepthNetwork, got {type(network).__name__}")
@@ -114,7 +117,8 @@ class LazyMember(DepthNetwork):
         tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
         # Copies for this call: nothing has to be copied back, and none is left behind by an error.
         there = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
-        return functional_call(network, there, (image,))
+        with self._turn:  # the call puts them into the network while it lasts
+            return functional_call(network, there, (image,))
 
     def train(self, mode: bool = True) -> LazyMember:
         """Also for a network that is loaded later."""
@@ -134,11 +138,11 @@ class LazyMember(DepthNetwork):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies and pickles: without the lock, and not loaded."""
-        return {**self.__dict__, "_held": {}, "_lock": None}
+        """For copies and pickles: without locks, and not loaded."""
+        return {**self.__dict__, "_held": {}, "_loading": None, "_turn": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__({**state, "_lock": threading.Lock()})
+        super().__setstate__({**state, "_loading": threading.Lock(), "_turn": threading.Lock()})
 
     def extra_repr(self) -> str:
         """Whether it is loaded."""

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from ufmstar_torch.models.batch_ensemble import BatchEnsemble
-from ufmstar_torch.models.heads import AleatoricNetwork, DepthOnlyNetwork, EvidentialNetwork, UncertaintyNetwork
+from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble
+from ufmstar_torch.models.heads import HEADS, UncertaintyNetwork, with_head
 from ufmstar_torch.models.network import Backbone
 from ufmstar_torch.models.preprocess import Preprocess
 
@@ -137,7 +137,9 @@ def build_backbone(spec: NetworkSpec) -> Backbone:
     return backbone
 
 
-def build_network(spec: NetworkSpec, backbone: Backbone | None = None) -> UncertaintyNetwork | BatchEnsemble:
+def build_network(
+    spec: NetworkSpec, backbone: Backbone | None = None, *, init: str = "normal", std: float = INIT_STD
+) -> UncertaintyNetwork | BatchEnsemble:
     """The network that ``spec`` describes, for training; "mc_dropout" does not sample by itself yet
     (``MonteCarloDropout`` makes it do so).
 
@@ -145,11 +147,12 @@ def build_network(spec: NetworkSpec, backbone: Backbone | None = None) -> Uncert
         spec: what to build.
         backbone: with pretrained weights, as :func:`build_backbone` makes it; it becomes part of the
             network (a "batch_ensemble" takes a copy). None: random weights.
+        init, std: how the factors of a "batch_ensemble" begin; see ``convert``.
     """
     backbone = build_backbone(spec) if backbone is None else backbone
-    heads: dict[str, type[UncertaintyNetwork]] = {"depth": DepthOnlyNetwork, "evidential": EvidentialNetwork}
-    network = heads.get(spec.method, AleatoricNetwork)(backbone)
-    return BatchEnsemble(network, spec.members) if spec.method == "batch_ensemble" else network
+    network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric")
+    several = spec.method == "batch_ensemble"
+    return BatchEnsemble(network, spec.members, init=init, std=std) if several else network
 
 
 def _is_number(value: object) -> bool:

@@ -19,6 +19,7 @@ from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.checkpoints import CheckpointError, fill, read_safetensors, save_checkpoint
 from ufmstar_torch.models.dropout import MonteCarloDropout
 from ufmstar_torch.models.ensemble import LazyMember
+from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.spec import NetworkSpec, build_network
 
@@ -137,6 +138,16 @@ def load_trained(
     return members
 
 
+def load_for_training(path: str | Path) -> list[UncertaintyNetwork | BatchEnsemble]:
+    """The networks in a file as ``build_network`` made them, in training mode, to go on from.
+
+    Raises:
+        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_trained`.
+    """
+    file = _TrainedFile(Path(path))
+    return [file.read(index).train() for index in range(file.info.networks)]
+
+
 class _TrainedFile:
     """One file, whose networks are read one by one. What they share is read once.
 
@@ -160,7 +171,7 @@ class _TrainedFile:
         if method == "batch_ensemble":
             index, turn = divmod(n, self.info.spec.members)
             return self._batch_ensemble(index).member(turn)
-        network = self._read(n)
+        network = self.read(n)
         return MonteCarloDropout(network).eval() if method == "mc_dropout" else network
 
     def __reduce__(self) -> tuple[type[_TrainedFile], tuple[Path]]:
@@ -169,12 +180,17 @@ class _TrainedFile:
     def _batch_ensemble(self, index: int) -> BatchEnsemble:
         with self._lock:
             if index not in self._shared:
-                network = self._read(index)
+                network = self.read(index)
                 assert isinstance(network, BatchEnsemble)
                 self._shared[index] = network
             return self._shared[index]
 
-    def _read(self, index: int) -> DepthNetwork:
+    def read(self, index: int) -> UncertaintyNetwork | BatchEnsemble:
+        """What is stored under an index, in eval mode.
+
+        Raises:
+            CheckpointError: as :meth:`member`.
+        """
         with torch.random.fork_rng(devices=[]):  # weights that are overwritten must not use up the caller's seed
             network = build_network(self.info.spec)
         fill(network, read_safetensors(self.path, f"member.{index}.")[0], f"{self.path}, member {index},")

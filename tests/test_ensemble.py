@@ -1,0 +1,280 @@
+"""Ensembles: the mixture of their members, and members that are loaded when needed and kept off the device."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import threading
+import weakref
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from ufmstar_torch import DepthPrediction, UncertainDepth
+from ufmstar_torch.models.checkpoints import CheckpointError
+from ufmstar_torch.models.ensemble import Ensemble, LazyMember
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
+
+INPUT = Preprocess(size=(8, 10))
+POSE, K = torch.eye(4), torch.tensor([[8.0, 0, 4.5], [0, 8, 3.5], [0, 0, 1]])
+
+
+class Gain(DepthNetwork):
+    """Depth and variance proportional to brightness; remembers on which device its weights were when called."""
+
+    def __init__(self, gain):
+        super().__init__()
+        self.preprocess = INPUT
+        self.gain = nn.Parameter(torch.tensor(float(gain)))
+        self.register_buffer("offset", torch.tensor(1.0))
+        self.register_buffer("spread", torch.tensor(0.01), persistent=False)
+        self.seen = []
+
+    def forward(self, image):
+        self.seen.append((self.gain.device.type, self.offset.device.type, self.training))
+        depth = self.gain * (self.offset + image.mean(1))
+        return DepthPrediction(depth, self.spread * depth)
+
+
+class Loader:
+    """Counts its calls; can be copied and pickled."""
+
+    def __init__(self, gain):
+        self.gain, self.calls = gain, 0
+
+    def __call__(self):
+        self.calls += 1
+        return Gain(self.gain)
+
+
+def lazy(*gains, **options):
+    loaders = [Loader(gain) for gain in gains]
+    members = [LazyMember(loader, INPUT, name=f"member {n}", **options) for n, loader in enumerate(loaders)]
+    return members, [lambda loader=loader: loader.calls for loader in loaders]
+
+
+def image(batch=2):
+    return torch.rand(batch, 3, 8, 10, generator=torch.Generator().manual_seed(0))
+
+
+# ---- all members at once ----
+
+
+def test_an_ensemble_is_the_mixture_of_its_members():
+    networks = [Gain(1.0), Gain(1.5), Gain(3.0)]
+    found = Ensemble(networks)(image())
+    depths = torch.stack([network(image()).depth for network in networks])
+    mean = depths.sum(0) / 3
+    torch.testing.assert_close(found.depth, mean)
+    torch.testing.assert_close(found.aleatoric_variance, 0.01 * mean)
+    torch.testing.assert_close(found.epistemic_variance, (depths**2).sum(0) / 3 - mean**2)
+    assert Ensemble(networks).preprocess == INPUT
+
+
+def test_an_ensemble_in_the_pipeline_is_its_full_mode():
+    networks = [Gain(1.0), Gain(1.5)]
+    one = UncertainDepth(Ensemble(networks))(image(1), POSE, K)
+    full = UncertainDepth(networks, mode="full")(image(1), POSE, K)
+    assert torch.equal(one.depth, full.depth)
+    assert torch.equal(one.variance, full.variance)
+
+
+def test_impossible_ensembles():
+    with pytest.raises(ValueError, match="at least two"):
+        Ensemble([Gain(1.0)])
+    other = Gain(1.0)
+    other.preprocess = replace(INPUT, size=(8, 12))
+    with pytest.raises(ValueError, match="the same input"):
+        Ensemble([Gain(1.0), other])
+
+
+# ---- lazy members ----
+
+
+def test_only_the_members_in_turn_are_loaded_each_once():
+    members, calls = lazy(1.0, 1.1, 1.2)
+    pipeline = UncertainDepth(members)
+    assert [call() for call in calls] == [0, 0, 0]
+    expected = [Gain(gain)(image(1)).depth for gain in (1.0, 1.1, 1.2)]
+    loaded = []
+    for turn in range(5):
+        result = pipeline(image(1), POSE, K)
+        assert torch.equal(result.depth, expected[turn % 3])
+        loaded.append([call() for call in calls])
+    assert loaded == [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 1, 1], [1, 1, 1]]
+    assert all(member.loaded for member in members)
+
+
+def test_a_lazy_member_is_in_eval_mode_unless_asked():
+    (member,), _ = lazy(1.0)
+    member(image())
+    assert not member.training
+    assert member.network().seen[-1] == ("cpu", "cpu", False)
+    member.train()(image())
+    assert member.network().seen[-1][2]
+    (member,), _ = lazy(1.0)
+    member.train()(image())
+    assert member.network().seen[-1][2]
+
+
+@pytest.mark.parametrize("first", ["move", "load"])
+def test_a_member_goes_where_it_is_sent_before_and_after_loading(first):
+    (member,), _ = lazy(1.0)
+    if first == "load":
+        member(image())
+    member.to("meta", torch.float64)
+    network = member.network()
+    assert (network.gain.device.type, network.offset.device.type, network.gain.dtype) == ("meta", "meta", torch.float64)
+    assert member(image().double().to("meta")).depth.device.type == "meta"
+
+
+def test_an_offloaded_member_keeps_nothing_on_the_device():
+    members, calls = lazy(1.0, 1.1, offload=True)
+    networks = nn.ModuleList(members).to("meta")
+    for turn in range(3):
+        out = networks[turn % 2](image().to("meta"))
+        assert out.depth.device.type == "meta"
+        # On the device in their turn, and on the host again after it, the very same tensors.
+        assert networks[turn % 2].network().seen[-1][:2] == ("meta", "meta")
+        held = [m.network() for m in members if m.loaded]
+        tensors = [t for n in held for t in (*n.parameters(), *n.buffers())]
+        assert {t.device.type for t in tensors} == {"cpu"}
+        assert len(tensors) == 3 * len(held)
+    assert [call() for call in calls] == [1, 1]
+    assert sum(p.numel() for p in networks.parameters() if p.device.type == "meta") == 0
+    assert torch.equal(members[1].network()(image()).depth, Gain(1.1)(image()).depth)
+
+
+def test_an_offloaded_member_computes_the_same_on_the_host():
+    (member,), _ = lazy(1.3, offload=True)
+    assert torch.equal(member(image()).depth, Gain(1.3)(image()).depth)
+
+
+def test_copies_for_a_turn_are_given_back():
+    """After a call, nothing refers to the tensors that were on the device."""
+    (member,), _ = lazy(1.0, offload=True)
+    member.to("meta")
+    there = []
+
+    class Watched(Gain):
+        def forward(self, image):
+            there.extend([weakref.ref(self.gain), weakref.ref(self.offset)])
+            if image.shape[0] == 1:
+                raise RuntimeError("out of memory")
+            return super().forward(image)
+
+    member.network().__class__ = Watched
+    member(image().to("meta"))
+    with pytest.raises(RuntimeError, match="out of memory"):
+        member(image(1).to("meta"))
+    assert len(there) == 4
+    assert all(ref() is None for ref in there[:2])
+    assert member.network().gain.device.type == "cpu"
+
+
+def test_weights_of_a_lazy_member_are_no_part_of_a_state_dict():
+    members, _ = lazy(1.0, 1.1)
+    pipeline = UncertainDepth(members)
+    before = set(pipeline.state_dict())
+    pipeline(image(1), POSE, K)
+    state = pipeline.state_dict()
+    assert set(state) == before
+    assert not any(key.startswith("networks.") for key in state)
+    others, _ = lazy(1.0, 1.1)
+    other = UncertainDepth(others)
+    other.load_state_dict(state)
+    assert torch.equal(other(image(1), POSE, K).variance, pipeline(image(1), POSE, K).variance)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+def test_a_copy_loads_anew(copied):
+    (member,), _ = lazy(1.2)
+    member(image())
+    other = copied(member)
+    assert not other.loaded
+    assert torch.equal(other(image()).depth, member(image()).depth)
+    assert other.network() is not member.network()
+    assert "loaded=True" in repr(other)
+
+
+def test_threads_load_a_member_once():
+    barrier, started = threading.Barrier(4), []
+
+    def slow():
+        started.append(1)
+        threading.Event().wait(0.05)
+        return Gain(1.0)
+
+    member, found = LazyMember(slow, INPUT), []
+
+    def work():
+        barrier.wait()
+        found.append(member(image()).depth)
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(started) == 1
+    assert len(found) == 4
+
+
+def test_threads_take_turns_on_the_device():
+    (member,), _ = lazy(1.0, offload=True)
+    member.to("meta")
+    devices = []
+
+    def work():
+        for _ in range(20):
+            devices.append(member(image().to("meta")).depth.device.type)
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert devices == ["meta"] * 60
+    assert member.network().gain.device.type == "cpu"
+
+
+@pytest.mark.parametrize("error", [FileNotFoundError("no file x"), RuntimeError("damaged"), CheckpointError("cut off")])
+def test_a_member_that_cannot_be_loaded_is_named(error):
+    def load():
+        if fail:
+            raise error
+        return Gain(2.0)
+
+    fail = [1]
+    members = [LazyMember(Loader(1.0), INPUT), LazyMember(load, INPUT, name="weights/b.safetensors, member 1")]
+    pipeline = UncertainDepth(members)
+    pipeline(image(1), POSE, K)
+    with pytest.raises(CheckpointError, match=rf"weights/b.safetensors, member 1 cannot be loaded: {error}"):
+        pipeline(image(1), POSE, K)
+    fail.clear()  # the alternation has not advanced, and the next attempt loads it
+    assert pipeline(image(1), POSE, K).member == 1
+
+
+def test_a_message_that_names_the_member_is_not_repeated():
+    def load():
+        raise CheckpointError("f.safetensors, member 3, does not fit")
+
+    with pytest.raises(CheckpointError, match=r"^f.safetensors, member 3, does not fit$"):
+        LazyMember(load, INPUT, name="f.safetensors, member 3")(image())
+
+
+def test_a_loader_must_return_what_was_declared():
+    with pytest.raises(CheckpointError, match="must be a DepthNetwork, got Linear"):
+        LazyMember(lambda: nn.Linear(1, 1), INPUT)(image())
+    with pytest.raises(CheckpointError, match="wants the input"):
+        LazyMember(Loader(1.0), replace(INPUT, size=(8, 12)))(image())
+
+
+def test_errors_of_the_network_itself_pass_through():
+    (member,), _ = lazy(1.0)
+    member.network().gain.data = torch.zeros(3)
+    with pytest.raises(RuntimeError, match="must match"):
+        member(image())
