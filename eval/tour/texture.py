@@ -144,13 +144,17 @@ def _books(p: Patch) -> Tensor:
 
 
 def _painting(p: Patch) -> Tensor:
-    """Hills before a sky, or shapes before a wall, by the surface's random shift."""
-    tall = 0.12 * torch.sin(p.own_u * 5 + p.u - p.own_u) + 0.06 * torch.sin(p.own_u * 13 + 2)
+    """Hills before a sky, or coloured fields, by the surface's random shift."""
+    shift = p.u - p.own_u
+    tall = 0.12 * torch.sin(p.own_u * 5 + shift) + 0.06 * torch.sin(p.own_u * 13 + 2)
     hill = _soft(p.own_v - tall, p.pixel)
-    sun = _soft(0.16 - ((p.own_u - 0.15) ** 2 + (p.own_v + 0.2) ** 2).sqrt(), p.pixel)
+    sun = _soft(0.1 - ((p.own_u - 0.4 * torch.sin(shift)) ** 2 + (p.own_v + 0.2) ** 2).sqrt(), p.pixel)
     sky = p.first * (0.7 - 0.5 * p.own_v)
     ground = p.second * (0.5 + 0.5 * p.noise(p.u * 9, p.v * 9))
-    return (sky * (1 - hill) + ground * hill) * (1 - sun) + (1 - p.second * 0.3) * sun
+    landscape = (sky * (1 - hill) + ground * hill) * (1 - sun) + (1 - p.second * 0.3) * sun
+    field = p.cell((p.u * 3).floor(), (p.v * 2.2).floor())
+    fields = p.first * (1 - field) + p.second * field + 0.25 * (field > 0.7)
+    return torch.where(shift - shift.floor() < 0.5, landscape, fields)
 
 
 def _window(p: Patch) -> Tensor:

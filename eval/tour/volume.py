@@ -8,12 +8,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.tour.intersect import entry
+from ufmstar_torch.eval.tour.intersect import Components, entry
 from ufmstar_torch.eval.tour.shapes import NOBODY, Surfaces
 
 GRID = (11, 22, 22)  # points of a room along y, z, x
 # Where a light's rays end, as parts of its size: the corners of a tetrahedron.
 _SAMPLES = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, -1.0))
+# What stands nearer to a lamp would shade half of the room [m].
+_TOO_NEAR = 0.5
 _SMALL = 0.05  # half extents below this cast no shadow worth a ray [m]
 
 
@@ -28,19 +30,18 @@ def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tens
         casts: [N] bool which primitives cast a shadow.
     """
     found = torch.ones(*lights.shape[:2], *GRID)
-    for r, (lower, upper) in enumerate(rooms):
-        points = torch.meshgrid(*(torch.linspace(0, 1, n, dtype=torch.float64) for n in GRID), indexing="ij")
-        y, z, x = (p.reshape(-1) for p in points)
-        xyz = [lower[k] + (upper[k] - lower[k]) * p for k, p in enumerate((x, y, z))]
+    for r, (lower, upper) in enumerate(rooms.float()):
+        x, y, z = (lower[k] + (upper[k] - lower[k]) * torch.linspace(0, 1, GRID[n]) for k, n in enumerate((2, 0, 1)))
+        points = (x, y[:, None, None], z[:, None])
         casters = _casters(surfaces, casts, r)
         for k in range(lights.shape[1]):
             if not lights[r, k, 3:6].any():
                 continue
-            reached = sum(
-                _visible(xyz, lights[r, k, :3].double() + sizes[r, k] * 0.5 * torch.tensor(s), surfaces, casters)
-                for s in _SAMPLES
-            )
-            found[r, k] = (reached / len(_SAMPLES)).reshape(GRID).float()
+            reached = torch.zeros(GRID)
+            for offset in _SAMPLES:
+                lamp = lights[r, k, :3] + 0.5 * sizes[r, k] * torch.tensor(offset)
+                reached += _visible(points, lamp, surfaces, casters)
+            found[r, k] = reached / len(_SAMPLES)
     return found
 
 
@@ -50,14 +51,17 @@ def _casters(surfaces: Surfaces, casts: Tensor, room: int) -> list[int]:
     return [int(i) for i in torch.nonzero(own & large).flatten()]
 
 
-def _visible(xyz: list[Tensor], light: Tensor, surfaces: Surfaces, casters: list[int]) -> Tensor:
-    """[P] 1.0 where nothing stands between a point and a light [3]."""
-    free = torch.ones_like(xyz[0])
+def _visible(points: Components, lamp: Tensor, surfaces: Surfaces, casters: list[int]) -> Tensor:
+    """[*GRID] 1.0 where nothing stands between a point and a lamp [3]; ``points`` are x, y, z that broadcast."""
+    to_x, to_y, to_z = (points[k] - lamp[k] for k in range(3))
+    distance = (to_x * to_x + to_y * to_y + to_z * to_z).sqrt()
+    free = torch.ones(GRID)
+    # From the lamp to the points: a point may be inside of something.
     for i in casters:
-        R, half, centre = (surfaces.rotation[i], surfaces.half[i], surfaces.centre[i])
-        # From the light to the points: the light is outside of everything, a point may be inside.
-        o = [float(((light - centre) * R[:, k]).sum() / half[k]) for k in range(3)]
-        d = [sum((xyz[j] - light[j]) * (R[j, k] / half[k]) for j in range(3)) for k in range(3)]
+        axes = (surfaces.rotation[i].float() / surfaces.half[i].float()).T.tolist()
+        to_lamp = (lamp - surfaces.centre[i].float()).tolist()
+        o = [sum(to_lamp[j] * axis[j] for j in range(3)) for axis in axes]
+        d = [to_x * axis[0] + (to_y * axis[1] + to_z * axis[2]) for axis in axes]
         t = entry(int(surfaces.kind[i]), (o[0], o[1], o[2]), (d[0], d[1], d[2]), float(surfaces.taper[i]))
-        free = free * (t > 1)
+        free.masked_fill_((t < 1) & (t * distance > _TOO_NEAR), 0.0)
     return free
