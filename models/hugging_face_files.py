@@ -58,7 +58,7 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None, local_files_o
     from transformers.image_processing_base import ImageProcessingMixin
 
     name = Path(name_or_dir).as_posix()
-    folder = Path(name_or_dir).expanduser() if _is_path(name) else None
+    folder = Path(name_or_dir).expanduser() if _is_path(str(name_or_dir)) else None
     if folder is not None and not (folder / "config.json").is_file():
         what = f"{folder} has no config.json" if folder.is_dir() else f"no such directory: {folder}"
         raise FileNotFoundError(f"{what}; a checkpoint of transformers is a directory with config.json and weights")
@@ -67,7 +67,9 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None, local_files_o
         config, _ = PreTrainedConfig.get_config_dict(str(folder or name), **options)
     except (OSError, ValueError, TypeError, AttributeError) as error:
         if folder is None:
-            raise OSError(f"{name} cannot be had from the Hugging Face hub: {error}; {_TO_DOWNLOAD}") from error
+            raise OSError(
+                f"{name} is no directory and cannot be had from the Hugging Face hub: {error}; {_TO_DOWNLOAD}"
+            ) from error
         raise CheckpointError(f"{folder}/config.json cannot be read: {error}") from error
     processor: dict[str, Any] = {}
     if folder is None or any((folder / f).is_file() for f in ("preprocessor_config.json", "processor_config.json")):
@@ -122,7 +124,7 @@ def load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: Sequen
 def _is_path(name: str) -> bool:
     """Whether a directory is meant: one that exists, or what no "owner/name" looks like."""
     path = Path(name)
-    return path.is_dir() or path.is_absolute() or name.startswith((".", "~")) or len(path.parts) > 2
+    return path.is_dir() or path.is_absolute() or name.startswith((".", "~")) or len(path.parts) != 2
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Alignment of relative depth: known scale and shift come back, outliers do not count, what cannot be told is refused."""
+"""Alignment of relative depth: scale and shift come back, outliers do not count, what cannot be told is refused."""
 
 from __future__ import annotations
 

@@ -1,0 +1,513 @@
+"""Depth Anything V2 and other models of ``transformers``: tiny random ones, saved and loaded as a user's checkpoint."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+from layouts import write_generic
+from runs import read_summary
+from safetensors.torch import load_file, save_file
+
+from scenes import look, render
+from ufmstar_torch import UncertainDepth, cli
+from ufmstar_torch.eval.run_source import network_source, sha256
+from ufmstar_torch.models import (
+    Alignment,
+    CheckpointError,
+    DepthAnything,
+    Preprocess,
+    depth_anything_name,
+    fit_inverse_depth,
+    from_hugging_face,
+    load_network,
+)
+from ufmstar_torch.ufmstar import UfMStarConfig
+
+transformers = pytest.importorskip("transformers")
+
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+K = torch.tensor([[525.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]], dtype=torch.float64)
+
+
+def lively(model, seed):
+    """Random weights large enough for outputs that depend on the image."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for value in model.parameters():
+            if value.dim() > 1:
+                value.copy_(torch.randn(value.shape, generator=generator) * (2 / value[0].numel()) ** 0.5)
+    return model.eval()
+
+
+def tiny(folder, kind, seed=0, max_depth=20):
+    """A Depth Anything V2 of 90 thousand weights with the published checkpoints' image processor."""
+    backbone = transformers.Dinov2Config(
+        hidden_size=32, num_hidden_layers=4, num_attention_heads=2, image_size=70, out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False, apply_layernorm=True, patch_size=14,
+    )  # fmt: skip
+    config = transformers.DepthAnythingConfig(
+        backbone_config=backbone, reassemble_hidden_size=32, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8,
+        head_hidden_size=8, depth_estimation_type=kind, max_depth=max_depth if kind == "metric" else 1,
+    )  # fmt: skip
+    model = lively(transformers.DepthAnythingForDepthEstimation(config), seed)
+    with torch.no_grad():
+        model.head.conv3.bias += 0.0 if kind == "metric" else 5.0  # the ReLU of relative ones stays open
+    model.save_pretrained(folder)
+    transformers.DPTImageProcessor(
+        size={"height": 518, "width": 518}, keep_aspect_ratio=True, ensure_multiple_of=14, resample=3,
+        image_mean=list(MEAN), image_std=list(STD),
+    ).save_pretrained(folder)  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="module")
+def metric(tmp_path_factory):
+    """A directory with a metric checkpoint. Nobody may change it."""
+    return tiny(tmp_path_factory.mktemp("hub") / "metric", "metric")
+
+
+@pytest.fixture(scope="module")
+def relative(tmp_path_factory):
+    """A directory with a relative checkpoint. Nobody may change it."""
+    return tiny(tmp_path_factory.mktemp("hub") / "relative", "relative")
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """A GLPN, whose configuration does not say what its depth is, and which reduces resolution."""
+    folder = tmp_path_factory.mktemp("hub") / "glpn"
+    config = transformers.GLPNConfig(
+        hidden_sizes=[8, 8, 16, 16], depths=[1, 1, 1, 1], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=8
+    )
+    lively(transformers.GLPNForDepthEstimation(config), 3).save_pretrained(folder)
+    (folder / "preprocessor_config.json").write_text(
+        json.dumps({"image_processor_type": "GLPNImageProcessor", "size_divisor": 32, "resample": 2, "do_rescale": True,
+                    "do_normalize": False})
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def broken(metric, tmp_path):
+    """A copy of the metric checkpoint to damage."""
+    return shutil.copytree(metric, tmp_path / "broken")
+
+
+def photos(number=2, size=(48, 64), seed=0):
+    """Images with edges and slopes: the rendered room, in colours by depth."""
+    poses = [look((-0.5 + 0.2 * i + 0.1 * seed, -0.2, -0.9), 0.05 * i, 0.05) for i in range(number)]
+    camera = torch.tensor([[size[1] * 0.9, 0, size[1] / 2], [0, size[1] * 0.9, size[0] / 2], [0, 0, 1]]).numpy()
+    depth = torch.stack([torch.from_numpy(render(T, camera, *size)) for T in poses])
+    return torch.stack([(40 * depth) % 256, 255 / (1 + depth), (90 * depth) % 256], 1).to(torch.uint8)
+
+
+def own_processor(folder, images, **changes):
+    """What the checkpoint's own image processor makes of uint8 images [B, 3, H, W]."""
+    processor = transformers.DPTImageProcessor.from_pretrained(folder, **changes)
+    return processor(list(images), return_tensors="pt")["pixel_values"]
+
+
+# ---- the network ----
+
+
+def test_metric_depth_equals_transformers_own_forward(metric):
+    network = DepthAnything.from_pretrained(metric, size=(70, 84))
+    x, _ = network.preprocess(photos(), K)
+    assert x.shape == (2, 3, 70, 84)
+    reference = transformers.DepthAnythingForDepthEstimation.from_pretrained(metric).eval()
+    with torch.no_grad():
+        expected, prediction = reference(pixel_values=x).predicted_depth, network(x)
+    torch.testing.assert_close(prediction.depth, expected, rtol=1e-6, atol=1e-6)
+    assert expected.std() > 0.05  # the tiny network sees something
+    assert (prediction.depth > 0).all()
+    assert (prediction.depth < 20).all()
+    assert prediction.variance is None
+    assert not network.training
+
+
+def test_the_default_is_518_by_518(metric):
+    network = DepthAnything.from_pretrained(metric)
+    x, K_net = network.preprocess(photos(1, (480, 640)), K)
+    with torch.no_grad():
+        depth = network(x).depth
+    assert x.shape == (1, 3, 518, 518)
+    assert depth.shape == (1, 518, 518)
+    assert depth.dtype == torch.float32
+    assert K_net[0, 0].item() == pytest.approx(525 * 518 / 640)
+    assert K_net[0, 2].item() == pytest.approx(320 * 518 / 640 - 0.5)
+
+
+def test_a_batch_gives_what_each_image_gives(metric):
+    network = DepthAnything.from_pretrained(metric, size=(70, 70))
+    x = network.preprocess.apply_image(photos(3))
+    with torch.no_grad():
+        together, alone = network(x).depth, torch.cat([network(x[i : i + 1]).depth for i in range(3)])
+    torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4)
+    assert (together[0] - together[2]).abs().max() > 0.05
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_weights_give_single_precision_depth(metric, dtype):
+    x = DepthAnything.from_pretrained(metric, size=(70, 70)).preprocess.apply_image(photos(1))
+    half = DepthAnything.from_pretrained(metric, size=(70, 70), dtype=dtype)
+    assert next(half.parameters()).dtype == dtype
+    with torch.no_grad():
+        depth = half(x).depth
+        full = DepthAnything.from_pretrained(metric, size=(70, 70))(x).depth
+    assert depth.dtype == torch.float32
+    torch.testing.assert_close(depth, full, rtol=0.1, atol=0.1)
+
+
+def test_weights_in_half_precision_on_disk_run_in_single(broken):
+    edit_weights(broken, lambda state: {name: value.half() for name, value in state.items()})
+    network = DepthAnything.from_pretrained(broken)
+    assert {p.dtype for p in network.parameters()} == {torch.float32}
+
+
+def test_inputs_that_do_not_fit_are_refused(metric):
+    with pytest.raises(ValueError, match=r"size must be .* multiples of the patch, 14 px, got \(500, 518\)"):
+        DepthAnything.from_pretrained(metric, size=(500, 518))
+    network = DepthAnything.from_pretrained(metric)
+    with pytest.raises(ValueError, match="multiples of 14 px, got 70 x 80"):
+        network(torch.zeros(1, 3, 70, 80))
+    for image in (torch.zeros(3, 70, 70), torch.zeros(1, 1, 70, 70), torch.zeros(1, 3, 70, 70, dtype=torch.uint8)):
+        with pytest.raises(ValueError, match="image must be floating-point"):
+            network(image)
+
+
+def test_names_on_the_hub():
+    assert depth_anything_name() == "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
+    assert depth_anything_name("large", "outdoor") == "depth-anything/Depth-Anything-V2-Metric-Outdoor-Large-hf"
+    assert depth_anything_name("base", "relative") == "depth-anything/Depth-Anything-V2-Base-hf"
+    with pytest.raises(ValueError, match="size must be one of"):
+        depth_anything_name("giant")
+
+
+# ---- relative checkpoints ----
+
+
+def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative):
+    network = DepthAnything.from_pretrained(relative, size=(70, 84))
+    x, K_net = network.preprocess(photos(1), K)
+    assert (network.kind, network.is_metric) == ("inverse", False)
+    with pytest.raises(ValueError, match="predicts relative depth .*inverse depth up to scale and shift"):
+        network(x)
+    with pytest.raises(ValueError, match="fit_inverse_depth"):
+        UncertainDepth(network, preprocess=network.preprocess)(photos(1), torch.eye(4), K)
+    with torch.no_grad():
+        raw = network.raw(x)
+        reference = transformers.DepthAnythingForDepthEstimation.from_pretrained(relative).eval()
+        torch.testing.assert_close(raw, reference(pixel_values=x).predicted_depth, rtol=1e-6, atol=1e-6)
+        truth = 1 / (0.05 * raw + 0.1)
+        measured = torch.where(torch.rand(truth.shape, generator=torch.Generator().manual_seed(0)) < 0.02, truth, 0)
+        aligned = network.aligned(fit_inverse_depth(raw, measured, pooled=True).alignment)
+        torch.testing.assert_close(aligned(x).depth, truth, rtol=1e-4, atol=0)
+    out = UncertainDepth(aligned, preprocess=aligned.preprocess)(photos(1), torch.eye(4, dtype=torch.float64), K)
+    torch.testing.assert_close(out.depth, truth, rtol=1e-4, atol=0)
+    torch.testing.assert_close(out.intrinsics[0], K_net)
+    assert out.variance.isfinite().any()
+
+
+def test_alignments_of_the_other_kind_are_refused(relative, metric):
+    with pytest.raises(ValueError, match="of the network's kind 'inverse', got 'affine'"):
+        DepthAnything.from_pretrained(relative).aligned(Alignment("affine", 1.0, 0.0))
+    with pytest.raises(ValueError, match="of the network's kind 'metric', got 'inverse'"):
+        DepthAnything.from_pretrained(metric).aligned(Alignment("inverse", 1.0, 0.0))
+
+
+def test_an_aligned_network_shares_the_weights_and_is_saved_like_any_other(relative):
+    network = DepthAnything.from_pretrained(relative, size=(70, 70))
+    aligned = network.aligned(Alignment("inverse", 0.05, 0.1))
+    assert {p.data_ptr() for p in aligned.parameters()} == {p.data_ptr() for p in network.parameters()}
+    x = network.preprocess.apply_image(photos(1))
+    with torch.no_grad():
+        assert aligned.double()(x.double()).depth.dtype == torch.float64
+
+
+# ---- preprocessing ----
+
+
+@pytest.mark.parametrize(("size", "expected"), [((480, 640), (518, 686)), ((640, 480), (686, 518)), ((300, 500), (518, 868))])
+def test_keeping_the_aspect_gives_the_own_processor_s_size(metric, size, expected):
+    preprocess = DepthAnything.from_pretrained(metric, keep_aspect=True).preprocess
+    image = photos(1, size)
+    assert preprocess.apply_image(image).shape[-2:] == expected
+    assert own_processor(metric, image).shape[-2:] == expected
+
+
+@pytest.mark.parametrize("keep_aspect", [False, True])
+def test_colours_are_the_own_processor_s_to_its_rounding(metric, keep_aspect):
+    """It resamples bytes and rounds after each axis; observed: mean .005, largest 2.1 of 255 levels."""
+    image = photos(2, (480, 640))
+    ours = DepthAnything.from_pretrained(metric, keep_aspect=keep_aspect).preprocess.apply_image(image)
+    theirs = own_processor(metric, image, keep_aspect_ratio=keep_aspect)
+    levels = (ours - theirs).abs() * torch.tensor(STD)[:, None, None] * 255
+    assert levels.mean() < 0.5
+    assert levels.max() < 4
+    linear = Preprocess(size=ours.shape[-2:], mean=MEAN, std=STD).apply_image(image)
+    assert (linear - theirs).abs().mean() > 1.5 * (ours - theirs).abs().mean()  # the filter matters
+
+
+@pytest.mark.parametrize("keep_aspect", [False, True])
+def test_intrinsics_follow_where_points_are_seen(metric, keep_aspect):
+    """Blobs at the projections of 3D points lie, after preprocessing, at the projections by the new intrinsics."""
+    points = torch.tensor([[-0.5, -0.3, 2.0], [0.4, 0.2, 1.5], [0.0, 0.3, 1.2], [0.6, -0.4, 2.5]], dtype=torch.float64)
+    v, u = torch.meshgrid(torch.arange(480.0), torch.arange(640.0), indexing="ij")
+    preprocess = DepthAnything.from_pretrained(metric, keep_aspect=keep_aspect).preprocess
+    for point in points:
+        x, y = (K @ point)[:2] / point[2]
+        blob = torch.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 6.0**2)).float()
+        seen, K_net = preprocess(blob.expand(1, 3, -1, -1), K)
+        weight = (seen * torch.tensor(STD)[:, None, None] + torch.tensor(MEAN)[:, None, None])[0, 0].double()
+        rows, columns = (torch.arange(n, dtype=torch.float64) for n in weight.shape)
+        centre = torch.stack([(weight.sum(0) * columns).sum(), (weight.sum(1) * rows).sum()]) / weight.sum()
+        torch.testing.assert_close(centre, (K_net @ point)[:2] / point[2], rtol=0, atol=0.01)
+
+
+def test_an_image_processor_may_be_missing_or_say_something_else(broken):
+    file = broken / "preprocessor_config.json"
+    says = json.loads(file.read_text())
+    file.unlink()
+    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(size=(518, 518), mean=MEAN, std=STD, cubic=True)
+    file.write_text(json.dumps(says | {"image_mean": [0.5, 0.5, 0.5], "resample": 2}))
+    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(size=(518, 518), mean=(0.5, 0.5, 0.5), std=STD)
+    file.write_text(json.dumps(says | {"do_normalize": False, "do_rescale": False}))
+    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(size=(518, 518), value_range=255.0, cubic=True)
+    for change in ({"resample": 1}, {"do_center_crop": True}):
+        file.write_text(json.dumps(says | change))
+        with pytest.raises(ValueError, match="is not supported: give a Preprocess of your own"):
+            DepthAnything.from_pretrained(broken)
+    file.write_text("{")
+    with pytest.raises(CheckpointError, match="broken: preprocessor_config.json cannot be read"):
+        DepthAnything.from_pretrained(broken)
+
+
+def test_aspect_and_filter_are_checked_and_go_through_json():
+    preprocess = Preprocess(size=(518, 518), aspect_multiple=14, cubic=True)
+    assert Preprocess.from_dict(json.loads(json.dumps(preprocess.to_dict()))) == preprocess
+    for values in ({"aspect_multiple": 14}, {"size": (10, 10), "aspect_multiple": 0}):
+        with pytest.raises(ValueError, match="aspect_multiple must be positive pixels and goes with size"):
+            Preprocess(**values)
+    step = torch.zeros(1, 3, 20, 20)
+    step[..., 10:] = 1
+    enlarged = Preprocess(size=(50, 50), cubic=True).apply_image(step)
+    assert (enlarged.min(), enlarged.max()) == (0, 1)  # a cubic filter overshoots
+
+
+# ---- checkpoints that cannot be used ----
+
+
+def edit_weights(folder, edit):
+    file = folder / "model.safetensors"
+    save_file(edit(load_file(file)), file, metadata={"format": "pt"})
+
+
+def edit_config(folder, **changes):
+    file = folder / "config.json"
+    values = json.loads(file.read_text()) | changes
+    file.write_text(json.dumps({name: value for name, value in values.items() if value != "drop"}))
+
+
+def cut(folder):
+    file = folder / "model.safetensors"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
+
+DAMAGES = {
+    "cut off": (cut, "cannot be loaded as a depth model"),
+    "garbage": (lambda d: (d / "model.safetensors").write_bytes(b"weights" * 9), "cannot be loaded as a depth model"),
+    "empty": (lambda d: (d / "model.safetensors").write_bytes(b""), "cannot be loaded as a depth model"),
+    "no weights": (lambda d: (d / "model.safetensors").unlink(), "cannot be loaded as a depth model"),
+    "a weight missing": (
+        lambda d: edit_weights(d, lambda s: {k: v for k, v in s.items() if k != "head.conv3.weight"}),
+        "lacks weights, which would stay random: head.conv3.weight",
+    ),
+    "another shape": (
+        lambda d: edit_weights(d, lambda s: s | {"head.conv3.bias": torch.zeros(3)}),
+        "cannot be loaded as a depth model",
+    ),
+    "not finite": (
+        lambda d: edit_weights(d, lambda s: s | {"head.conv3.bias": torch.tensor([float("nan")])}),
+        "weights that are not finite: head.conv3.bias",
+    ),
+    "config no JSON": (lambda d: (d / "config.json").write_text("{"), "config.json cannot be read"),
+    "config a list": (lambda d: (d / "config.json").write_text("[]"), "config.json"),
+    "another model": (lambda d: edit_config(d, model_type="bert"), "is a 'bert' model, expected 'depth_anything'"),
+    "no model": (lambda d: edit_config(d, model_type="drop"), "is a None model"),
+    "impossible value": (lambda d: edit_config(d, max_depth="far"), "cannot be loaded as a depth model"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_is_named(broken, damage):
+    edit, message = DAMAGES[damage]
+    edit(broken)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        DepthAnything.from_pretrained(broken)
+    assert str(broken) in str(caught.value)
+
+
+def test_missing_directories_are_named(broken, tmp_path):
+    (broken / "config.json").unlink()
+    with pytest.raises(FileNotFoundError, match="broken has no config.json"):
+        DepthAnything.from_pretrained(broken)
+    with pytest.raises(FileNotFoundError, match="no such directory: .*nowhere"):
+        DepthAnything.from_pretrained(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="no such directory: nowhere"):
+        DepthAnything.from_pretrained("./nowhere")
+
+
+def test_a_hub_name_without_a_connection_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(OSError, match=r"(?s)Small-hf is no directory and cannot be had.*--local-dir DIR") as caught:
+        DepthAnything.from_pretrained(depth_anything_name("small", "relative"), local_files_only=True)
+    assert isinstance(caught.value.__cause__, OSError)
+
+
+def test_metric_without_a_maximum_is_refused(broken):
+    edit_config(broken, max_depth="drop")
+    with pytest.raises(ValueError, match="says metric, but not the max_depth"):
+        DepthAnything.from_pretrained(broken)
+    edit_config(broken, depth_estimation_type="drop")
+    assert DepthAnything.from_pretrained(broken).kind == "inverse"  # what transformers makes of it
+
+
+def test_loading_leaves_transformers_settings_and_says_nothing(metric, capfd):
+    logging = transformers.utils.logging
+    before = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    DepthAnything.from_pretrained(metric)
+    assert (logging.get_verbosity(), logging.is_progress_bar_enabled()) == before
+    assert capfd.readouterr() == ("", "")
+
+
+# ---- any other model ----
+
+
+def test_another_model_in_one_line_with_its_meaning_declared(other):
+    images = photos(1, (64, 96))
+    with pytest.raises(ValueError, match=r"\(glpn\) does not say whether its depth is metric: declare kind='metric'"):
+        from_hugging_face(other, size=(64, 96))
+    network = from_hugging_face(other, kind="metric", scale=2.0, size=(64, 96))
+    assert network.preprocess == Preprocess(size=(64, 96))
+    reference = transformers.GLPNForDepthEstimation.from_pretrained(other).eval()
+    with torch.no_grad():
+        expected = reference(pixel_values=images.float() / 255).predicted_depth
+        torch.testing.assert_close(network(network.preprocess(images, K)[0]).depth, 2 * expected, rtol=1e-5, atol=1e-5)
+    affine = from_hugging_face(other, kind="affine", size=(64, 96))
+    with pytest.raises(ValueError, match=r"\(depth up to scale and shift\), not metres"):
+        affine(images.float() / 255)
+    with pytest.raises(ValueError, match="does not say what its input needs: give size"):
+        from_hugging_face(other, kind="metric")
+    with pytest.raises(ValueError, match="scale goes with kind 'metric' only"):
+        from_hugging_face(other, kind="affine", scale=2.0, size=(64, 96))
+    with pytest.raises(ValueError, match="preprocess excludes size"):
+        from_hugging_face(other, kind="metric", size=(64, 96), preprocess=Preprocess())
+    with pytest.raises(ValueError, match="kind must be one of"):
+        from_hugging_face(other, kind="depth", size=(64, 96))
+
+
+def test_what_a_configuration_says_may_not_be_contradicted(metric, relative):
+    assert from_hugging_face(metric).kind == "metric"
+    assert from_hugging_face(relative, kind="inverse").kind == "inverse"
+    assert from_hugging_face(metric).preprocess.aspect_multiple == 14
+    assert from_hugging_face(metric, keep_aspect=False).preprocess == DepthAnything.from_pretrained(metric).preprocess
+    with pytest.raises(ValueError, match="says depth_estimation_type 'relative', which is 'inverse'"):
+        from_hugging_face(relative, kind="metric")
+
+
+def test_smaller_outputs_are_enlarged_to_the_input(other):
+    network = from_hugging_face(other, kind="metric", size=(64, 96))
+
+    class Half(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.ones(()))
+
+        def forward(self, pixel_values):
+            ramp = torch.arange(pixel_values.shape[-1] // 2).float().expand(len(pixel_values), 1, 32, -1)
+            return transformers.modeling_outputs.DepthEstimatorOutput(predicted_depth=ramp + self.weight)
+
+    network.raw.model = Half()
+    depth = network(torch.zeros(2, 3, 64, 96)).depth
+    inner = depth[:, :, 1:-1]
+    torch.testing.assert_close(inner, ((torch.arange(1, 95) + 0.5) / 2 + 0.5).expand_as(inner))
+
+
+def test_models_that_predict_no_depth_are_refused(broken):
+    (broken / "config.json").write_text(json.dumps({"model_type": "bert"}))
+    with pytest.raises(CheckpointError, match=r"broken \(bert\) cannot be loaded as a depth model"):
+        from_hugging_face(broken, kind="metric")
+
+
+def test_weights_that_a_model_does_not_use_may_be_missing(broken):
+    edit_weights(broken, lambda state: {k: v for k, v in state.items() if not k.startswith("head.conv3")})
+    with pytest.raises(CheckpointError, match="name them in allow_missing"):
+        from_hugging_face(broken, allow_missing=["head.conv2"])
+    assert from_hugging_face(broken, allow_missing=["head.conv3"]).kind == "metric"
+
+
+# ---- by name, and on the command line ----
+
+
+def test_networks_by_name(metric, relative, other, tmp_path):
+    spec = {"size": [70, 84]}
+    network = load_network("depth_anything", metric, spec=spec)
+    assert isinstance(network, DepthAnything)
+    assert network.preprocess.size == (70, 84)
+    with pytest.raises(ValueError, match=r'In a spec: {"alignment": {"kind": "inverse"'):
+        load_network("depth_anything", relative)
+    alignment = {"kind": "inverse", "scale": 0.05, "shift": 0.1}
+    file = tmp_path / "spec.json"
+    file.write_text(json.dumps(spec | {"alignment": alignment}))
+    aligned = load_network("depth_anything", relative, spec=file)
+    assert aligned.alignment.to_dict() == alignment | {"max_depth": None}
+    glpn = load_network("huggingface", other, spec={"kind": "metric", "preprocess": {"size": [64, 96]}})
+    assert glpn.preprocess == Preprocess(size=(64, 96))
+    with pytest.raises(ValueError, match="spec has no \\['kind'\\]"):
+        load_network("depth_anything", metric, spec={"kind": "metric"})
+
+
+def test_the_command_line_runs_a_directory(metric, relative, tmp_path, capsys):
+    sequence = write_generic(tmp_path / "scene")[0]
+    spec, out = tmp_path / "spec.json", tmp_path / "out"
+    spec.write_text(json.dumps({"size": [42, 56]}))
+    words = ["run", sequence, "--out", out, "--spec", spec, "--no-video", "--no-sheet", "--frames", ":3"]
+    words = [str(word) for word in words if word not in ("--no-video", "--no-sheet")]
+    assert cli.main([*words, "--model", "depth_anything", "--weights", str(metric)]) == 0
+    assert read_summary(out)["state"] == "finished"
+    capsys.readouterr()
+    assert cli.main([*words, "--overwrite", "--model", "depth_anything", "--weights", str(relative)]) != 0
+    assert "predicts relative depth" in capsys.readouterr().err
+    spec.write_text(json.dumps({"size": [42, 56], "alignment": {"kind": "inverse", "scale": 0.05, "shift": 0.1}}))
+    assert cli.main([*words, "--overwrite", "--model", "depth_anything", "--weights", str(relative)]) == 0
+    assert cli.main([*words, "--overwrite", "--model", "depth_anything", "--weights", str(tmp_path / "none")]) != 0
+    assert "hf download NAME --local-dir DIR" in capsys.readouterr().err
+
+
+def test_a_directory_is_identified_by_its_visible_files(broken, metric):
+    assert sha256(broken) == sha256(metric)
+    (broken / ".cache").mkdir()
+    (broken / ".cache" / "lock").write_text("x")
+    assert sha256(broken) == sha256(metric)
+    edit_weights(broken, lambda state: state | {"head.conv3.bias": state["head.conv3.bias"] + 1})
+    assert sha256(broken) != sha256(metric)
+    shutil.copy(metric / "model.safetensors", broken / "model.safetensors")
+    assert sha256(broken) == sha256(metric)
+    (broken / "config.json").rename(broken / "config2.json")
+    assert sha256(broken) != sha256(metric)
+    identity = network_source("depth_anything", [metric], UfMStarConfig()).identity
+    assert identity["weights"] == [{"name": "metric", "sha256": sha256(metric)}]
+
+
+def test_transformers_is_loaded_only_with_a_checkpoint():
+    code = (
+        "import sys\n"
+        "from ufmstar_torch.models import DepthAnything, from_hugging_face, load_network\n"
+        "assert not {'transformers', 'huggingface_hub', 'safetensors'} & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
