@@ -14,7 +14,7 @@ from ufmstar_torch.train.nyu import NyuFrames
 from ufmstar_torch.train.parts import Part
 from ufmstar_torch.train.samples import FrameSource, SampleDataset
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
-from ufmstar_torch.train.tour_data import TourSettings, tour_frames
+from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_frames
 
 
 class DepthDataModule(LightningDataModule):
@@ -86,11 +86,11 @@ def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:
     if c.kind == "tour":
         settings = TourSettings(c.tour_frames, c.tour_stride, c.tour_size, c.tour_style, c.tour_fov)
         seeds = range(c.first_tour, c.first_tour + c.tours + c.validation_tours)
-        frames = [
-            tour_frames(some, settings, c.cache or None, workers=c.render_workers)
-            for some in (seeds[: c.tours], seeds[c.tours :])
-        ]
-        return frames[0], frames[1]
+        stored = tour_frames(seeds, settings, c.cache or None, workers=c.render_workers)
+        train, validation = (
+            TourFrames(stored.folder, some, c.tour_frames) for some in (seeds[: c.tours], seeds[c.tours :])
+        )
+        return train, validation
     return _sequences(c)
 
 
