@@ -116,7 +116,7 @@ class ConvUnit(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=kernel // 2, groups=groups, bias=not norm)
         self.norm = nn.BatchNorm2d(outputs) if norm else nn.Identity()
-        self.activation = nn.ReLU6() if relu6 else nn.ReLU()
+        self.activation: nn.Module = nn.ReLU6() if relu6 else nn.ReLU()
 
     def forward(self, x: Tensor) -> Tensor:
         return self.activation(self.norm(self.conv(x)))
