@@ -198,7 +198,7 @@ def _ceiling_lamps(found: Furnished, room: Room, palette: Palette, rng: np.rando
         if drop > 0.02:
             found.parts.append(tube((x, -room.height + drop / 2, z), 0.012, drop / 2, metal))
         power = float(rng.uniform(*style.brightness)) / count**0.7
-        found.lights.append(Light(np.array([x, -room.height + drop + 0.3, z]), color * power, 0.5 * size.mean(), 0.2))
+        found.lights.append(Light(np.array([x, -room.height + drop + 0.16, z]), color * power, 0.5 * size.mean(), 0.25))
 
 
 def _rug(found: Furnished, room: Room, palette: Palette, rng: np.random.Generator) -> None:
@@ -236,7 +236,7 @@ def _window(found: Furnished, room: Room, way: Array, palette: Palette, rng: np.
             if len(found.lights) < LIGHTS:
                 power = 0.55 * float(rng.uniform(*room.style.brightness))
                 color = np.array([0.88, 0.97, 1.15]) * power
-                found.lights.append(Light(at, color, 0.45 * float((room.upper - room.lower).mean()), 0.35))
+                found.lights.append(Light(at, color, 0.45 * float((room.upper - room.lower).mean()), 0.5))
             return
 
 

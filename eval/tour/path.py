@@ -13,8 +13,10 @@ from ufmstar_torch.eval.tour.tour import Tour
 
 Array = NDArray[np.float64]
 
-_STEP, _TURN = 0.12, np.radians(5.0)  # a frame moves about this far [m], or turns about this much [rad]
-_SLOWEST = 0.5  # of that pace; with more frames, the way is walked again
+_STEP, _TURN = 0.16, np.radians(8.0)  # a frame moves about this far [m], or turns about this much [rad]
+_SLOWEST, _FASTEST = 0.5, 1.2  # shares of that pace; with more frames, the way is walked again
+# Shares of a way after which its last room was seen, and after which the camera is back in the first.
+_ENOUGH_TO_SEE, _ENOUGH_TO_RETURN = 0.6, 0.75
 _LOOKAHEAD, _SMOOTH = 0.7, 0.4  # the camera looks at where it will be, with a slow head [m]
 SWAY = 0.04  # of the hand, at most, on either axis [m]
 _GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
@@ -54,15 +56,12 @@ def tour_path(tour: Tour, frames: int, seed: int | None = None) -> Tensor:
 def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:
     """The way that leads farthest within a number of frames, and which share of it to walk."""
     ways = [way.numpy() for way in tour.ways]
-    efforts = [_effort(way)[-1] for way in ways]
-    for k in range(len(ways) - 1, -1, -1):
-        if efforts[k] <= frames:
-            if k < len(ways) - 2 and len(set(tour.room_styles)) > 1:
-                break
-            return ways[k], 1.0
-    if len(set(tour.room_styles)) > 1:  # the last room is the point of such a tour: at least look round in it
-        return ways[-2], min(1.0, max(frames / efforts[-2], 0.6))
-    return ways[0], min(1.0, frames / efforts[0])
+    shares = [_FASTEST * frames / float(_effort(way)[-1]) for way in ways]
+    if len(set(tour.room_styles)) > 1:  # the last room is the point of such a tour: see it at any pace
+        k = len(ways) - (1 if shares[-1] >= 1 else 2)
+        return ways[k], min(1.0, max(shares[k], _ENOUGH_TO_SEE))
+    k = max((k for k, share in enumerate(shares) if share >= _ENOUGH_TO_RETURN), default=0)
+    return ways[k], min(1.0, shares[k])
 
 
 def _effort(way: Array) -> Array:

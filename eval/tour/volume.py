@@ -11,7 +11,7 @@ from torch import Tensor
 from ufmstar_torch.eval.tour.intersect import Components, entry
 from ufmstar_torch.eval.tour.shapes import NOBODY, Surfaces
 
-GRID = (11, 22, 22)  # points of a room along y, z, x
+GRID = (14, 22, 22)  # points of a room along y, z, x
 # Where a light's rays end, as parts of its size: the corners of a tetrahedron.
 _SAMPLES = ((1.0, 1.0, 1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, -1.0, -1.0))
 # What stands nearer to a lamp would shade half of the room [m].
