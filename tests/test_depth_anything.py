@@ -56,7 +56,8 @@ def tiny(folder, kind, seed=0, max_depth=20):
     )  # fmt: skip
     model = lively(transformers.DepthAnythingForDepthEstimation(config), seed)
     with torch.no_grad():
-        model.head.conv3.bias += 0.0 if kind == "metric" else 5.0  # the ReLU of relative ones stays open
+        model.head.conv3.weight *= 0.2  # the sigmoid of metric ones is not saturated,
+        model.head.conv3.bias += 0.0 if kind == "metric" else 5.0  # and the ReLU of relative ones open
     model.save_pretrained(folder)
     transformers.DPTImageProcessor(
         size={"height": 518, "width": 518}, keep_aspect_ratio=True, ensure_multiple_of=14, resample=3,
@@ -232,7 +233,9 @@ def test_an_aligned_network_shares_the_weights_and_is_saved_like_any_other(relat
 # ---- preprocessing ----
 
 
-@pytest.mark.parametrize(("size", "expected"), [((480, 640), (518, 686)), ((640, 480), (686, 518)), ((300, 500), (518, 868))])
+@pytest.mark.parametrize(
+    ("size", "expected"), [((480, 640), (518, 686)), ((640, 480), (686, 518)), ((300, 500), (308, 518))]
+)
 def test_keeping_the_aspect_gives_the_own_processor_s_size(metric, size, expected):
     preprocess = DepthAnything.from_pretrained(metric, keep_aspect=True).preprocess
     image = photos(1, size)
@@ -242,13 +245,15 @@ def test_keeping_the_aspect_gives_the_own_processor_s_size(metric, size, expecte
 
 @pytest.mark.parametrize("keep_aspect", [False, True])
 def test_colours_are_the_own_processor_s_to_its_rounding(metric, keep_aspect):
-    """It resamples bytes and rounds after each axis; observed: mean .005, largest 2.1 of 255 levels."""
+    """It resamples bytes, rounding and clipping after each axis. Of 255 levels observed: .05 on average, .6 at the
+    quantile .999, 12 at corners where the cubic overshoots twice (photographs of TUM RGB-D: .28, .97, 9)."""
     image = photos(2, (480, 640))
     ours = DepthAnything.from_pretrained(metric, keep_aspect=keep_aspect).preprocess.apply_image(image)
     theirs = own_processor(metric, image, keep_aspect_ratio=keep_aspect)
     levels = (ours - theirs).abs() * torch.tensor(STD)[:, None, None] * 255
-    assert levels.mean() < 0.5
-    assert levels.max() < 4
+    assert levels.mean() < 0.1
+    assert levels.flatten()[::7].quantile(0.999) < 1
+    assert levels.max() < 16
     linear = Preprocess(size=ours.shape[-2:], mean=MEAN, std=STD).apply_image(image)
     assert (linear - theirs).abs().mean() > 1.5 * (ours - theirs).abs().mean()  # the filter matters
 
@@ -273,11 +278,17 @@ def test_an_image_processor_may_be_missing_or_say_something_else(broken):
     file = broken / "preprocessor_config.json"
     says = json.loads(file.read_text())
     file.unlink()
-    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(size=(518, 518), mean=MEAN, std=STD, cubic=True)
+    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(
+        size=(518, 518), mean=MEAN, std=STD, cubic=True
+    )
     file.write_text(json.dumps(says | {"image_mean": [0.5, 0.5, 0.5], "resample": 2}))
-    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(size=(518, 518), mean=(0.5, 0.5, 0.5), std=STD)
+    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(
+        size=(518, 518), mean=(0.5, 0.5, 0.5), std=STD
+    )
     file.write_text(json.dumps(says | {"do_normalize": False, "do_rescale": False}))
-    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(size=(518, 518), value_range=255.0, cubic=True)
+    assert DepthAnything.from_pretrained(broken).preprocess == Preprocess(
+        size=(518, 518), value_range=255.0, cubic=True
+    )
     for change in ({"resample": 1}, {"do_center_crop": True}):
         file.write_text(json.dumps(says | change))
         with pytest.raises(ValueError, match="is not supported: give a Preprocess of your own"):
@@ -507,7 +518,7 @@ def test_a_directory_is_identified_by_its_visible_files(broken, metric):
 def test_transformers_is_loaded_only_with_a_checkpoint():
     code = (
         "import sys\n"
-        "from ufmstar_torch.models import DepthAnything, from_hugging_face, load_network\n"
+        "from ufmstar_torch.models import DepthAnything, from_hugging_face, hugging_face_spec\n"
         "assert not {'transformers', 'huggingface_hub', 'safetensors'} & set(sys.modules)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
