@@ -78,7 +78,7 @@ def save_trained(
     members = [networks] if isinstance(networks, DepthNetwork) else list(networks)
     if path.suffix != ".safetensors" or not members:
         raise ValueError(f"need a file .safetensors and at least one network, got {path.name} and {len(members)}")
-    expected = {key: value.shape for key, value in _empty(spec).state_dict().items()}
+    expected = {key: value.shape for key, value in _new(spec).state_dict().items()}
     state: dict[str, Tensor] = {}
     for n, member in enumerate(members):
         own = (member.network if isinstance(member, MonteCarloDropout) else member).state_dict()
@@ -191,8 +191,7 @@ class _TrainedFile:
         Raises:
             CheckpointError: as :meth:`member`.
         """
-        with torch.random.fork_rng(devices=[]):  # weights that are overwritten must not use up the caller's seed
-            network = build_network(self.info.spec)
+        network = _new(self.info.spec)
         fill(network, read_safetensors(self.path, f"member.{index}.")[0], f"{self.path}, member {index},")
         return network.eval()
 
@@ -227,9 +226,9 @@ def _parse(path: Path, metadata: Any) -> TrainedInfo:
     return TrainedInfo(path, spec, count, info)
 
 
-def _empty(spec: NetworkSpec) -> DepthNetwork:
-    """The network's structure, without memory for weights."""
-    with torch.device("meta"):
+def _new(spec: NetworkSpec) -> UncertaintyNetwork | BatchEnsemble:
+    """A network to be filled or compared with, whose random weights do not use up the caller's seed."""
+    with torch.random.fork_rng(devices=[]):
         return build_network(spec)
 
 

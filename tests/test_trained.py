@@ -1,0 +1,517 @@
+"""Trained checkpoints: what was saved is what is loaded, and every bad file is named; and ``ufmstar run`` with them."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from layouts import truncate, write_generic
+from runs import outputs, read_summary
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from ufmstar_torch import UncertainDepth, cli
+from ufmstar_torch.eval.writers import read_frame
+from ufmstar_torch.models import NetworkSpec, build_network, load_network, load_trained, read_info, save_trained
+from ufmstar_torch.models.batch_ensemble import BatchEnsemble, BatchEnsembleMember
+from ufmstar_torch.models.checkpoints import CheckpointError
+from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
+from ufmstar_torch.models.ensemble import Ensemble, LazyMember
+from ufmstar_torch.models.trained import load_for_training
+from ufmstar_torch.pipeline import combine
+
+SPECS = {
+    "depth": {},
+    "aleatoric": {},
+    "evidential": {},
+    "mc_dropout": {"dropout": 0.2},
+    "batch_ensemble": {"members": 3},
+}
+
+
+def spec_of(method="aleatoric"):
+    return NetworkSpec(
+        method=method, widths=0.1, positive="softplus", size=(32, 64), preprocess="resize", **SPECS[method]
+    )
+
+
+def trained(spec, count=2, seed=0):
+    """Networks in eval mode whose weights and statistics have moved from where they began."""
+    torch.manual_seed(seed)
+    networks = [build_network(spec) for _ in range(count)]
+    with torch.no_grad():
+        for network in networks:
+            network.distribution(torch.rand(4, 3, *spec.size))
+            for parameter in network.parameters():
+                parameter += 0.05 * torch.randn_like(parameter)
+    return [network.eval() for network in networks]
+
+
+@pytest.fixture(scope="module")
+def image():
+    return torch.rand(1, 3, 32, 64, generator=torch.Generator().manual_seed(1))
+
+
+def members_of(networks):
+    return [m for n in networks for m in (n.all_members() if isinstance(n, BatchEnsemble) else [n])]
+
+
+def predict(network, image):
+    """Depth and variance, without dropout."""
+    if isinstance(network, LazyMember):
+        network = network.network()
+    if isinstance(network, MonteCarloDropout):
+        set_sampling(network, False)
+    with torch.no_grad():
+        out = network(image)
+    return torch.stack([out.depth, *([] if out.variance is None else [out.variance])])
+
+
+# ---- there and back ----
+
+
+@pytest.mark.parametrize("method", SPECS)
+@pytest.mark.parametrize("lazy", [False, True])
+def test_what_was_saved_is_loaded_bit_for_bit(tmp_path, image, method, lazy):
+    spec = spec_of(method)
+    networks = trained(spec)
+    save_trained(tmp_path / "n.safetensors", networks, spec, info={"command": "ufmstar train", "nll": 0.25})
+    loaded = load_trained(tmp_path / "n.safetensors", lazy=lazy)
+    expected = members_of(networks)
+    assert len(loaded) == len(expected) == (6 if method == "batch_ensemble" else 2)
+    for found, original in zip(loaded, expected, strict=True):
+        assert found.preprocess == spec.input()
+        assert not any(m.training for m in found.modules())
+        assert torch.equal(predict(found, image), predict(original, image))
+    told = read_info(tmp_path / "n.safetensors")
+    assert (told.spec, told.networks, told.members) == (spec, 2, len(expected))
+    assert told.info == {"command": "ufmstar train", "nll": 0.25}
+
+
+def test_the_kinds_of_networks_that_are_loaded(tmp_path, image):
+    kinds = {}
+    for method in SPECS:
+        file = tmp_path / f"{method}.safetensors"
+        save_trained(file, trained(spec_of(method), 1), spec_of(method))
+        kinds[method] = load_trained(file)
+    dropout = kinds["mc_dropout"][0]
+    assert isinstance(dropout, MonteCarloDropout)
+    assert not torch.equal(dropout(image).depth, dropout(image).depth)
+    members = kinds["batch_ensemble"]
+    assert all(isinstance(member, BatchEnsembleMember) for member in members)
+    assert len({id(member.ensemble) for member in members}) == 1
+
+
+def test_a_sampling_network_is_saved_as_what_it_wraps(tmp_path, image):
+    spec = spec_of("mc_dropout")
+    (network,) = trained(spec, 1)
+    expected = predict(network, image)
+    save_trained(tmp_path / "n.safetensors", MonteCarloDropout(network), spec)
+    assert torch.equal(predict(load_trained(tmp_path / "n.safetensors")[0], image), expected)
+
+
+def test_an_ensemble_of_several_files(tmp_path, image):
+    spec = spec_of()
+    networks = trained(spec, 3)
+    save_trained(tmp_path / "a.safetensors", networks[:2], spec)
+    save_trained(tmp_path / "b.safetensors", networks[2], spec)
+    loaded = load_trained([tmp_path / "a.safetensors", tmp_path / "b.safetensors"])
+    for found, original in zip(loaded, networks, strict=True):
+        assert torch.equal(predict(found, image), predict(original, image))
+
+
+def test_loading_leaves_the_callers_random_numbers_alone(tmp_path):
+    save_trained(tmp_path / "n.safetensors", trained(spec_of("batch_ensemble"), 1), spec_of("batch_ensemble"))
+    before = torch.get_rng_state()
+    load_trained(tmp_path / "n.safetensors")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_saving_and_loading_change_no_network(tmp_path, image):
+    (network,) = trained(spec_of(), 1)
+    before, expected = copy.deepcopy(network.state_dict()), predict(network, image)
+    save_trained(tmp_path / "n.safetensors", network, spec_of(), half=True)
+    with torch.no_grad():
+        for parameter in load_trained(tmp_path / "n.safetensors")[0].parameters():
+            parameter.zero_()
+    assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
+    assert torch.equal(predict(network, image), expected)
+
+
+def test_training_goes_on_from_a_file(tmp_path, image):
+    spec = spec_of("batch_ensemble")
+    networks = trained(spec)
+    save_trained(tmp_path / "n.safetensors", networks, spec)
+    again = load_for_training(tmp_path / "n.safetensors")
+    assert [type(network) for network in again] == [BatchEnsemble, BatchEnsemble]
+    assert all(m.training for network in again for m in network.modules())
+    for found, original in zip(again, networks, strict=True):
+        state = original.state_dict()
+        assert all(torch.equal(value, state[key]) for key, value in found.state_dict().items())
+
+
+def test_members_of_a_file_alternate(tmp_path, image):
+    networks = trained(spec_of())
+    save_trained(tmp_path / "n.safetensors", networks, spec_of())
+    pipeline = UncertainDepth(load_trained(tmp_path / "n.safetensors"))
+    pose, K = torch.eye(4), torch.tensor([[40.0, 0, 31.5], [0, 40, 15.5], [0, 0, 1]])
+    for turn in range(3):
+        result = pipeline(image, pose, K)
+        assert result.member == turn % 2
+        assert torch.equal(result.depth, networks[turn % 2](image).depth)
+
+
+# ---- lazily ----
+
+
+def test_lazy_members_read_their_own_weights_only(tmp_path, image):
+    networks = trained(spec_of(), 3)
+    file = tmp_path / "n.safetensors"
+    save_trained(file, networks, spec_of())
+    loaded = load_trained(file, lazy=True)
+    assert not any(member.loaded for member in loaded)
+    assert torch.equal(predict(loaded[1], image), predict(networks[1], image))
+    assert [member.loaded for member in loaded] == [False, True, False]
+    file.unlink()
+    loaded[1](image)
+    with pytest.raises(CheckpointError, match=r"n\.safetensors, member 2 cannot be loaded: no file"):
+        loaded[2](image)
+
+
+def test_offloading_without_lazy_reads_at_once(tmp_path, image):
+    networks = trained(spec_of())
+    save_trained(tmp_path / "n.safetensors", networks, spec_of())
+    loaded = load_trained(tmp_path / "n.safetensors", offload=True)
+    assert all(member.loaded and member.offload for member in loaded)
+    nn.ModuleList(loaded).to("meta")  # its turn there is tested with the members alone
+    assert torch.equal(predict(loaded[1], image), predict(networks[1], image))
+    assert {p.device.type for member in loaded for p in member.network().parameters()} == {"cpu"}
+
+
+@pytest.mark.parametrize("offload", [False, True])
+def test_lazy_members_of_a_batch_ensemble_share_their_weights(tmp_path, image, offload):
+    spec = spec_of("batch_ensemble")
+    networks = trained(spec)
+    save_trained(tmp_path / "n.safetensors", networks, spec)
+    for loaded in (lazies := load_trained(tmp_path / "n.safetensors", lazy=True, offload=offload), None):
+        loaded = loaded or list(copy.deepcopy(nn.ModuleList(lazies)))
+        for found, original in zip(loaded, members_of(networks), strict=True):
+            assert torch.equal(predict(found, image), predict(original, image))
+        ensembles = [member.network().ensemble for member in loaded]
+        assert [e is ensembles[0] for e in ensembles] == [True] * 3 + [False] * 3
+
+
+def test_lazy_members_can_be_pickled(tmp_path, image):
+    networks = trained(spec_of())
+    save_trained(tmp_path / "n.safetensors", networks, spec_of())
+    loaded = pickle.loads(pickle.dumps(load_trained(tmp_path / "n.safetensors", lazy=True)))
+    assert torch.equal(predict(loaded[1], image), predict(networks[1], image))
+
+
+# ---- half precision ----
+
+
+@pytest.mark.parametrize("method", SPECS)
+def test_half_precision_is_half_the_file_and_nearly_the_network(tmp_path, image, method):
+    spec = spec_of(method)
+    networks = trained(spec)
+    save_trained(tmp_path / "full.safetensors", networks, spec)
+    save_trained(tmp_path / "half.safetensors", networks, spec, half=True)
+    sizes = [(tmp_path / name).stat().st_size for name in ("full.safetensors", "half.safetensors")]
+    header = struct.unpack("<Q", (tmp_path / "half.safetensors").read_bytes()[:8])[0]
+    assert sizes[1] - header < 0.53 * (sizes[0] - header)
+    full, half = (load_trained(tmp_path / name) for name in ("full.safetensors", "half.safetensors"))
+    for one, other in zip(full, half, strict=True):
+        for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True):
+            assert a.dtype == b.dtype
+            # 2^-11 relative, or half the distance of the subnormal numbers.
+            torch.testing.assert_close(b, a, rtol=2**-11, atol=2**-25)
+        torch.testing.assert_close(predict(other, image), predict(one, image), rtol=0.02, atol=0.02)
+
+
+def test_statistics_that_half_precision_cannot_hold_stay(tmp_path):
+    (network,) = trained(spec_of(), 1)
+    norms = [m for m in network.modules() if isinstance(m, nn.BatchNorm2d)]
+    with torch.no_grad():
+        norms[0].running_var[0] = 1e5  # would be infinite
+        norms[1].running_mean[0] = -7e4
+        norms[2].running_var[0] = 1e-6  # would have 4 bits left
+        norms[3].weight[0] = 1e-9  # may become 0: it is not divided by
+    save_trained(tmp_path / "n.safetensors", network, spec_of(), half=True)
+    (found,) = load_trained(tmp_path / "n.safetensors")
+    again = [m for m in found.modules() if isinstance(m, nn.BatchNorm2d)]
+    assert torch.equal(again[0].running_var, norms[0].running_var)
+    assert torch.equal(again[1].running_mean, norms[1].running_mean)
+    assert torch.equal(again[2].running_var, norms[2].running_var)
+    assert again[3].weight[0] == 0
+    stored = load_file(tmp_path / "n.safetensors")
+    kept = [key for key, value in stored.items() if value.dtype == torch.float32]
+    assert len(kept) == 3
+    assert {value.dtype for value in stored.values()} == {torch.float16, torch.float32, torch.int64}
+    assert {value.dtype for value in found.state_dict().values()} == {torch.float32, torch.int64}
+
+
+# ---- what cannot be saved ----
+
+
+def test_networks_that_do_not_fit_their_spec(tmp_path):
+    networks = trained(spec_of())
+    file = tmp_path / "n.safetensors"
+    for wrong in (replace(spec_of(), method="evidential"), replace(spec_of(), widths=0.2)):
+        with pytest.raises(ValueError, match=r"network 0 \(AleatoricNetwork\) is not what its spec describes"):
+            save_trained(file, networks, wrong)
+    with pytest.raises(ValueError, match="at least one network, got n"):
+        save_trained(file, [], spec_of())
+    with pytest.raises(ValueError, match=r"need a file \.safetensors"):
+        save_trained(tmp_path / "n.pt", networks, spec_of())
+    with pytest.raises(TypeError, match="JSON serializable"):
+        save_trained(file, networks, spec_of(), info={"what": object()})
+    with torch.no_grad():
+        networks[1].head.weight[0, 0, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"member\.1\.head\.weight has NaN"):
+        save_trained(file, networks, spec_of())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_save_that_fails_leaves_the_old_file(tmp_path, image):
+    networks = trained(spec_of())
+    save_trained(tmp_path / "n.safetensors", networks, spec_of())
+    before = (tmp_path / "n.safetensors").read_bytes()
+    with pytest.raises(TypeError):
+        save_trained(tmp_path / "n.safetensors", networks, spec_of(), info={"what": object()})
+    assert (tmp_path / "n.safetensors").read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+# ---- bad files ----
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "bad.safetensors"
+    save_trained(path, trained(spec_of()), spec_of(), info={"a": 1})
+    return path
+
+
+def rewritten(path, change):
+    """The file with its tensors and metadata changed in place by ``change``."""
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as opened:
+        metadata = json.loads(opened.metadata()["metadata"])
+    tensors = {key: value.clone() for key, value in load_file(path).items()}
+    change(tensors, metadata)
+    save_file(tensors, path, metadata={"metadata": json.dumps(metadata)})
+
+
+METADATA = {
+    "another format": (lambda m: m.update(format="something"), "no trained networks of this package"),
+    "newer": (lambda m: m.update(version=2), "version 2, written by a newer release .* update it"),
+    "no version": (lambda m: m.pop("version"), "version None, which never was"),
+    "spec with an unknown key": (lambda m: m["spec"].update(depth=3), r"spec .* NetworkSpec has no \['depth'\]"),
+    "impossible spec": (lambda m: m["spec"].update(size=[33, 64]), "spec that cannot be built: .*multiples of 32"),
+    "spec of another kind": (lambda m: m.update(spec=7), "spec that cannot be built"),
+    "no networks": (lambda m: m.update(networks=0), "damaged metadata"),
+    "no info": (lambda m: m.pop("info"), "damaged metadata"),
+}
+
+
+@pytest.mark.parametrize("name", METADATA)
+def test_metadata_that_cannot_be_used(file, name):
+    change, message = METADATA[name]
+    rewritten(file, lambda tensors, metadata: change(metadata))
+    for load in (load_trained, read_info, lambda path: load_trained(path, lazy=True)):
+        with pytest.raises(CheckpointError, match=rf"bad\.safetensors .*{message}"):
+            load(file)
+
+
+def test_a_file_of_another_program(tmp_path):
+    save_file({"x": torch.zeros(1)}, tmp_path / "bad.safetensors")
+    with pytest.raises(CheckpointError, match=r"bad\.safetensors holds no trained networks of this package"):
+        load_trained(tmp_path / "bad.safetensors")
+    save_file({"x": torch.zeros(1)}, tmp_path / "bad.safetensors", metadata={"metadata": "{"})
+    with pytest.raises(CheckpointError, match=r"bad\.safetensors is not a readable"):
+        load_trained(tmp_path / "bad.safetensors")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
+def test_a_file_that_is_cut_off(file, share):
+    truncate(file, share)
+    for load in (load_trained, read_info, lambda path: load_trained(path, lazy=True)):
+        with pytest.raises(CheckpointError, match=r"bad\.safetensors is not a readable safetensors file"):
+            load(file)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    for load in (load_trained, read_info):
+        with pytest.raises(FileNotFoundError, match="nowhere"):
+            load(tmp_path / "nowhere.safetensors")
+
+
+WEIGHTS = {
+    "missing": (lambda t: t.pop("member.1.head.bias"), "1 missing: head.bias"),
+    "unexpected": (lambda t: t.update({"member.1.more": torch.zeros(1)}), "1 unexpected: more"),
+    "of another shape": (lambda t: t.update({"member.1.head.bias": torch.zeros(2)}), r"head.bias is \(2,\), expected"),
+    "not finite": (lambda t: t["member.1.head.bias"].fill_(torch.inf), "with NaN or infinity: head.bias"),
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_damaged_weights_name_file_and_member(file, image, name):
+    change, message = WEIGHTS[name]
+    rewritten(file, lambda tensors, metadata: change(tensors))
+    with pytest.raises(CheckpointError, match=rf"bad\.safetensors, member 1, does not fit .*{message}"):
+        load_trained(file)
+    loaded = load_trained(file, lazy=True)
+    loaded[0](image)
+    with pytest.raises(CheckpointError, match=rf"bad\.safetensors, member 1, does not fit .*{message}"):
+        loaded[1](image)
+
+
+def test_the_file_of_an_ensemble_that_is_bad_is_named(tmp_path, file):
+    save_trained(tmp_path / "good.safetensors", trained(spec_of()), spec_of())
+    truncate(file)
+    with pytest.raises(CheckpointError, match=r"bad\.safetensors"):
+        load_trained([tmp_path / "good.safetensors", file])
+
+
+# ---- by name, and from the command line ----
+
+
+def test_a_file_as_one_network(tmp_path, image):
+    networks = trained(spec_of())
+    save_trained(tmp_path / "two.safetensors", networks, spec_of())
+    save_trained(tmp_path / "one.safetensors", networks[0], spec_of())
+    found = load_network("trained", tmp_path / "two.safetensors")
+    assert isinstance(found, Ensemble)
+    expected = combine([network(image) for network in networks])
+    assert torch.equal(found(image).depth, expected.depth)
+    assert torch.equal(found(image).epistemic_variance, expected.epistemic_variance)
+    assert torch.equal(
+        predict(load_network("trained", tmp_path / "one.safetensors"), image), predict(networks[0], image)
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A generic sequence of 4 frames, 48x64. Nobody may change it."""
+    return write_generic(tmp_path_factory.mktemp("scene"), frames=4)[0]
+
+
+@pytest.fixture
+def ufmstar(capfd, scene, tmp_path):
+    """Runs the scene into a folder: (exit code, stdout, stderr)."""
+
+    def call(*words, out="out"):
+        capfd.readouterr()
+        quiet = ("--no-video", "--no-sheet", "--out", tmp_path / out)
+        code = cli.main([str(word) for word in ("run", scene, "--model", "trained", *words, *quiet)])
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return call
+
+
+def depths(out):
+    return np.stack([read_frame(path)["depth"] for path in sorted((out / "frames").iterdir(), key=lambda p: int(p.stem))])
+
+
+def by_hand(scene, members, mode="alternate"):
+    """The depths of a run."""
+    from ufmstar_torch.eval.sequences import open_sequence
+
+    pipeline = UncertainDepth(members, mode=mode, preprocess=members[0].preprocess)
+    found = []
+    for frame in open_sequence(scene):
+        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+        pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
+        found.append(pipeline(image, pose, K).depth[0].numpy())
+    return np.stack(found)
+
+
+@pytest.mark.parametrize("mode", ["alternate", "full"])
+@pytest.mark.parametrize("method", ["aleatoric", "batch_ensemble"])
+def test_a_run_with_all_members_of_two_files(ufmstar, scene, tmp_path, mode, method):
+    spec = spec_of(method)
+    networks = trained(spec, 3)
+    save_trained(tmp_path / "a.safetensors", networks[:2], spec)
+    save_trained(tmp_path / "b.safetensors", networks[2], spec)
+    files = (tmp_path / "a.safetensors", tmp_path / "b.safetensors")
+    code, out, err = ufmstar("--weights", *files, "--mode", mode)
+    assert code == 0, err
+    assert "finished: 4 of 4 frames" in out
+    np.testing.assert_array_equal(depths(tmp_path / "out"), by_hand(scene, members_of(networks), mode))
+    source = read_summary(tmp_path / "out")["source"]
+    assert [file["name"] for file in source["weights"]] == ["a.safetensors", "b.safetensors"]
+    assert (source["mode"], source["samples"]) == (mode, None)
+
+
+def test_a_run_with_offloading_is_the_same(ufmstar, scene, tmp_path):
+    networks = trained(spec_of())
+    save_trained(tmp_path / "a.safetensors", networks, spec_of())
+    assert ufmstar("--weights", tmp_path / "a.safetensors", "--offload")[0] == 0
+    np.testing.assert_array_equal(depths(tmp_path / "out"), by_hand(scene, networks))
+
+
+def test_a_run_that_samples_repeats_itself_and_goes_on(ufmstar, scene, tmp_path):
+    spec = spec_of("mc_dropout")
+    save_trained(tmp_path / "a.safetensors", trained(spec, 1), spec)
+    words = ("--weights", tmp_path / "a.safetensors")
+    assert ufmstar(*words)[0] == 0
+    whole = outputs(tmp_path / "out")
+    torch.rand(7)  # whatever else was drawn
+    assert ufmstar(*words, "--overwrite")[0] == 0
+    again = outputs(tmp_path / "out")
+    assert again == whole
+    np.testing.assert_raises(
+        AssertionError, np.testing.assert_array_equal, depths(tmp_path / "out"), by_hand(scene, trained(spec, 1))
+    )
+
+
+def test_a_run_of_samples_taken_together(ufmstar, tmp_path):
+    spec = spec_of("mc_dropout")
+    save_trained(tmp_path / "a.safetensors", trained(spec, 1), spec)
+    words = ("--weights", tmp_path / "a.safetensors", "--mode", "full", "--frames", ":1")
+    for samples, said in (((), 10), (("--samples", "3"), 3)):
+        code, _, err = ufmstar(*words, *samples, "--overwrite")
+        assert code == 0, err
+        assert read_summary(tmp_path / "out")["source"]["samples"] == said
+
+
+MISTAKES = {
+    "full with one member": (("--mode", "full"), "needs several members"),
+    "samples of an ensemble": (("--mode", "full", "--samples", "3"), "needs several members"),
+    "samples in turn": (("--samples", "3"), "goes with --mode full"),
+    "one sample": (("--mode", "full", "--samples", "1"), "at least 2"),
+    "spec": (("--spec", "{weights}"), "does not take"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_told_in_one_line(ufmstar, tmp_path, name):
+    words, message = MISTAKES[name]
+    weights = tmp_path / "a.safetensors"
+    save_trained(weights, trained(spec_of(), 1), spec_of())
+    code, _, err = ufmstar("--weights", weights, *[word.format(weights=weights) for word in words])
+    assert (code, err.count("\n")) == (2, 1)
+    assert message in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_file_is_told_in_one_line(ufmstar, file):
+    truncate(file)
+    code, _, err = ufmstar("--weights", file)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "bad.safetensors is not a readable safetensors file" in err
+
+
+def test_offloading_is_for_trained_networks(capfd, scene, tmp_path):
+    words = ("run", scene, "--model", "fastdepth", "--weights", "x", "--offload", "--out", tmp_path / "out")
+    assert cli.main([str(word) for word in words]) == 2
+    assert "--offload goes with --model trained only" in capfd.readouterr().err
