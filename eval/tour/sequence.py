@@ -83,7 +83,8 @@ def tour_sequence(
         Entry(f"{i:06d}", poses[i].numpy(), partial(renderer.image, i), partial(renderer.depth, i), timestamp=i / FPS)
         for i in range(frames)
     ]
-    return make_sequence(f"tour-{seed}", "tour", entries, K, image_size=size, depth_size=size)
+    named = style if isinstance(style, str) else "own"
+    return make_sequence(f"tour-{seed}-{named}", "tour", entries, K, image_size=size, depth_size=size)
 
 
 def export_tour(sequence: Sequence, folder: str | Path) -> Path:
@@ -95,6 +96,7 @@ def export_tour(sequence: Sequence, folder: str | Path) -> Path:
 
     Raises:
         FileExistsError: the folder holds something.
+        ValueError: a frame has no image or no depth.
     """
     from PIL import Image
 
@@ -105,7 +107,8 @@ def export_tour(sequence: Sequence, folder: str | Path) -> Path:
         (folder / name).mkdir(parents=True, exist_ok=True)
     rows = []
     for frame in sequence:
-        assert frame.image is not None
+        if frame.image is None or frame.depth is None:
+            raise ValueError(f"sequence must have an image and a depth map for every frame, {frame.name} has not")
         Image.fromarray(frame.image).save(folder / "images" / f"{frame.name}.png")
         np.save(folder / "depth" / f"{frame.name}.npy", frame.depth)
         rows.append(frame.T_world_cam[:3].flatten())
