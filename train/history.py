@@ -75,7 +75,9 @@ class History(pl.Callback):
     def on_train_epoch_end(self, trainer: pl.Trainer, module: TrainingModule) -> None:
         """A row of metrics.csv."""
         if trainer.is_global_zero:
-            self._append(METRICS, METRIC_COLUMNS, trainer, {**trainer.callback_metrics, "train_loss": module.losses.mean()})
+            self._append(
+                METRICS, METRIC_COLUMNS, trainer, {**trainer.callback_metrics, "train_loss": module.losses.mean()}
+            )
 
     def on_save_checkpoint(self, trainer: pl.Trainer, module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
         """The clock."""
