@@ -157,7 +157,9 @@ def _floor(covariance, floor):
     M, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for n in range(covariance.shape[0]):
         S = covariance[n]
-        M[:] = S
+        for i in range(3):  # a slice assignment would compile for seconds, for the sake of its error message
+            for j in range(3):
+                M[i, j] = S[i, j]
         right_singular(M, V, s)  # of a positive semidefinite matrix: its eigenvalues and eigenvectors
         if min(s[0], s[1], s[2]) >= floor[n]:
             continue
@@ -186,13 +188,17 @@ def _fuse(
                 pi_k = np.float64(weight[b, k])
                 pi_c = weight_c[b, c] * (overlap[b, c, k] if overlap_weighted else 1.0)
                 lam = pi_c / (pi_k + pi_c)
-                mean_k[:] = mean[b, k]
-                cov_k[:] = covariance[b, k]
+                for i in range(3):  # no slice assignments: see _floor
+                    mean_k[i] = mean[b, k, i]
+                    for j in range(3):
+                        cov_k[i, j] = covariance[b, k, i, j]
                 distance = geodesic(mean_k, cov_k, mean_c[b, c], cov_c[b, c], lam, work)
                 least[0] = 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2])
                 _floor(cov_k[None], least)
-                mean[b, k] = mean_k
-                covariance[b, k] = cov_k
+                for i in range(3):
+                    mean[b, k, i] = mean_k[i]
+                    for j in range(3):
+                        covariance[b, k, i, j] = cov_k[i, j]
                 weight[b, k] = pi_k + pi_c
                 disagreement[b, k] = (1 - lam) * np.float64(disagreement[b, k]) + lam * distance
                 for g in range(features.shape[2]):
