@@ -218,7 +218,7 @@ def _window(found: Furnished, room: Room, way: Array, palette: Palette, rng: np.
     frame, view = palette.finish("ceiling"), palette.picture("window", "paint", 2 * h, glow=0.75)
     parts = [
         box((0, -h, 0.02), (w, h, 0.015), view),
-        box((0, 0.0, 0.04), (w + 0.08, 0.03, 0.05), frame),
+        box((0, 0.0, 0.04), (w + 0.08, 0.03, 0.042), frame),
         box((0, -2 * h, 0.02), (w + 0.04, 0.03, 0.025), frame),
         box((-w, -h, 0.02), (0.03, h, 0.025), frame),
         box((w, -h, 0.02), (0.03, h, 0.025), frame),

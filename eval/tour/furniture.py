@@ -100,7 +100,7 @@ def desk(rng: np.random.Generator, palette: Palette) -> Piece:
     screen = rng.uniform(0.22, 0.34)
     parts = [
         box((0, -h, d / 2), (w / 2, 0.02, d / 2), wood),
-        box((-w / 2 + 0.02, -h / 2, d / 2), (0.02, h / 2, d / 2 - 0.03), wood),
+        box((-w / 2 + 0.03, -h / 2, d / 2), (0.02, h / 2, d / 2 - 0.03), wood),
         box((w / 2 - 0.22, -h / 2, d / 2), (0.2, h / 2 - 0.03, d / 2 - 0.05), palette.finish("paint")),
         box((0.1, -h - 0.25, 0.2), (screen, screen * 0.6, 0.015), dark, yaw=rng.uniform(-0.3, 0.3)),
         box((0.1, -h - 0.06, 0.2), (0.03, 0.06, 0.03), dark),
@@ -114,8 +114,8 @@ def sofa(rng: np.random.Generator, palette: Palette) -> Piece:
     cloth, w = palette.finish("cloth"), rng.uniform(1.5, 2.0) if rng.random() < 0.65 else rng.uniform(0.8, 0.95)
     d, seat = rng.uniform(0.75, 0.9), rng.uniform(0.36, 0.44)
     parts = [
-        box((0, -seat / 2 - 0.03, d / 2), (w / 2, seat / 2 - 0.03, d / 2), cloth),
-        box((0, -seat - 0.2, 0.11), (w / 2, 0.22, 0.1), cloth, pitch=0.1),
+        box((0, -seat / 2 - 0.03, d / 2), (w / 2 - 0.02, seat / 2 - 0.03, d / 2 - 0.01), cloth),
+        box((0, -seat - 0.2, 0.11), (w / 2 - 0.01, 0.22, 0.1), cloth, pitch=0.1),
         box((-w / 2 + 0.08, -seat - 0.08, d / 2), (0.08, 0.12, d / 2), cloth),
         box((w / 2 - 0.08, -seat - 0.08, d / 2), (0.08, 0.12, d / 2), cloth),
     ]
@@ -147,7 +147,7 @@ def bookshelf(rng: np.random.Generator, palette: Palette) -> Piece:
     parts = [box((s * (w / 2 - 0.012), -h / 2, d / 2), (0.012, h / 2, d / 2), wood) for s in (-1, 1)]
     parts.append(box((0, -h / 2, 0.01), (w / 2, h / 2, 0.01), wood))
     for row in range(rows + 1):
-        parts.append(box((0, -0.05 - row * 0.36, d / 2), (w / 2, 0.013, d / 2), wood))
+        parts.append(box((0, -0.05 - row * 0.36, d / 2), (w / 2 - 0.02, 0.013, d / 2 - 0.004), wood))
     for row in range(rows):
         y = -0.063 - row * 0.36
         if rng.random() < 0.75:

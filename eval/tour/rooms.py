@@ -174,7 +174,7 @@ def _wall(
     def skirting(start: float, end: float) -> Part:
         centre, half = np.zeros(3), np.zeros(3)
         centre[2 * axis], centre[2 * along], centre[1] = wall, (start + end) / 2, -0.04
-        half[2 * axis], half[2 * along], half[1] = 0.015, (end - start) / 2, 0.045
+        half[2 * axis], half[2 * along], half[1] = 0.012, (end - start) / 2, 0.045
         return part(BOX, centre, half, board, label="skirting")
 
     top, at = -room.height - _OVERLAP, float(room.lower[along]) - _OVERLAP
