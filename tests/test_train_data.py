@@ -605,7 +605,7 @@ def test_processes_share_each_batch_of_one_process(length, batch_size, world, se
     for batch, *shares in zip(whole, *parts, strict=True):
         assert all(len(share) == batch_size for share in shares)
         assert sorted(batch) == sorted(key for share in shares for key in share)
-    seen = [key.index for batch in whole for key in batch]
+    seen = [key.frame for batch in whole for key in batch]
     assert len(set(seen)) == len(seen) == length // step * step
     assert all(key.epoch == epoch for batch in whole for key in batch)
 
@@ -614,7 +614,7 @@ def test_processes_share_each_batch_of_one_process(length, batch_size, world, se
 @given(**LENGTHS)
 def test_validation_takes_every_frame_once(length, batch_size, world):
     parts = [EpochBatches(length, batch_size, rank=r, world=world, shuffle=False) for r in range(world)]
-    seen = [key.index for part in parts for batch in part for key in batch]
+    seen = [key.frame for part in parts for batch in part for key in batch]
     assert sorted(seen) == list(range(length))
     assert all(len(list(part)) == len(part) for part in parts)
     assert all(0 < len(batch) <= batch_size for part in parts for batch in part)
@@ -625,7 +625,7 @@ def test_order_depends_on_seed_and_epoch_alone():
         batches = EpochBatches(50, 7, seed=seed)
         batches.set_epoch(epoch, start)
         torch.manual_seed(np.random.default_rng().integers(1000))
-        return [key.index for batch in batches for key in batch]
+        return [key.frame for batch in batches for key in batch]
 
     assert order(1, 2) == order(1, 2)
     assert len({tuple(order(s, e)) for s in range(3) for e in range(3)}) == 9
@@ -805,7 +805,7 @@ def test_lightning_walks_through_the_epochs(tmp_path):
     expected, batches = [], EpochBatches(23, 4, seed=9)
     for epoch in range(3):
         batches.set_epoch(epoch)
-        expected += [key.index for batch in batches for key in batch]
+        expected += [key.frame for batch in batches for key in batch]
     assert recorder.seen == expected
 
 

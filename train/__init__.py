@@ -1,1 +1,54 @@
-"""Training of the networks: the layer's place; its modules come with the networks' own release."""
+"""Training of the networks: losses, augmentation, data, and the loop around them.
+
+The names below load their module when they are first used, not when this package is imported.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ufmstar_torch.train.augment import Augmentation as Augmentation
+    from ufmstar_torch.train.augment import AugmentationConfig as AugmentationConfig
+    from ufmstar_torch.train.batches import EpochBatches as EpochBatches
+    from ufmstar_torch.train.batches import EpochLoader as EpochLoader
+    from ufmstar_torch.train.data import DepthDataModule as DepthDataModule
+    from ufmstar_torch.train.data_config import DataConfig as DataConfig
+    from ufmstar_torch.train.losses import loss_of as loss_of
+    from ufmstar_torch.train.losses import loss_sums as loss_sums
+    from ufmstar_torch.train.nyu import NyuFrames as NyuFrames
+    from ufmstar_torch.train.nyu import convert_labelled as convert_labelled
+    from ufmstar_torch.train.samples import SampleDataset as SampleDataset
+    from ufmstar_torch.train.samples import SampleError as SampleError
+    from ufmstar_torch.train.sequence_data import SequenceFrames as SequenceFrames
+    from ufmstar_torch.train.tour_data import TourSettings as TourSettings
+    from ufmstar_torch.train.tour_data import tour_frames as tour_frames
+
+_HOME = {
+    "Augmentation": "augment",
+    "AugmentationConfig": "augment",
+    "DataConfig": "data_config",
+    "DepthDataModule": "data",
+    "EpochBatches": "batches",
+    "EpochLoader": "batches",
+    "NyuFrames": "nyu",
+    "SampleDataset": "samples",
+    "SampleError": "samples",
+    "SequenceFrames": "sequence_data",
+    "TourSettings": "tour_data",
+    "convert_labelled": "nyu",
+    "loss_of": "losses",
+    "loss_sums": "losses",
+    "tour_frames": "tour_data",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(_HOME)

@@ -13,7 +13,7 @@ from ufmstar_torch.train.samples import Sample, SampleDataset, SampleKey
 
 
 class EpochBatches(Sampler[list[SampleKey]]):
-    """Batches of (epoch, index) for a loader's ``batch_sampler``.
+    """Batches of (epoch, frame) for a loader's ``batch_sampler``.
 
     Training (``shuffle``): each epoch has its own order. The processes of a distributed run divide each batch of
     ``world * batch_size`` among them, so that together they take the steps of one process with that batch
@@ -66,7 +66,7 @@ class EpochBatches(Sampler[list[SampleKey]]):
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, order = self.epoch, self._order()
         for batch in range(self.start_batch, len(self)):
-            yield [SampleKey(epoch, int(index)) for index in self._batch(order, batch)]
+            yield [SampleKey(epoch, int(frame)) for frame in self._batch(order, batch)]
 
     def _order(self) -> np.ndarray:
         if not self.shuffle:

@@ -51,7 +51,7 @@ class SampleKey(NamedTuple):
     the same for any number of workers."""
 
     epoch: int
-    index: int
+    frame: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class SampleDataset(Dataset[Sample]):
         """The sample of a frame.
 
         Args:
-            key: (epoch, index) as :class:`~ufmstar_torch.train.batches.EpochBatches` yields it; an index
+            key: (epoch, frame) as :class:`~ufmstar_torch.train.batches.EpochBatches` yields it; a frame's number
                 alone is of epoch 0.
 
         Raises:
