@@ -9,6 +9,7 @@ import sys
 
 import pytest
 import torch
+from depth_anything_files import MEAN, STD, lively, write_depth_anything
 from layouts import write_generic
 from runs import read_summary
 from safetensors.torch import load_file, save_file
@@ -30,52 +31,19 @@ from ufmstar_torch.ufmstar import UfMStarConfig
 
 transformers = pytest.importorskip("transformers")
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 K = torch.tensor([[525.0, 0, 319.5], [0, 520.0, 239.5], [0, 0, 1]], dtype=torch.float64)
-
-
-def lively(model, seed):
-    """Random weights large enough for outputs that depend on the image."""
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for value in model.parameters():
-            if value.dim() > 1:
-                value.copy_(torch.randn(value.shape, generator=generator) * (2 / value[0].numel()) ** 0.5)
-    return model.eval()
-
-
-def tiny(folder, kind, seed=0, max_depth=20):
-    """A Depth Anything V2 of 90 thousand weights with the published checkpoints' image processor."""
-    backbone = transformers.Dinov2Config(
-        hidden_size=32, num_hidden_layers=4, num_attention_heads=2, image_size=70, out_indices=[1, 2, 3, 4],
-        reshape_hidden_states=False, apply_layernorm=True, patch_size=14,
-    )  # fmt: skip
-    config = transformers.DepthAnythingConfig(
-        backbone_config=backbone, reassemble_hidden_size=32, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8,
-        head_hidden_size=8, depth_estimation_type=kind, max_depth=max_depth if kind == "metric" else 1,
-    )  # fmt: skip
-    model = lively(transformers.DepthAnythingForDepthEstimation(config), seed)
-    with torch.no_grad():
-        model.head.conv3.weight *= 0.2  # the sigmoid of metric ones is not saturated,
-        model.head.conv3.bias += 0.0 if kind == "metric" else 5.0  # and the ReLU of relative ones open
-    model.save_pretrained(folder)
-    transformers.DPTImageProcessor(
-        size={"height": 518, "width": 518}, keep_aspect_ratio=True, ensure_multiple_of=14, resample=3,
-        image_mean=list(MEAN), image_std=list(STD),
-    ).save_pretrained(folder)  # fmt: skip
-    return folder
 
 
 @pytest.fixture(scope="module")
 def metric(tmp_path_factory):
     """A directory with a metric checkpoint. Nobody may change it."""
-    return tiny(tmp_path_factory.mktemp("hub") / "metric", "metric")
+    return write_depth_anything(tmp_path_factory.mktemp("hub") / "metric", "metric")
 
 
 @pytest.fixture(scope="module")
 def relative(tmp_path_factory):
     """A directory with a relative checkpoint. Nobody may change it."""
-    return tiny(tmp_path_factory.mktemp("hub") / "relative", "relative")
+    return write_depth_anything(tmp_path_factory.mktemp("hub") / "relative", "relative")
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +164,7 @@ def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative)
     network = DepthAnything.from_pretrained(relative, size=(70, 84))
     x, K_net = network.preprocess(photos(1), K)
     assert (network.kind, network.is_metric) == ("inverse", False)
-    with pytest.raises(ValueError, match="predicts relative depth .*inverse depth up to scale and shift"):
+    with pytest.raises(ValueError, match=r"predicts relative depth .*inverse depth up to scale and shift"):
         network(x)
     with pytest.raises(ValueError, match="fit_inverse_depth"):
         UncertainDepth(network, preprocess=network.preprocess)(photos(1), torch.eye(4), K)
@@ -294,7 +262,7 @@ def test_an_image_processor_may_be_missing_or_say_something_else(broken):
         with pytest.raises(ValueError, match="is not supported: give a Preprocess of your own"):
             DepthAnything.from_pretrained(broken)
     file.write_text("{")
-    with pytest.raises(CheckpointError, match="broken: preprocessor_config.json cannot be read"):
+    with pytest.raises(CheckpointError, match=r"broken: preprocessor_config\.json cannot be read"):
         DepthAnything.from_pretrained(broken)
 
 
@@ -365,9 +333,9 @@ def test_a_damaged_checkpoint_is_named(broken, damage):
 
 def test_missing_directories_are_named(broken, tmp_path):
     (broken / "config.json").unlink()
-    with pytest.raises(FileNotFoundError, match="broken has no config.json"):
+    with pytest.raises(FileNotFoundError, match=r"broken has no config\.json"):
         DepthAnything.from_pretrained(broken)
-    with pytest.raises(FileNotFoundError, match="no such directory: .*nowhere"):
+    with pytest.raises(FileNotFoundError, match=r"no such directory: .*nowhere"):
         DepthAnything.from_pretrained(tmp_path / "nowhere")
     with pytest.raises(FileNotFoundError, match="no such directory: nowhere"):
         DepthAnything.from_pretrained("./nowhere")
@@ -487,8 +455,21 @@ def test_the_command_line_runs_a_directory(metric, relative, tmp_path, capsys):
     sequence = write_generic(tmp_path / "scene")[0]
     spec, out = tmp_path / "spec.json", tmp_path / "out"
     spec.write_text(json.dumps({"size": [42, 56]}))
-    words = ["run", sequence, "--out", out, "--spec", spec, "--no-video", "--no-sheet", "--frames", ":3"]
-    words = [str(word) for word in words if word not in ("--no-video", "--no-sheet")]
+    words = [
+        "run",
+        sequence,
+        "--out",
+        out,
+        "--spec",
+        spec,
+        "--no-video",
+        "true",
+        "--no-sheet",
+        "true",
+        "--frames",
+        ":2",
+    ]
+    words = [str(word) for word in words]
     assert cli.main([*words, "--model", "depth_anything", "--weights", str(metric)]) == 0
     assert read_summary(out)["state"] == "finished"
     capsys.readouterr()

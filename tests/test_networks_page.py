@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 import torch
+from depth_anything_files import write_depth_anything
 from onnx_files import small_network, write_fastdepth
 from test_monodepth2 import classifier_weights, published_decoder, write_published
 from torch import nn
 
+from ufmstar_torch.models.depth_anything import DepthAnything
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.monodepth2 import DECODER_WIDTHS
 
@@ -49,6 +51,20 @@ def write_files(folder: Path) -> None:
     torch.export.save(torch.export.export(network, (image,)), folder / "network.pt2")
     write_fastdepth(folder / "network.onnx", small_network())
     write_glpn(folder / "glpn-nyu")
+    write_depth_anything(folder / "Depth-Anything-V2-Metric-Indoor-Small-hf", "metric")
+    write_depth_anything(folder / "Depth-Anything-V2-Small-hf", "relative")
+
+
+def camera() -> dict[str, Any]:
+    """Images, intrinsics and measured depth, which the page takes for given; the alignment is 0.05 x + 0.1 [1/m]."""
+    images = torch.randint(0, 256, (2, 3, 60, 80), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    K = torch.tensor([[70.0, 0, 39.5], [0, 70.0, 29.5], [0, 0, 1]], dtype=torch.float64)
+    relative = DepthAnything.from_pretrained("Depth-Anything-V2-Small-hf")
+    with torch.no_grad():
+        depth = 1 / (0.05 * relative.raw(relative.preprocess.apply_image(images)) + 0.1)
+    measured = torch.zeros_like(depth)
+    measured[:, ::20, ::20] = depth[:, ::20, ::20]
+    return {"images": images, "K": K, "measured": measured}
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
@@ -57,15 +73,24 @@ def test_every_piece_of_code_runs(
 ) -> None:
     write_files(tmp_path)
     monkeypatch.chdir(tmp_path)
-    scope: dict[str, Any] = {}
+    scope = camera()
     for code in blocks():
         exec(compile(code, PAGE.name, "exec"), scope)
     assert len(blocks()) >= 4
     printed = capsys.readouterr().out
     assert "140 tensors; left as they were: ('head.bias', 'head.weight')" in printed
+    assert "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf" in printed
+    assert scope["depth"].shape == (2, 518, 518)
+    assert float(scope["fit"].alignment.scale) == pytest.approx(0.05, rel=1e-4)
     assert scope["baseline"].epistemic_variance.mean() > 0
     assert isinstance(scope["single"].networks[0].network, UncertaintyNetwork)
 
 
 def test_the_sections_are_there() -> None:
-    assert {"FastDepth", "ResNet50-Monodepth2", "Any other network"} <= set(TITLES)
+    assert {
+        "FastDepth",
+        "ResNet50-Monodepth2",
+        "Depth Anything V2",
+        "Hugging Face depth models",
+        "Any other network",
+    } <= set(TITLES)
