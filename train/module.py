@@ -177,7 +177,7 @@ class TrainingModule(pl.LightningModule):
         loader = self.trainer.train_dataloader
         batches = copy.copy(loader.batches)
         batches.set_epoch(self.current_epoch, batch_idx)
-        return [loader.dataset.source.name(key.index) for key in next(iter(batches))]
+        return [loader.dataset.source.name(key.frame) for key in next(iter(batches))]
 
     def _blame(self, batch: Batch, batch_idx: int, mine: float) -> str:
         told = f", samples {', '.join(self._samples(batch_idx))}"
