@@ -27,7 +27,7 @@ from ufmstar_torch.train.member import WEIGHTS, Job
 MANIFEST, SUMMARY, LOCK = "training.json", "summary.json", "lock"
 PROGRAM, FORMAT = "ufmstar train", 1
 # Fields of the data's configuration that change how fast samples come, not which.
-_SPEED = ("workers",)
+_SPEED = ("workers", "render_workers", "cache")
 _SHOWN = 5
 
 

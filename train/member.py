@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from ufmstar_torch.train.presets import Recipe
 from ufmstar_torch.train.settings import FitSettings
 from ufmstar_torch.train.start import starting_network, train_only
 
+_LIGHTNINGS_OWN = r"`isinstance\(treespec, LeafSpec\)` is deprecated"
 WEIGHTS, RESULT = "trained.safetensors", "result.json"
 
 
@@ -182,13 +184,16 @@ def finish(job: Job, member: int, module: TrainingModule, history: History, step
 
 @contextmanager
 def quiet_lightning() -> Iterator[None]:
-    """Without Lightning's remarks on hardware and tips; warnings stay."""
+    """Without Lightning's remarks on hardware and tips, and without a warning of torch about Lightning's own code;
+    other warnings stay."""
     loggers = [logging.getLogger(f"lightning.{part}") for part in ("pytorch", "fabric")]
     before = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.WARNING)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", _LIGHTNINGS_OWN, FutureWarning)
+            yield
     finally:
         for logger, level in zip(loggers, before, strict=True):
             logger.setLevel(level)

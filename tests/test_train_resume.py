@@ -1,0 +1,219 @@
+"""A training that is killed, stopped or fails goes on exactly, and loses nothing that was finished."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from trainings import RECIPE, tiny_job, with_network, write_frames
+
+from ufmstar_torch.eval.run_folder import FolderError
+from ufmstar_torch.models.checkpoints import read_safetensors
+from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, ResumeError, read_checkpoint
+from ufmstar_torch.train.fit import fit
+from ufmstar_torch.train.history import METRICS, STEPS, read_rows
+from ufmstar_torch.train.member import RESULT, WEIGHTS
+
+# Dropout, batch norm, augmentation, a schedule and a running mean: whatever could be out of step.
+DROPOUT = with_network(method="mc_dropout", dropout=0.2)
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """A sequence. Nobody may change it."""
+    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(frames, tmp_path_factory):
+    """The folder of a training that nothing disturbed."""
+    out = tmp_path_factory.mktemp("reference") / "out"
+    assert fit(tiny_job(frames, out, DROPOUT))["stopped"] is None
+    return out
+
+
+def tensors(path):
+    return read_safetensors(path)[0]
+
+
+def assert_same_result(out, reference, member=0):
+    """Weights bit for bit, the optimizer's state too, and the histories but for the clock."""
+    mine, theirs = (tensors(folder / f"member_{member}" / WEIGHTS) for folder in (out, reference))
+    assert mine.keys() == theirs.keys()
+    assert [key for key in mine if not torch.equal(mine[key], theirs[key])] == []
+    mine, theirs = (read_checkpoint(folder / f"member_{member}" / NAME) for folder in (out, reference))
+    for key, state in theirs["optimizer_states"][0]["state"].items():
+        for name, value in state.items():
+            assert torch.equal(value, mine["optimizer_states"][0]["state"][key][name]), (key, name)
+    for name in (METRICS, STEPS):
+        histories = [read_rows(folder / f"member_{member}" / name) for folder in (out, reference)]
+        assert [{**row, "seconds": ""} for row in histories[0]] == [{**row, "seconds": ""} for row in histories[1]]
+
+
+def stop_after(steps):
+    """Asks to stop after so many steps (it is asked once before the first)."""
+    count = iter(range(1, 10_000))
+    return lambda: next(count) > steps
+
+
+# ---- killed ----
+
+
+def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path):
+    code = f"""
+        import os, signal, sys
+        from pathlib import Path
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from trainings import tiny_job
+        from ufmstar_torch.train import fit as fit_module
+        from test_train_resume import DROPOUT
+        steps = iter(range(100))
+        def asked():
+            # Asked once before the first step; after step 8 of 15, the last checkpoint being that of step 6.
+            if next(steps) == 8:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return False
+        fit_module.fit(tiny_job({str(frames)!r}, Path({str(tmp_path / "out")!r}), DROPOUT), asked=asked)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=200)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    stored = read_checkpoint(tmp_path / "out" / "member_0" / NAME)
+    assert (stored["global_step"], stored["ufmstar_next"]) == (6, {"epoch": 1, "batch": 1})
+    assert not (tmp_path / "out" / "member_0" / RESULT).exists()
+    # As a kill in the middle of a line leaves it.
+    with (tmp_path / "out" / "member_0" / STEPS).open("a") as file:
+        file.write("9,1,3.0,1.2")
+    summary = fit(tiny_job(frames, tmp_path / "out", DROPOUT), resume=True)
+    assert summary["stopped"] is None
+    assert_same_result(tmp_path / "out", uninterrupted)
+
+
+@pytest.mark.parametrize("steps", [1, 4, 5, 7])
+def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, steps):
+    sessions = 0
+    while True:
+        job = tiny_job(frames, tmp_path / "out", DROPOUT, checkpoint_every=0)
+        summary = fit(job, resume=True, asked=stop_after(steps))
+        sessions += 1
+        if summary["stopped"] is None:
+            break
+        assert summary["members"][0]["steps"] == min(15, steps * sessions)
+        assert (tmp_path / "out" / WEIGHTS).is_file()
+    assert sessions == -(-15 // steps)
+    assert_same_result(tmp_path / "out", uninterrupted)
+
+
+def test_a_time_budget_is_shared_by_the_members_and_resuming_goes_on(frames, tmp_path):
+    recipe = replace(RECIPE, members=2, epochs=1)
+    summary = fit(tiny_job(frames, tmp_path / "out", recipe, max_minutes=1e-9))
+    assert summary["stopped"] == "time budget spent"
+    assert [m["steps"] for m in summary["members"]] == [1, 1]
+    summary = fit(tiny_job(frames, tmp_path / "out", recipe), resume=True)
+    assert summary["stopped"] is None
+    assert [(m["steps"], m["finished"]) for m in summary["members"]] == [(5, True), (5, True)]
+
+
+def test_a_finished_member_is_not_trained_again(frames, tmp_path):
+    recipe = replace(RECIPE, members=2, epochs=1)
+    out = tmp_path / "out"
+    # Asked once before each member and once after each step: stop before the second member.
+    count = iter(range(100))
+    summary = fit(tiny_job(frames, out, recipe), asked=lambda: next(count) >= 6)
+    assert [m["finished"] for m in summary["members"]] == [True]
+    assert summary["stopped"] == "stopped"
+    first = out / "member_0"
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.iterdir() if path.is_file()}
+    summary = fit(tiny_job(frames, out, recipe), resume=True)
+    assert [m["finished"] for m in summary["members"]] == [True, True]
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
+    both = tensors(out / WEIGHTS)
+    key = "backbone.encoder.0.conv.weight"
+    assert not torch.equal(both[f"member.0.{key}"], both[f"member.1.{key}"])
+    # A second look at a finished training trains nothing, more members are added to it.
+    more = replace(recipe, members=3)
+    assert [m["seed"] for m in fit(tiny_job(frames, out, more), resume=True)["members"]] == [0, 1, 2]
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
+
+
+# ---- what must not be lost ----
+
+
+def test_a_write_that_fails_leaves_the_checkpoint_before_it(tmp_path):
+    path = tmp_path / NAME
+    io = AtomicCheckpointIO()
+    io.save_checkpoint({"ufmstar_next": {"epoch": 1, "batch": 0}, "x": torch.ones(3)}, path)
+
+    class Unwritable:
+        def __reduce__(self):
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        io.save_checkpoint({"x": torch.ones(10_000), "y": Unwritable()}, path)
+    assert torch.equal(read_checkpoint(path)["x"], torch.ones(3))
+    assert [p.name for p in tmp_path.iterdir()] == [NAME]
+
+
+def test_a_damaged_checkpoint_is_named(frames, tmp_path):
+    job = tiny_job(frames, tmp_path / "out", replace(RECIPE, epochs=1))
+    fit(job, asked=stop_after(2))
+    file = tmp_path / "out" / "member_0" / NAME
+    whole = file.read_bytes()
+    for broken in (whole[: len(whole) // 2], b"", b"hello"):
+        file.write_bytes(broken)
+        with pytest.raises(ResumeError, match=r"last\.ckpt cannot be read .*--overwrite"):
+            fit(job, resume=True)
+    torch.save({"weights": torch.ones(1)}, file)
+    with pytest.raises(ResumeError, match="no checkpoint of this program"):
+        fit(job, resume=True)
+    assert fit(job, overwrite=True)["stopped"] is None
+
+
+def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
+    recipe = replace(RECIPE, epochs=1, max_steps=1)
+    job = tiny_job(frames, tmp_path / "out", recipe)
+    fit(job)
+    with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
+        fit(job)
+    others = [
+        (replace(job, recipe=replace(recipe, learning_rate=0.5)), r"recipe\.learning_rate was 0\.01, now 0\.5"),
+        (replace(job, settings=replace(job.settings, seed=3)), "seed was 0, now 3"),
+        (replace(job, data=replace(job.data, part="0:16")), r"data\.part was 0:20, now 0:16"),
+    ]
+    for other, told in others:
+        with pytest.raises(FolderError, match=told):
+            fit(other, resume=True)
+    # Whatever changes the speed only is no other training.
+    same = replace(job, settings=replace(job.settings, checkpoint_every=7, max_minutes=3.0))
+    assert fit(same, resume=True)["stopped"] is None
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("x")
+    with pytest.raises(FolderError, match="files of someone else"):
+        fit(replace(job, settings=replace(job.settings, out=tmp_path / "home")), overwrite=True)
+    assert (tmp_path / "home" / "thesis.tex").read_text() == "x"
+
+
+def test_overwriting_removes_what_was_there_and_nothing_else(frames, tmp_path):
+    out = tmp_path / "out"
+    fit(tiny_job(frames, out, replace(RECIPE, members=2, max_steps=1)))
+    (out / "notes.txt").write_text("x")
+    fit(tiny_job(frames, out, replace(RECIPE, members=1, max_steps=1, learning_rate=0.02)), overwrite=True)
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["lock", "member_0", "notes.txt", "summary.json", "trained.safetensors", "training.json"]
+    assert json.loads((out / "summary.json").read_text())["recipe"]["learning_rate"] == 0.02
+
+
+def test_a_folder_in_use_is_refused(frames, tmp_path):
+    from ufmstar_torch.train.folder import open_folder
+
+    job = tiny_job(frames, tmp_path / "out")
+    with open_folder(job), pytest.raises(FolderError, match="another training is writing there"), open_folder(
+        job, resume=True
+    ):
+        pass
