@@ -72,8 +72,11 @@ def convert(
     if not expected:
         raise ValueError(f"{type(network).__name__} has no Conv2d and no Linear: nothing to convert")
     result, selection = copy.deepcopy(network), Selection()
-    new = {m: BatchLayer(m, members, selection) for m in result.modules() if isinstance(m, _PLAIN)}
-    result = _replace(result, dict(new))
+    new: dict[nn.Module, nn.Module] = {}
+    for module in result.modules():
+        if isinstance(module, _PLAIN):
+            new[module] = BatchLayer(module, members, selection)
+    result = _replace(result, new)
     layers = converted_layers(result)
     left = sum(isinstance(module, _PLAIN) for module in result.modules()) - len(layers)  # each has one inside
     if len(layers) != expected or left:
