@@ -146,10 +146,11 @@ def _rays(prediction: Tensor, intrinsics: Tensor) -> Tensor:
     batch, height, width = prediction.shape
     if tuple(intrinsics.shape) not in ((3, 3), (batch, 3, 3)):
         raise ValueError(f"intrinsics must be [3, 3] or [{batch}, 3, 3], got {tuple(intrinsics.shape)}")
-    options = {"dtype": torch.float64, "device": prediction.device}
-    v, u = torch.meshgrid(torch.arange(height, **options), torch.arange(width, **options), indexing="ij")
+    K = intrinsics.to(prediction.device, torch.float64).expand(batch, 3, 3)
+    rows, columns = (torch.arange(n, dtype=K.dtype, device=K.device) for n in (height, width))
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
     pixels = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3)
-    return pixels @ torch.linalg.inv(intrinsics.to(**options).expand(batch, 3, 3)).mT
+    return pixels @ torch.linalg.inv(K).mT
 
 
 def _down(up_cam: Tensor | None, batch: int, like: Tensor) -> Tensor:

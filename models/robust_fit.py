@@ -92,9 +92,9 @@ def robust_fit(
     pick = _random_points(valid, min(_JUDGES, valid.shape[1]), seed)
     count = valid.sum(1).clamp_max(pick.shape[1])
     judge_design = design.gather(1, pick[..., None].expand(-1, -1, design.shape[-1]))
-    judges = [value.gather(1, pick) for value in (target, root, valid)]
+    judge_target, judge_root, judge_valid = (value.gather(1, pick) for value in (target, root, valid))
     bound = None if tolerance is None else tolerance.gather(1, pick)
-    theta = _best_hypothesis(judge_design, *judges, count, bound, admissible, seed)
+    theta = _best_hypothesis(judge_design, judge_target, judge_root, judge_valid, count, bound, admissible, seed)
     inlier, determined = valid, valid.new_zeros(len(valid))
     # Residuals in units of their expected size (up to a factor), or of the tolerance.
     unit = root if tolerance is None else 1 / tolerance.clamp_min(torch.finfo(tolerance.dtype).tiny)

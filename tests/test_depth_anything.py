@@ -455,21 +455,7 @@ def test_the_command_line_runs_a_directory(metric, relative, tmp_path, capsys):
     sequence = write_generic(tmp_path / "scene")[0]
     spec, out = tmp_path / "spec.json", tmp_path / "out"
     spec.write_text(json.dumps({"size": [42, 56]}))
-    words = [
-        "run",
-        sequence,
-        "--out",
-        out,
-        "--spec",
-        spec,
-        "--no-video",
-        "true",
-        "--no-sheet",
-        "true",
-        "--frames",
-        ":2",
-    ]
-    words = [str(word) for word in words]
+    words = ["run", str(sequence), "--out", str(out), "--spec", str(spec), "--no-video", "--no-sheet", "--frames", ":2"]
     assert cli.main([*words, "--model", "depth_anything", "--weights", str(metric)]) == 0
     assert read_summary(out)["state"] == "finished"
     capsys.readouterr()
