@@ -57,7 +57,7 @@ def convert(
 
     Raises:
         ValueError: nothing to convert, an option out of range, a network that is converted already, or a
-            module that is kept in a plain list only (its weights would be neither trained nor saved).
+            layer that is kept in a plain list only (its weights would be neither trained nor saved).
         TypeError: a layer of a derived class or with weights of another kind (weight norm), whose
             computation is not known here.
         RuntimeError: not all of the layers were converted.
@@ -243,7 +243,7 @@ def _replace(root: Network, new: Mapping[nn.Module, nn.Module]) -> Any:
     """``root`` with modules replaced wherever its modules keep them, in place; or what replaces ``root``.
 
     Raises:
-        ValueError: a module that is no registered part of ``root`` is kept in a plain list or dict.
+        ValueError: a layer that is no registered part of ``root`` is kept in a plain list or dict.
     """
     modules = list(root.modules())
     known = {id(module): new.get(module, module) for module in modules}
@@ -256,9 +256,9 @@ def _replace(root: Network, new: Mapping[nn.Module, nn.Module]) -> Any:
 def _replaced(value: Any, known: Mapping[int, nn.Module], where: str) -> Any:
     """``value`` with modules replaced, dicts and lists in place."""
     if isinstance(value, nn.Module):
-        if id(value) not in known:
+        if id(value) not in known and any(isinstance(m, (*_PLAIN, BatchLayer)) for m in value.modules()):
             raise ValueError(f"{where} keeps a {type(value).__name__} that is not registered: use nn.ModuleList")
-        return known[id(value)]
+        return known.get(id(value), value)
     if isinstance(value, dict):
         value.update({key: _replaced(item, known, where) for key, item in value.items()})
     elif isinstance(value, list):

@@ -302,12 +302,15 @@ class HidesOne(nn.Module):
     def __init__(self):
         super().__init__()
         self.seen = nn.Conv2d(3, 3, 1)
-        self.hidden = [nn.Conv2d(3, 3, 1)]
+        self.hidden = [nn.ReLU(), nn.Sequential(nn.Conv2d(3, 3, 1))]
 
 
-def test_a_module_in_a_plain_list_only_is_told():
-    with pytest.raises(ValueError, match=r"HidesOne\.hidden keeps a Conv2d .* nn\.ModuleList"):
+def test_a_layer_in_a_plain_list_only_is_told():
+    with pytest.raises(ValueError, match=r"HidesOne\.hidden keeps a Sequential .* nn\.ModuleList"):
         convert(HidesOne(), N)
+    network = HidesOne()
+    network.hidden.pop()
+    assert isinstance(convert(network, N).hidden[0], nn.ReLU)
 
 
 class Out:
