@@ -419,7 +419,9 @@ def ufmstar(capfd, scene, tmp_path):
 
 
 def depths(out):
-    return np.stack([read_frame(path)["depth"] for path in sorted((out / "frames").iterdir(), key=lambda p: int(p.stem))])
+    return np.stack(
+        [read_frame(path)["depth"] for path in sorted((out / "frames").iterdir(), key=lambda p: int(p.stem))]
+    )
 
 
 def by_hand(scene, members, mode="alternate"):
