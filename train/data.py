@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
 from lightning.pytorch import LightningDataModule
 
 from ufmstar_torch.models.preprocess import Preprocess
@@ -71,7 +72,7 @@ class DepthDataModule(LightningDataModule):
         rank, world = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         c = self.config
         batches = EpochBatches(len(dataset), c.batch_size, seed=c.seed, rank=rank, world=world, shuffle=shuffle)
-        return EpochLoader(dataset, batches, workers=c.workers)
+        return EpochLoader(dataset, batches, workers=c.workers, pin_memory=torch.cuda.is_available())
 
 
 def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:

@@ -83,17 +83,17 @@ def loss_sums(
         # Before the loss, not behind it: a gradient of NaN times 0 is NaN.
         return torch.where(usable, values.to(torch.promote_types(values.dtype, torch.float32)), elsewhere)
 
-    with torch.autocast(target.device.type, enabled=False):
-        goal = at_valid(target)
-        depth = at_valid(distribution.depth)
-        if isinstance(distribution, GaussianDepth):
-            loss = gaussian_nll(depth, at_valid(distribution.log_variance, 0.0), goal, beta=beta_nll)
-        elif isinstance(distribution, EvidentialDepth):
-            nu, beta = at_valid(distribution.nu), at_valid(distribution.beta)
-            loss = evidential_loss(depth, nu, at_valid(distribution.alpha, 2.0), beta, goal, evidence_weight)
-        else:
-            loss = depth_l1(depth, goal)
-        return torch.where(usable, loss, 0.0).sum(), usable.sum()
+    # Autocast leaves all that follows in the type it is in: it is about matrix products and convolutions.
+    goal = at_valid(target)
+    depth = at_valid(distribution.depth)
+    if isinstance(distribution, GaussianDepth):
+        loss = gaussian_nll(depth, at_valid(distribution.log_variance, 0.0), goal, beta=beta_nll)
+    elif isinstance(distribution, EvidentialDepth):
+        nu, beta = at_valid(distribution.nu), at_valid(distribution.beta)
+        loss = evidential_loss(depth, nu, at_valid(distribution.alpha, 2.0), beta, goal, evidence_weight)
+    else:
+        loss = depth_l1(depth, goal)
+    return torch.where(usable, loss, 0.0).sum(), usable.sum()
 
 
 def depth_l1(depth: Tensor, target: Tensor) -> Tensor:
