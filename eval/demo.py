@@ -8,6 +8,7 @@ UfM and UfM* judge the same predictions, and the table says how well.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.resources import as_file, files
@@ -26,10 +27,11 @@ from ufmstar_torch.eval.files import to_json, write_json_atomic
 from ufmstar_torch.eval.ground_truth import truth_at
 from ufmstar_torch.eval.run import Progress
 from ufmstar_torch.eval.run_source import sha256
-from ufmstar_torch.eval.sequences.frame import Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, Sequence
 from ufmstar_torch.eval.summary import versions
 from ufmstar_torch.eval.tour import make_tour, tour_sequence
 from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
+from ufmstar_torch.ufmstar import UfMStar
 
 PROGRAM = "ufmstar demo"
 # Of "mixed" tours: what the networks were trained on, and what they never saw.
@@ -96,14 +98,11 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     with _weights(options.weights) as file:
         info, members = read_info(file), load_trained(file)
         digest = sha256(file)
-    progress(Progress("rooms", 0, 1, None, 0))
-    height, width = info.spec.size
-    sequence = tour_sequence(options.seed, frames=options.frames, size=(height, width), style=STYLE)
-    kinds = room_kinds(sequence, options.seed)
-    progress(Progress("rooms", 1, 1, None, 0))
+    size = info.spec.size
+    sequence = tour_sequence(options.seed, frames=options.frames, size=size, style=STYLE, device=device)
+    frames, kinds = _render(sequence, device, progress), room_kinds(sequence, options.seed)
     comparison = Comparison(members, device)
-    _warm_up(comparison, sequence, progress)
-    tally, panels = _walk(comparison, sequence, kinds, progress)
+    tally, panels = _walk(comparison, frames, kinds, progress)
     summary = {
         "program": PROGRAM,
         "out": str(options.out),
@@ -151,13 +150,15 @@ def sheet_rows(kinds: list[str], rows: int = SHEET_ROWS) -> list[int]:
 
 
 def _walk(
-    comparison: Comparison, sequence: Sequence, kinds: list[str], progress: Callable[[Progress], None]
+    comparison: Comparison, frames: list[Frame], kinds: list[str], progress: Callable[[Progress], None]
 ) -> tuple[Tally, list[DemoPanel]]:
     """All frames by all methods, with their figures and the rows of the contact sheet."""
+    comparison.take(frames[0])  # libraries set themselves up at the first call, which does not count
+    comparison.restart()
     tally = Tally(comparison.methods, [kind for kind in KINDS.values() if kind in kinds])
     rows, panels = sheet_rows(kinds), {}
-    progress(Progress("frames", 0, len(sequence), None, 0))
-    for index, frame in enumerate(sequence):
+    progress(Progress("frames", 0, len(frames), None, 0))
+    for index, frame in enumerate(frames):
         compared = comparison.take(frame)
         depth = compared.estimates[NETWORK].depth
         truth = truth_at(frame, compared.intrinsics.double().numpy(), (depth.shape[0], depth.shape[1]))
@@ -167,17 +168,32 @@ def _walk(
         if index in rows:
             panels[index] = panel(f"frame {index}", kinds[index], frame.image, compared, truth)
         components = int(comparison.ufm_star.mixture.components.sum())
-        progress(Progress("frames", index + 1, len(sequence), components, 0))
+        progress(Progress("frames", index + 1, len(frames), components, 0))
     return tally, [panels[row] for row in rows]
 
 
-def _warm_up(comparison: Comparison, sequence: Sequence, progress: Callable[[Progress], None]) -> None:
-    """Two frames that do not count: kernels are compiled on the first run, and libraries set up."""
-    progress(Progress("kernels", 0, 2, None, 0))
-    for index in range(2):
-        comparison.take(sequence[index])
-        progress(Progress("kernels", index + 1, 2, None, 0))
-    comparison.restart()
+def _render(sequence: Sequence, device: torch.device, progress: Callable[[Progress], None]) -> list[Frame]:
+    """All frames. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the very first run."""
+    progress(Progress("rooms", 0, len(sequence), None, 0))
+    frames = [sequence[index] for index in range(2)]
+    with ThreadPoolExecutor(1) as beside:
+        compiled = beside.submit(_compile, frames, device)
+        for index in range(2, len(sequence)):
+            frames.append(sequence[index])
+            progress(Progress("rooms", index + 1, len(sequence), None, 0))
+        progress(Progress("kernels", 0, 1, None, 0))
+        compiled.result()
+    progress(Progress("kernels", 1, 1, None, 0))
+    return frames
+
+
+def _compile(frames: list[Frame], device: torch.device) -> None:
+    """UfM* on two frames with their true depth, whose segments match, so that every kernel is called."""
+    ufm_star = UfMStar().to(device)
+    for frame in frames:
+        depth = torch.from_numpy(frame.depth)[None].to(device)
+        pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
+        ufm_star(depth, pose, K, torch.full_like(depth, 0.01))
 
 
 def _methods(comparison: Comparison, tally: Tally) -> dict[str, Any]:

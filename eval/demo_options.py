@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-FRAMES, SEED, OUT = 90, 100_003, Path("ufmstar_demo")
+FRAMES, SEED, OUT = 72, 100_003, Path("ufmstar_demo")
 _DESCRIPTION = (
     "Walks through rendered rooms with small depth networks that come with the package, compares their own variance "
     "with UfM's and UfM*'s, and saves pictures. Nothing else is needed; a minute on two cores."
