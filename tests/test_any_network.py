@@ -199,7 +199,7 @@ def test_refusals_by_name(tmp_path: Path) -> None:
             load_network(name, "n")
     with pytest.raises(ValueError, match=r"'outputs' and, if needed, 'preprocess', got \['kind'\]"):
         load_network("exported", "n", spec={"kind": "metric"})
-    assert network_names() == ("exported", "fastdepth", "monodepth2", "onnx", "torchscript")
+    assert {"exported", "fastdepth", "monodepth2", "onnx", "torchscript"} <= set(network_names())
 
 
 def test_the_package_is_light_and_complete() -> None:
