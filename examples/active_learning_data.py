@@ -16,13 +16,15 @@ from torch import Tensor
 
 from ufmstar_torch.eval.ground_truth import truth_at
 from ufmstar_torch.eval.sequences import Frame, Sequence, open_sequence
-from ufmstar_torch.eval.tour import make_tour, tour_sequence
+from ufmstar_torch.eval.synthetic import intrinsics
+from ufmstar_torch.eval.tour import Tour, make_tour, render, tour_path
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:"
 # Rooms by the style of a tour's; the shipped networks were trained in homes and saw no hall.
 ROOMS = {"home": "seen", "hall": "unseen"}
 _POOL_PATH, _HELD_BACK_PATH = 0, 1
+_SENSOR = 1_000_003  # a sensor's noise differs between the walks
 _HELD_BACK_STRIDE = 5  # frames of the walk; views that are judged need no overlap
 _POOL_END, _HELD_BACK_START = 0.6, 0.65  # shares of a recording
 
@@ -92,18 +94,29 @@ def open_environment(
     if not sequence.startswith(TOUR):
         return _recording(open_sequence(sequence), frames, stride, held_back, preprocess)
     seed, style = parse_tour(sequence)
-    seed += index
-    tour = make_tour(seed, style)
+    tour = make_tour(seed + index, style)
+    pool = _walk(tour, size, _POOL_PATH, frames * stride, stride)
+    judged = _walk(tour, size, _HELD_BACK_PATH, held_back * _HELD_BACK_STRIDE, _HELD_BACK_STRIDE)
 
-    def walk(name: str, path: int, steps: int, every: int) -> tuple[View, ...]:
-        walked = tour_sequence(seed, frames=steps, size=size, style=style, path_seed=path)
-        chosen = [walked[i] for i in range(0, steps, every)]
-        rooms = [ROOMS[tour.style_at(torch.from_numpy(frame.T_world_cam[:3, 3]))] for frame in chosen]
-        return _views(name, chosen, rooms, preprocess)
+    def rooms(walk: list[Frame]) -> list[str]:
+        return [ROOMS[tour.style_at(torch.from_numpy(frame.T_world_cam[:3, 3]))] for frame in walk]
 
-    pool = walk("pool", _POOL_PATH, frames * stride, stride)
-    judged = walk("held_back", _HELD_BACK_PATH, held_back * _HELD_BACK_STRIDE, _HELD_BACK_STRIDE)
-    return Environment(f"tour-{seed}", pool, judged)
+    return Environment(
+        f"tour-{seed + index}",
+        _views("pool", pool, rooms(pool), preprocess),
+        _views("held_back", judged, rooms(judged), preprocess),
+    )
+
+
+def _walk(tour: Tour, size: tuple[int, int], path: int, steps: int, every: int) -> list[Frame]:
+    """Every so many steps of a walk, rendered; what ``tour_sequence`` does, without making the rooms again."""
+    K = intrinsics(*size)
+    poses = tour_path(tour, steps, path)
+    frames = []
+    for i in range(0, steps, every):
+        view = render(tour, poses[i], torch.from_numpy(K), *size, frame_seed=_SENSOR * (1 + path) + i)
+        frames.append(Frame(i, f"{i:06d}", view.image.numpy(), view.depth.float().numpy(), poses[i].numpy(), K))
+    return frames
 
 
 def parse_tour(name: str) -> tuple[int, str]:

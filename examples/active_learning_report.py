@@ -95,9 +95,9 @@ def cost_line(results: Mapping[str, Any]) -> str:
     budget, pixels, threads = results["settings"]["budget"], costs[0]["pixels"], costs[0]["threads"]
     return (
         f"Mean of V over {pixels} pixels: {sample:.1f} ms an image, dense map: {dense:.1f} ms (processor time: "
-        f"{ratio:.2f} of it), network: {network:.1f} ms; medians, {threads} thread(s). Of {budget} picks, {agree:.1f} are "
-        f"those of the dense map. The whole run: {results['seconds']:.0f} s ({results['processor_seconds']:.0f} s of "
-        "processor time)."
+        f"{ratio:.2f} of it), network: {network:.1f} ms; medians, {threads} thread(s). Of {budget} picks, {agree:.1f} "
+        f"are those of the dense map. The whole run: {results['seconds']:.0f} s, of processor time "
+        f"{results['processor_seconds']:.0f} s."
     )
 
 
