@@ -14,9 +14,10 @@ from ufmstar_torch.eval.tour.tour import Tour
 Array = NDArray[np.float64]
 
 _STEP, _TURN = 0.16, np.radians(8.0)  # a frame moves about this far [m], or turns about this much [rad]
-_SLOWEST, _FASTEST = 0.5, 1.2  # shares of that pace; with more frames, the way is walked again
-# Shares of a way after which its last room was seen, and after which the camera is back in the first.
-_ENOUGH_TO_SEE, _ENOUGH_TO_RETURN = 0.6, 0.75
+_SLOWEST, _FASTEST = 0.5, 1.3  # shares of that pace; with more frames, the way is walked again
+# Shares of a way after which its last room was seen, and after which the camera is back where it began; walked on
+# from there, the first views are seen again.
+_ENOUGH_TO_SEE, _ENOUGH_TO_RETURN, _ONCE_MORE = 0.6, 0.95, 1.12
 _LOOKAHEAD, _SMOOTH = 0.7, 0.4  # the camera looks at where it will be, with a slow head [m]
 SWAY = 0.04  # of the hand, at most, on either axis [m]
 _GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
@@ -25,9 +26,9 @@ _GLANCE, _PITCH, _ROLL = np.radians(22.0), np.radians(4.0), np.radians(1.2)
 def tour_path(tour: Tour, frames: int, seed: int | None = None) -> Tensor:
     """[N, 4, 4] float64 camera-to-world poses [m] of a camera that walks through the rooms and comes back.
 
-    Without ``seed``, it starts in the first room and walks to the farthest one that the frames allow and back
-    (or only to it, in a tour whose last room has another style). With ``seed``, it starts anywhere on the
-    longest way, in either direction.
+    Without ``seed``, it starts in the first room, walks to the farthest one that the frames allow and back, and
+    once more where it began. (In a tour whose last room has another style it goes there in any case, and turns
+    back only if the frames allow.) With ``seed``, it starts anywhere on the longest way, in either direction.
 
     Args:
         tour: where.
@@ -58,10 +59,10 @@ def _way_within(tour: Tour, frames: int) -> tuple[Array, float]:
     ways = [way.numpy() for way in tour.ways]
     shares = [_FASTEST * frames / float(_effort(way)[-1]) for way in ways]
     if len(set(tour.room_styles)) > 1:  # the last room is the point of such a tour: see it at any pace
-        k = len(ways) - (1 if shares[-1] >= 1 else 2)
-        return ways[k], min(1.0, max(shares[k], _ENOUGH_TO_SEE))
+        k = len(ways) - (1 if shares[-1] >= _ONCE_MORE else 2)
+        return ways[k], min(_ONCE_MORE, max(shares[k], _ENOUGH_TO_SEE))
     k = max((k for k, share in enumerate(shares) if share >= _ENOUGH_TO_RETURN), default=0)
-    return ways[k], min(1.0, shares[k])
+    return ways[k], min(_ONCE_MORE, shares[k])
 
 
 def _effort(way: Array) -> Array:
@@ -79,7 +80,7 @@ def _next(yaw: Array) -> float:
 def _samples(way: Array, frames: int, share: float) -> Array:
     """[frames] positions along the way [samples], evenly by effort; several rounds where there is time."""
     effort = _effort(way)
-    rounds = max(1, int(frames * _SLOWEST // effort[-1])) if share == 1.0 else 1
+    rounds = max(1, int(frames * _SLOWEST // effort[-1])) if share >= 1 else 1
     at = rounds * share * effort[-1] * np.arange(frames) / frames
     whole, rest = np.divmod(at, effort[-1])
     return whole * len(way) + np.interp(rest, effort, np.arange(len(way) + 1))

@@ -48,7 +48,7 @@ class _Renderer:
 def tour_sequence(
     seed: int,
     *,
-    frames: int = 100,
+    frames: int = 150,
     size: Size = (160, 224),
     style: str | TourStyle = "home",
     fov: float = 70.0,

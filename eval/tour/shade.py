@@ -156,7 +156,9 @@ def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:
     for value, start, end in spans:
         part = slice(start, end)
         first, second = look[:3, part], look[3:6, part]
-        patch = Patch(*shifted[:, part], *own[:, part], pixel[part], first, second, tour.noise)
+        u, v = shifted[:, part]
+        own_u, own_v = own[:, part]
+        patch = Patch(u, v, own_u, own_v, pixel[part], first, second, tour.noise)
         found.append(albedo(value % _TEXTURES, patch))
     return torch.cat(found, dim=1)
 

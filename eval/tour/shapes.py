@@ -19,8 +19,8 @@ from torch import Tensor
 from ufmstar_torch.eval.tour.style import TEXTURES
 
 QUAD, BOX, ELLIPSOID, FRUSTUM = range(4)
-Vector = Sequence[float]
 Array = NDArray[np.float64]
+Vector = Sequence[float] | Array
 NOBODY = -1
 
 

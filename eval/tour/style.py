@@ -93,7 +93,7 @@ class TourStyle:
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
             raise ValueError(f"unknown field {unknown} of TourStyle, expected some of {[f.name for f in fields(cls)]}")
-        plain = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
         if isinstance(plain.get("last"), dict):
             plain["last"] = cls.from_dict(plain["last"])
         return cls(**plain)

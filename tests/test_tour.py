@@ -1,0 +1,530 @@
+"""Tours: exact depth, ways clear of things, places seen again, styles that never mix, sequences by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ufmstar_torch.eval.sequences import check_sequence, open_sequence
+from ufmstar_torch.eval.synthetic import intrinsics, look
+from ufmstar_torch.eval.tour import Tour, TourStyle, make_tour, render, tour_path, tour_sequence
+from ufmstar_torch.eval.tour.intersect import entry
+from ufmstar_torch.eval.tour.sensor import develop
+from ufmstar_torch.eval.tour.sequence import export_tour
+from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces, tube, turn
+from ufmstar_torch.eval.tour.style import HALL_TEXTURES, HOME_TEXTURES, STYLES, TEXTURES
+from ufmstar_torch.eval.tour.texture import Patch, albedo, noise_table
+from ufmstar_torch.eval.tour.view import cast
+
+K = torch.from_numpy(intrinsics(24, 32))
+
+
+@pytest.fixture(scope="module")
+def home() -> Tour:
+    return make_tour(2)
+
+
+@pytest.fixture(scope="module")
+def mixed() -> Tour:
+    return make_tour(1, "mixed")
+
+
+def scene(*parts) -> Tour:
+    """Nothing but these primitives, in a room of 40 m."""
+    room = torch.tensor([[[-20.0, -20.0, -20.0], [20.0, 20.0, 20.0]]], dtype=torch.float64)
+    lights = torch.zeros(1, 1, 7)
+    lights[..., 3:] = 1
+    return Tour(
+        seed=0,
+        style=STYLES["home"],
+        rooms=room,
+        room_styles=("home",),
+        doors=torch.zeros(0, 2, 3, dtype=torch.float64),
+        door_rooms=torch.zeros(0, 2, dtype=torch.int64),
+        surfaces=surfaces(parts, np.random.default_rng(0)),
+        labels=("",) * len(parts),
+        lights=lights,
+        volumes=torch.ones(1, 1, 2, 2, 2),
+        noise=noise_table(),
+        ways=(),
+        camera_height=1.5,
+    )
+
+
+def depth_of(*parts, pose=None, size=(24, 32)) -> np.ndarray:
+    T = torch.eye(4, dtype=torch.float64) if pose is None else torch.from_numpy(pose)
+    return cast(scene(*parts), T, torch.from_numpy(intrinsics(*size)), *size)[0].numpy()
+
+
+def rays(size=(24, 32)) -> np.ndarray:
+    v, u = np.mgrid[: size[0], : size[1]].astype(float)
+    return np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsics(*size)).T
+
+
+# --- exact depth ---------------------------------------------------------------------------------------------
+
+
+def test_depth_of_a_sphere_is_the_quadratic_formula():
+    centre, r, d = np.array([0.2, -0.1, 4.0]), 0.9, rays()
+    a, b, c = (d * d).sum(-1), (d @ centre), centre @ centre - r * r
+    root = np.sqrt(np.maximum(b * b - a * c, 0))
+    expected = np.where(b * b >= a * c, (b - root) / a, np.inf)
+    assert 20 < np.isfinite(expected).sum() < 700
+    np.testing.assert_allclose(depth_of(ball(centre, (r, r, r), Finish())), expected, rtol=1e-9)
+
+
+def test_depth_of_an_ellipsoid_is_that_of_a_ball_in_stretched_space():
+    half, d = np.array([0.5, 1.0, 0.25]), rays()
+    centre, d = np.array([0.0, 0.0, 3.0]) / half, d / half
+    a, b, c = (d * d).sum(-1), d @ centre, centre @ centre - 1
+    expected = np.where(b * b >= a * c, (b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, np.inf)
+    np.testing.assert_allclose(depth_of(ball((0, 0, 3), half, Finish())), expected, rtol=1e-9)
+
+
+def test_depth_of_a_box_in_front_is_its_front_or_a_side():
+    d, (x, z) = rays(), (0.5, 2.0)
+    front = np.where((np.abs(d[..., 0]) * z <= x) & (np.abs(d[..., 1]) * z <= x), z, np.inf)
+    np.testing.assert_allclose(depth_of(box((0, 0, 2.5), (0.5, 0.5, 0.5), Finish())), front, rtol=1e-9)
+    # Moved aside, its left side x = 1 is seen too: at depth 1 / d_x, where that lies within the side.
+    d = rays((24, 64))
+    with np.errstate(divide="ignore"):
+        side = 1 / d[..., 0]
+    on_side = (side >= 2) & (side <= 4) & (np.abs(side * d[..., 1]) <= 0.5)
+    on_front = (d[..., 0] * 2 >= 1) & (d[..., 0] * 2 <= 1.5) & (np.abs(d[..., 1]) * 2 <= 0.5)
+    expected = np.where(on_front, 2.0, np.where(on_side, side, np.inf))
+    assert on_side.sum() > 20
+    assert on_front.sum() > 20
+    found = depth_of(box((1.25, 0, 3.0), (0.25, 0.5, 1.0), Finish()), size=(24, 64))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_depth_of_a_cylinder_and_of_its_cap():
+    d = rays()
+    upright = depth_of(tube((0, 0, 3), 0.8, 5.0, Finish()))
+    a, b, c = d[..., 0] ** 2 + 1, 3.0, 9 - 0.64
+    expected = np.where(b * b >= a * c, (b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, np.inf)
+    np.testing.assert_allclose(upright, expected, rtol=1e-9)
+    lying = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    cap = np.where(np.hypot(d[..., 0], d[..., 1]) * 2 <= 0.8, 2.0, np.inf)
+    on_end = depth_of(tube((0, 0, 3), 0.8, 1.0, Finish(), rotation=lying))
+    np.testing.assert_allclose(on_end, cap, rtol=1e-9)
+
+
+def test_depth_of_a_cone():
+    """Apex (nearly) at the camera's height, so that x^2 + z^2 = (taper' y)^2 has the camera's axis in its plane."""
+    depth = depth_of(tube((0, 0, 3), 1.0, 1.0, Finish(), taper=0.2), size=(25, 33))
+    # In the middle row y = 0, where the radius is (1 + taper) / 2 = 0.6.
+    d = rays((25, 33))[12]
+    a, b, c = d[:, 0] ** 2 + 1, 3.0, 9 - 0.36
+    expected = np.where(b * b >= a * c, (b - np.sqrt(np.maximum(b * b - a * c, 0))) / a, np.inf)
+    np.testing.assert_allclose(depth[12], expected, rtol=1e-9)
+    points = rays((25, 33)) * np.where(np.isfinite(depth), depth, 0)[..., None]
+    seen = np.isfinite(depth)
+    y, r = points[seen][:, 1], np.hypot(points[seen][:, 0], points[seen][:, 2] - 3)
+    on_side = np.abs(r - (0.6 + 0.4 * y)) < 1e-9
+    on_cap = (np.abs(np.abs(y) - 1) < 1e-9) & (r <= 0.6 + 0.4 * y + 1e-9)
+    assert (on_side | on_cap).all()
+    assert on_side.sum() > 50
+
+
+def test_a_quad_is_seen_from_its_front_only():
+    facing = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    d = rays()
+    within = (np.abs(d[..., 0]) * 2 <= 0.7) & (np.abs(d[..., 1]) * 2 <= 0.4)
+    both = (facing, facing @ np.diag([1.0, -1, -1]))
+    fronts = [depth_of(part(QUAD, (0, 0, 2), (0.7, 1, 0.4), Finish(), R)) for R in both]
+    visible = [front for front in fronts if np.isfinite(front).any()]
+    assert len(visible) == 1
+    np.testing.assert_allclose(visible[0], np.where(within, 2.0, np.inf), rtol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([BOX, ELLIPSOID, FRUSTUM]), st.floats(0.05, 1.4))
+def test_entry_is_the_first_point_of_the_solid(seed, kind, taper):
+    """Against bisection of the solid's own inequality along densely sampled rays."""
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=3)
+    o *= rng.uniform(3, 6) / np.linalg.norm(o)
+    d = rng.uniform(-1, 1, (40, 3)) - o
+    t = entry(kind, tuple(o), tuple(torch.from_numpy(d).unbind(1)), taper).numpy()
+
+    def inside(p):
+        if kind == BOX:
+            return np.abs(p).max(-1) <= 1
+        if kind == ELLIPSOID:
+            return (p * p).sum(-1) <= 1
+        radius = (1 + taper) / 2 + (1 - taper) / 2 * p[..., 1]
+        return (np.abs(p[..., 1]) <= 1) & (np.hypot(p[..., 0], p[..., 2]) <= radius)
+
+    steps = np.linspace(0, 3, 3001)
+    found = inside(o + steps[:, None, None] * d)
+    hit = found.any(0)
+    first = steps[found.argmax(0)]
+    assert np.isfinite(t[hit]).all()
+    assert ((first[hit] - t[hit] >= -1e-9) & (first[hit] - t[hit] <= 2e-3)).all()
+    # A ray that grazes an edge between two samples may hit without being found, but then on the surface.
+    grazing = ~hit & np.isfinite(t)
+    assert inside((o + t[grazing, None] * d[grazing]) * (1 - 1e-9)).all()
+
+
+def test_rotated_box_and_moved_camera_agree_with_turning_the_world_back():
+    pose = look((0.4, -0.3, -1.0), 0.3, 0.1)
+    first = depth_of(box((0.5, 0.1, 3), (0.4, 0.7, 0.3), Finish(), yaw=0.8), pose=pose)
+    turned = np.eye(4)
+    turned[:3, :3] = turn(-0.8)
+    moved = turn(-0.8) @ np.array([0.5, 0.1, 3])
+    second = depth_of(box(moved, (0.4, 0.7, 0.3), Finish()), pose=turned @ pose)
+    assert np.isfinite(first).sum() > 30
+    np.testing.assert_allclose(first, second, rtol=1e-9)
+
+
+def test_the_nearer_surface_hides_the_farther_one():
+    near, far = box((0.3, 0, 2), (0.2, 0.2, 0.2), Finish()), ball((0, 0, 5), (2, 2, 2), Finish())
+    a, b = depth_of(near), depth_of(far)
+    assert (np.isfinite(a) & np.isfinite(b)).any()
+    for order in ((near, far), (far, near)):
+        np.testing.assert_array_equal(depth_of(*order), np.minimum(a, b))
+    view = render(scene(near, far), torch.eye(4, dtype=torch.float64), K, 24, 32)
+    assert (view.surface.numpy() == np.where(np.isfinite(a), 0, np.where(np.isfinite(b), 1, -1))).all()
+    assert (view.valid == (view.surface >= 0)).all()
+    assert (view.depth[~view.valid] == 0).all()
+
+
+# --- tours ---------------------------------------------------------------------------------------------------
+
+
+def same(a: Tour, b: Tour) -> bool:
+    pairs = [(a.rooms, b.rooms), (a.lights, b.lights), (a.volumes, b.volumes)]
+    pairs += [(getattr(a.surfaces, n), getattr(b.surfaces, n)) for n in a.surfaces.__dataclass_fields__]
+    return all(torch.equal(x, y) for x, y in pairs) and a.labels == b.labels
+
+
+def test_a_seed_makes_the_same_tour_and_pictures_for_any_number_of_threads(home):
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    try:
+        torch.set_num_threads(3)
+        again = make_tour(2)
+        assert same(home, again)
+        poses = tour_path(home, 40)
+        assert torch.equal(poses, tour_path(again, 40))
+        views = []
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            views.append(render(home, poses[7], torch.from_numpy(intrinsics(160, 224)), 160, 224, frame_seed=5))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(views[0].image, views[1].image)
+    assert torch.equal(views[0].depth, views[1].depth)
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def test_other_seeds_make_other_rooms_and_ways(home):
+    assert not same(home, make_tour(3))
+    assert not torch.equal(tour_path(home, 20, 1), tour_path(home, 20, 2))
+    assert not torch.equal(tour_path(home, 20, 1), tour_path(home, 20))
+
+
+def to_surfaces(tour: Tour, points: torch.Tensor) -> torch.Tensor:
+    """[N] distance of each primitive's box from the nearest of some points [m]: at most the true distance."""
+    s = tour.surfaces
+    low, high = s.corners.amin(1), s.corners.amax(1)
+    axis_aligned = torch.maximum(torch.maximum(low[:, None] - points, points - high[:, None]), torch.zeros(()))
+    return axis_aligned.norm(dim=-1).amin(1)
+
+
+@pytest.mark.parametrize(("seed", "style"), [(5, "home"), (3, "hall"), (1, "mixed")])
+def test_every_way_keeps_clear_of_everything(seed, style):
+    tour = make_tour(seed, style)
+    for frames, path_seed in ((100, None), (300, None), (200, 1)):
+        points = tour_path(tour, frames, path_seed)[:, :3, 3]
+        boxes = torch.cat([tour.rooms, tour.doors])
+        assert ((boxes[:, 0] < points[:, None]) & (points[:, None] < boxes[:, 1])).all(-1).any(1).all()
+        distance = to_surfaces(tour, points)
+        assert distance.min() >= 0.3, tour.labels[int(distance.argmin())]
+
+
+def test_poses_are_rigid_level_and_smooth(home):
+    poses = tour_path(home, 200)
+    R, p = poses[:, :3, :3], poses[:, :3, 3]
+    torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand_as(R), atol=1e-12, rtol=0)
+    assert (torch.linalg.det(R) > 0.99).all()
+    assert (R[:, 1, 1] > 0.9).all()  # the camera's down is the world's
+    steps = (p[1:] - p[:-1]).norm(dim=1)
+    assert steps.max() < 0.25
+    # Where the way turns back, the camera stops to turn; everywhere else the pace changes slowly.
+    assert ((steps[1:] - steps[:-1]).abs() < 0.06).double().mean() > 0.93
+    angle = torch.rad2deg(torch.arccos((((R[1:] * R[:-1]).sum((1, 2)) - 1) / 2).clamp(-1, 1)))
+    assert angle.max() < 12
+    assert -p[:, 1].max() >= 1.0 - 0.05
+    assert -p[:, 1].min() <= 1.6 + 0.05
+
+
+def seen_from(tour: Tour, points: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+    """[N] whether points [N, 3] lie on what a camera sees."""
+    x, y, z = (points - pose[:3, 3]).matmul(pose[:3, :3]).unbind(1)
+    front = z > 0.1
+    u, v = (K[0, 0] * x / z + K[0, 2]).round().long(), (K[1, 1] * y / z + K[1, 2]).round().long()
+    inside = front & (u >= 0) & (u < 32) & (v >= 0) & (v < 24)
+    depth = cast(tour, pose, K, 24, 32)[0][v.clamp(0, 23), u.clamp(0, 31)]
+    return inside & ((depth - z).abs() < 0.05 * z)
+
+
+def world_points(tour: Tour, pose: torch.Tensor) -> torch.Tensor:
+    depth = cast(tour, pose, K, 24, 32)[0]
+    assert torch.isfinite(depth).all()
+    d = torch.from_numpy(rays()) @ pose[:3, :3].T
+    return (pose[:3, 3] + depth[..., None] * d).reshape(-1, 3)
+
+
+def test_neighbouring_frames_overlap_and_places_are_seen_again(home):
+    poses = tour_path(home, 150)
+    pairs = [(poses[i], poses[i + 1]) for i in range(0, 149, 5)]
+    shares = [float(seen_from(home, world_points(home, a), b).double().mean()) for a, b in pairs]
+    assert min(shares) > 0.5
+    assert np.median(shares) > 0.7
+    assert len(set(home.room_at(poses[:, :3, 3]).tolist())) > 1, "the way leads through a doorway"
+    revisits = 0
+    for i in range(0, 60, 12):
+        early = world_points(home, poses[i])
+        seen = np.array([float(seen_from(home, early, pose).double().mean()) for pose in poses[i::3]])
+        gone = np.flatnonzero(seen < 0.05)
+        revisits += bool(len(gone)) and bool((seen[max(gone.min(), 11) :] > 0.3).any())  # 11 x 3 frames later
+    assert revisits >= 1, "a place must leave the view and come back"
+
+
+def test_no_ray_of_another_view_passes_a_point_that_was_seen(home):
+    """Exact reprojection: a view's points hide what is behind them in every other view."""
+    poses = tour_path(home, 60)
+    rng, equal = np.random.default_rng(0), 0
+    for i, j in ((3, 5), (10, 13), (30, 33)):
+        points = world_points(home, poses[i])
+        for X in points[rng.integers(len(points), size=15)]:
+            x, y, z = ((X - poses[j, :3, 3]) @ poses[j, :3, :3]).tolist()
+            if z < 0.2:
+                continue
+            aimed = torch.tensor([[1.0, 0, -x / z], [0, 1.0, -y / z], [0, 0, 1]], dtype=torch.float64)
+            found = float(cast(home, poses[j], aimed, 1, 1)[0])
+            assert found <= z * (1 + 1e-9)
+            equal += abs(found - z) <= 1e-9 * z
+    assert equal > 22
+
+
+@pytest.mark.parametrize("style", ["home", "hall", "mixed"])
+def test_culling_changes_nothing(style):
+    tour = make_tour(4, style)
+    for pose in tour_path(tour, 50, 3)[::7]:
+        culled, whole = cast(tour, pose, K, 24, 32), cast(tour, pose, K, 24, 32, cull=False)
+        assert torch.equal(culled[0], whole[0])
+        assert torch.equal(culled[1], whole[1])
+        assert (culled[1] >= 0).all(), "rooms are closed"
+
+
+def test_no_texture_occurs_in_both_styles(home):
+    assert not set(HOME_TEXTURES) & set(HALL_TEXTURES)
+    used = {style: {TEXTURES[i] for i in make_tour(3, style).surfaces.texture.tolist()} for style in ("home", "hall")}
+    assert used["home"] <= set(HOME_TEXTURES)
+    assert used["hall"] <= set(HALL_TEXTURES)
+    assert len(used["home"]) > 6
+    assert len(used["hall"]) > 4
+
+
+def test_every_texture_is_a_colour_and_fades_to_its_mean_where_it_is_too_fine():
+    table = noise_table()
+    u, v = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0)) * 40 - 20
+    first, second = torch.tensor([0.8, 0.5, 0.2])[:, None].expand(3, 4000), torch.full((3, 4000), 0.1)
+    for number, name in enumerate(TEXTURES):
+        near = albedo(number, Patch(u, v, u, v, torch.full_like(u, 0.01), first, second, table))
+        far = albedo(number, Patch(u, v, u, v, torch.full_like(u, 3.0), first, second, table))
+        assert near.shape == (3, 4000)
+        assert near.min() >= 0
+        assert near.max() <= 1
+        assert near.std(dim=1).max() > 0.005, f"{name} has no pattern"
+        if name not in ("books", "painting", "window"):
+            assert far.std(dim=1).max() < 0.5 * near.std(dim=1).max() + 1e-3, f"{name} flickers from afar"
+
+
+def test_mixed_tours_begin_at_home_and_end_in_a_hall(mixed):
+    assert mixed.room_styles == ("home", "home", "hall")
+    rooms = mixed.room_at(tour_path(mixed, 150)[:, :3, 3])
+    assert rooms[0] == 0
+    assert (rooms == 2).sum() > 40
+    styles = [mixed.style_at(p) for p in mixed.rooms.mean(1)]
+    assert styles == ["home", "home", "hall"]
+    texture, room = mixed.surfaces.texture, mixed.surfaces.rooms
+    of_hall = {TEXTURES[i] for i in texture[(room[:, 0] == 2) & (room[:, 1] < 0)].tolist()}
+    of_home = {TEXTURES[i] for i in texture[room[:, 0] < 2].tolist()}
+    assert of_hall <= set(HALL_TEXTURES)
+    assert of_home <= set(HOME_TEXTURES)
+
+
+@pytest.mark.parametrize(("seed", "style"), [(0, "home"), (1, "hall")])
+def test_sizes_are_the_styles(seed, style):
+    tour, wanted = make_tour(seed, style), STYLES[style]
+    size = tour.rooms[:, 1] - tour.rooms[:, 0]
+    assert wanted.rooms[0] <= len(tour.rooms) <= wanted.rooms[1]
+    assert ((size[:, [0, 2]] >= wanted.room_size[0]) & (size[:, [0, 2]] <= wanted.room_size[1])).all()
+    assert ((size[:, 1] >= wanted.ceiling[0]) & (size[:, 1] <= wanted.ceiling[1])).all()
+    kinds = torch.bincount(tour.surfaces.kind, minlength=4)
+    assert (kinds > 2).all(), "boxes, ellipsoids, frusta and quads"
+
+
+def test_shadows_darken_what_a_box_hides_from_the_lamp(home):
+    assert home.volumes.min() < 0.3
+    assert home.volumes.max() == 1
+    # High up in a room, hardly anything stands between a point and the lamps; near the floor, much does.
+    assert home.volumes[:, 0, 2].mean() > home.volumes[:, 0, -1].mean()
+
+
+def test_the_sensor_is_mild_and_repeats(home):
+    pose = tour_path(home, 10)[4]
+    clean = render(home, pose, K, 24, 32).image.double()
+    noisy = [render(home, pose, K, 24, 32, frame_seed=s).image.double() for s in (1, 1, 2)]
+    assert torch.equal(noisy[0], noisy[1])
+    assert not torch.equal(noisy[0], noisy[2])
+    assert 0 < (noisy[0] - clean).abs().mean() < 30
+    assert clean.std() > 10
+    assert torch.equal(develop(torch.zeros(3, 4, 4)), torch.zeros(4, 4, 3, dtype=torch.uint8))
+
+
+# --- sequences -----------------------------------------------------------------------------------------------
+
+
+def test_a_tour_by_name_is_a_sequence_whose_depth_and_poses_fit():
+    sequence = open_sequence("tour:7?frames=60&size=120x160&fov=80")
+    assert len(sequence) == 60
+    frame = sequence[3]
+    assert frame.image.shape == (120, 160, 3)
+    assert frame.image.dtype == np.uint8
+    assert frame.depth.dtype == np.float32
+    assert frame.depth.min() > 0.2
+    np.testing.assert_allclose(frame.intrinsics, intrinsics(120, 160, 80.0))
+    np.testing.assert_array_equal(frame.image, tour_sequence(7, frames=60, size=(120, 160), fov=80.0)[3].image)
+    check = check_sequence(sequence, pairs=3)
+    assert check.ok, check.problems
+    assert check.error < 0.01
+
+
+def test_image_and_depth_of_a_frame_come_from_one_rendering(monkeypatch):
+    calls = []
+    real = render
+    monkeypatch.setattr("ufmstar_torch.eval.tour.sequence.render", lambda *a, **k: (calls.append(1), real(*a, **k))[1])
+    sequence = tour_sequence(0, frames=9, size=(24, 32))
+    assert not calls, "nothing is rendered before it is asked for"
+    frames = list(sequence)
+    assert len(calls) == 9
+    np.testing.assert_array_equal(sequence[0].image, frames[0].image)
+    assert len(calls) == 10, "only a few are kept"
+
+
+def test_path_seed_and_sensor_are_options_of_the_name():
+    plain, other = (
+        open_sequence("tour:0?frames=4&size=24x32"),
+        open_sequence("tour:0?frames=4&size=24x32&path=3&sensor=0"),
+    )
+    assert not np.array_equal(plain[0].T_world_cam, other[0].T_world_cam)
+    same_seed = open_sequence("tour:0?size=24x32&path=3&frames=4")
+    np.testing.assert_array_equal(same_seed[1].depth, other[1].depth)
+    assert not np.array_equal(same_seed[1].image, other[1].image)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("tour:", "tour:SEED"),
+        ("tour:-1", "tour:SEED"),
+        ("tour:a", "tour:SEED"),
+        ("tour:1?colour=red", "unknown option 'colour'"),
+        ("tour:1?style=attic", "style must be one of home, hall, mixed"),
+        ("tour:1?frames=0", "frames must be a number of at least 1"),
+        ("tour:1?size=160", "size must be HxW"),
+        ("tour:1?size=4x4", "size must be"),
+        ("tour:1?fov=wide", "fov must be"),
+        ("tour:1?fov=170", "fov must be"),
+        ("tour:1?sensor=yes", "sensor must be 0 or 1"),
+        ("tour:1?frames=3&frames=4", "twice"),
+    ],
+)
+def test_malformed_names_are_told_what_was_expected(name, expected):
+    with pytest.raises(ValueError, match=expected):
+        open_sequence(name)
+
+
+def test_options_of_folders_are_none_of_a_tour():
+    with pytest.raises(ValueError, match="takes no fps"):
+        open_sequence("tour:1", fps=30.0)
+    with pytest.raises(ValueError, match="layout must be auto"):
+        open_sequence("tour:1", "tum")
+    with pytest.raises(ValueError, match="takes no intrinsics"):
+        open_sequence("tour:1", intrinsics=np.eye(3))
+
+
+def test_an_exported_tour_reads_as_a_generic_sequence(tmp_path):
+    sequence = tour_sequence(1, frames=3, size=(24, 32))
+    again = open_sequence(export_tour(sequence, tmp_path / "tour"))
+    assert again.layout == "generic"
+    for a, b in zip(sequence, again, strict=True):
+        np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(a.depth, b.depth)
+        np.testing.assert_allclose(a.T_world_cam, b.T_world_cam, atol=1e-12)
+    with pytest.raises(FileExistsError, match="new or empty"):
+        export_tour(sequence, tmp_path / "tour")
+
+
+# --- bad input -----------------------------------------------------------------------------------------------
+
+
+def test_bad_input_is_named(home):
+    pose = tour_path(home, 1)[0]
+    outside = pose.clone()
+    outside[0, 3] = 99
+    for call, expected in (
+        (lambda: make_tour(-1), "seed must be"),
+        (lambda: make_tour(True), "seed must be"),
+        (lambda: make_tour(1, "attic"), "style must be one of"),
+        (lambda: tour_path(home, 0), "frames must be"),
+        (lambda: tour_path(home, 3, -1), "seed must be"),
+        (lambda: render(home, outside, K, 24, 32), "must stand in a room"),
+        (lambda: render(home, pose * float("nan"), K, 24, 32), "T_world_cam must be"),
+        (lambda: render(home, pose, K[:2], 24, 32), "K must be"),
+        (lambda: render(home, pose, K, 0, 32), "height and width"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            call()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"textures": ()},
+        {"textures": ("velvet",)},
+        {"rooms": (0, 3)},
+        {"rooms": (4, 3)},
+        {"room_size": (1.0, 4.0)},
+        {"ceiling": (1.5, 3.0)},
+        {"camera_height": (1.0, 3.0)},
+        {"warmth": (-2.0, 0.0)},
+        {"brightness": (0.0, 1.0)},
+        {"scale": (1.0, 9.0)},
+        {"furniture": -1.0},
+    ],
+)
+def test_impossible_styles_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        replace(TourStyle(), **change)
+    with pytest.raises(ValueError, match=next(iter(change))):
+        TourStyle.from_dict({name: list(v) if isinstance(v, tuple) else v for name, v in change.items()})
+
+
+def test_a_style_of_ones_own_from_plain_values():
+    style = TourStyle.from_dict({"name": "cell", "rooms": [1, 1], "room_size": [3.0, 3.2], "furniture": 0.2})
+    tour = make_tour(0, style)
+    assert len(tour.rooms) == 1
+    assert tour.room_styles == ("cell",)
+    assert render(tour, tour_path(tour, 5)[2], K, 24, 32).valid.all()
+    with pytest.raises(ValueError, match="unknown field"):
+        TourStyle.from_dict({"colour": "red"})
