@@ -13,14 +13,17 @@ import io
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 
 from ufmstar_torch.eval.files import write_atomic
+from ufmstar_torch.train.checkpoints import POSITION
 from ufmstar_torch.train.module import TrainingModule
 
+SECONDS = "ufmstar_seconds"
 METRICS, STEPS = "metrics.csv", "steps.csv"
 METRIC_COLUMNS = (
     "epoch",
@@ -37,33 +40,49 @@ METRIC_COLUMNS = (
 STEP_COLUMNS = ("step", "epoch", "seconds", "train_loss", "learning_rate")
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where a training goes on: steps done, the epoch that comes or goes on next, seconds spent."""
+
+    step: int = 0
+    epoch: int = 0
+    seconds: float = 0.0
+
+    @classmethod
+    def after(cls, checkpoint: Mapping[str, Any]) -> Start:
+        """A checkpoint that :class:`~ufmstar_torch.train.checkpoints.Checkpoints` wrote."""
+        return cls(int(checkpoint["global_step"]), int(checkpoint[POSITION]["epoch"]), float(checkpoint[SECONDS]))
+
+
 class History(pl.Callback):
     """Writes both files, on the first process.
 
     Args:
         folder: of the member; it must exist.
         every: steps between rows of steps.csv.
-        start: (step, seconds) from which the training goes on; later rows are those of a killed run and are dropped.
+        start: where the training goes on; what lies behind it was written by a killed run, or for an epoch that was
+            stopped in the middle, and is dropped.
     """
 
-    def __init__(self, folder: Path, every: int, start: tuple[int, float] = (0, 0.0)) -> None:
+    def __init__(self, folder: Path, every: int, start: Start | None = None) -> None:
         self.folder = folder
         self.every = every
-        self.start = start
+        self.start = Start() if start is None else start
         self._began = time.monotonic()
 
     @property
     def seconds(self) -> float:
         """Of training so far, earlier sessions included."""
-        return self.start[1] + time.monotonic() - self._began
+        return self.start.seconds + time.monotonic() - self._began
 
     def on_fit_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         """Keep what belongs to the steps before, and start the clock."""
         self._began = time.monotonic()
         if trainer.is_global_zero:
-            for name, columns in ((METRICS, METRIC_COLUMNS), (STEPS, STEP_COLUMNS)):
-                rows = [row for row in read_rows(self.folder / name) if int(row["step"]) <= self.start[0]]
-                write_rows(self.folder / name, columns, rows)
+            metrics = [row for row in read_rows(self.folder / METRICS) if int(row["epoch"]) < self.start.epoch]
+            write_rows(self.folder / METRICS, METRIC_COLUMNS, metrics)
+            steps = [row for row in read_rows(self.folder / STEPS) if int(row["step"]) <= self.start.step]
+            write_rows(self.folder / STEPS, STEP_COLUMNS, steps)
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
         """A row of steps.csv."""
@@ -81,7 +100,7 @@ class History(pl.Callback):
 
     def on_save_checkpoint(self, trainer: pl.Trainer, module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
         """The clock."""
-        checkpoint["ufmstar_seconds"] = self.seconds
+        checkpoint[SECONDS] = self.seconds
 
     def _append(self, name: str, columns: Sequence[str], trainer: pl.Trainer, values: Mapping[str, Any]) -> None:
         own = {"epoch": trainer.current_epoch, "step": trainer.global_step, "seconds": f"{self.seconds:.1f}"}
@@ -109,4 +128,4 @@ def write_rows(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
 
 
 def _number(value: Any) -> str:
-    return "" if value is None or not math.isfinite(float(value)) else f"{float(value):.7g}"
+    return "" if value is None or not math.isfinite(float(value)) else f"{float(value):.9g}"

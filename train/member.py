@@ -19,7 +19,7 @@ from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, read_checkpoint
 from ufmstar_torch.train.data import DataConfig, DepthDataModule
 from ufmstar_torch.train.examples import Examples
-from ufmstar_torch.train.history import METRICS, History, read_rows
+from ufmstar_torch.train.history import METRICS, History, Start, read_rows
 from ufmstar_torch.train.module import TrainingModule, step_seed
 from ufmstar_torch.train.presets import Recipe
 from ufmstar_torch.train.settings import FitSettings
@@ -83,21 +83,23 @@ def train_member(
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / NAME
     stored = read_checkpoint(checkpoint) if checkpoint.is_file() else None
-    start = (0, 0.0) if stored is None else (int(stored["global_step"]), float(stored["ufmstar_seconds"]))
     stops = Stops(deadline, asked)
-    history = History(folder, s.log_every, start)
+    history = History(folder, s.log_every, None if stored is None else Start.after(stored))
     callbacks = [stops, history, Checkpoints(checkpoint, s.checkpoint_every)]
     with quiet_lightning(), torch.random.fork_rng():
         trainer = make_trainer(job, member, callbacks)
         data = make_data(job, member, trainer.world_size)
         if s.examples:
             trainer.callbacks.insert(0, Examples(folder, data, s.examples, epochs(job, data)))
-        module = TrainingModule(new_network(job, member), job.recipe, total_steps(job, data), job.seed(member))
+        total = total_steps(job, data)
+        module = TrainingModule(new_network(job, member), job.recipe, total, job.seed(member))
         trainer.fit(module, data, ckpt_path=None if stored is None else checkpoint, weights_only=True)
+    # Who asks for a stop at the last step gets a finished training.
+    reason = stops.reason if trainer.global_step < total else None
     if trainer.is_global_zero:
-        finish(job, member, module, history, trainer.global_step, stops.reason)
+        finish(job, member, module, history, trainer.global_step, reason)
     trainer.strategy.barrier("member is written")
-    return stops.reason
+    return reason
 
 
 def make_data(job: Job, member: int, world: int) -> DepthDataModule:

@@ -13,7 +13,8 @@ class FitSettings:
         seed: of member 0; member n has seed + n.
         init: weights to start from, or None; see ``train.start.starting_network``.
         trainable: only parameters whose names begin so are trained; empty = all of them.
-        accelerator, devices, nodes, strategy, precision: as Lightning's Trainer takes them.
+        accelerator, devices, nodes, strategy, precision: as Lightning's Trainer takes them; of the strategies,
+            those that start processes as scripts ("ddp", not "ddp_spawn").
         member_processes: members that are trained at the same time, each in a process of its own.
         checkpoint_every: steps between checkpoints within an epoch, 0 = at the end of epochs only.
         log_every: steps between rows of steps.csv.
@@ -50,3 +51,7 @@ class FitSettings:
         for name, low in {**lowest, "max_minutes": 0}.items():
             if not getattr(self, name) >= low:
                 raise ValueError(f"FitSettings.{name} must be at least {low}, got {getattr(self, name)}")
+        if any(word in self.strategy for word in ("spawn", "fork", "notebook")):
+            raise ValueError(f"FitSettings.strategy must start processes as scripts: 'ddp', not {self.strategy!r}")
+        if self.member_processes > 1 and (self.devices != 1 or self.nodes != 1):
+            raise ValueError("FitSettings.member_processes above 1 goes with devices = 1 and nodes = 1")
