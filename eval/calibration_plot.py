@@ -13,7 +13,7 @@ from ufmstar_torch.eval.files import write_atomic
 from ufmstar_torch.eval.plots import FAINT, INK
 
 # Okabe and Ito's colours, which the colour-blind tell apart, and marks for print in grey.
-_LINES = (("#0072B2", "o"), ("#E69F00", "s"), ("#6b6b6b", "^"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
+_LINES = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
 
 
 def draw_calibration(

@@ -7,7 +7,7 @@ UfM and UfM* judge the same predictions, and the table says how well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -18,28 +18,29 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from ufmstar_torch.camera import unproject
+from ufmstar_torch.eval.demo_folder import PROGRAM, SUMMARY, prepare
 from ufmstar_torch.eval.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.demo_options import FRAMES, OUT, SEED
-from ufmstar_torch.eval.demo_pictures import FILES, DemoPanel, panel, write_pictures
+from ufmstar_torch.eval.demo_pictures import DemoPanel, panel, write_pictures
 from ufmstar_torch.eval.demo_report import names
 from ufmstar_torch.eval.files import to_json, write_json_atomic
-from ufmstar_torch.eval.ground_truth import truth_at
+from ufmstar_torch.eval.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.run import Progress
 from ufmstar_torch.eval.run_source import sha256
 from ufmstar_torch.eval.sequences.frame import Frame, Sequence
 from ufmstar_torch.eval.summary import versions
-from ufmstar_torch.eval.tour import make_tour, tour_sequence
+from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
 from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
 from ufmstar_torch.ufmstar import UfMStar
 
-PROGRAM = "ufmstar demo"
 # Of "mixed" tours: what the networks were trained on, and what they never saw.
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
 STYLE = "mixed"
 SHEET_ROWS = 6
 _WEIGHTS = ("weights", "demo.safetensors")
-_SUMMARY = "summary.json"
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,6 @@ class DemoOptions:
             raise ValueError(f"--seed must be at least 0, got {self.seed}")
 
 
-class OutputError(ValueError):
-    """The output folder cannot be used as asked; the message says what to do."""
-
-
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
     """Walk through the tour and leave pictures, mixture and summary in a folder.
 
@@ -94,15 +91,15 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     """
     started = perf_counter()
     device = _device(options.device)
-    _prepare(options.out, overwrite=options.overwrite)
     with _weights(options.weights) as file:
         info, members = read_info(file), load_trained(file)
         digest = sha256(file)
+    prepare(options.out, overwrite=options.overwrite)
     size = info.spec.size
     sequence = tour_sequence(options.seed, frames=options.frames, size=size, style=STYLE, device=device)
-    frames, kinds = _render(sequence, device, progress), room_kinds(sequence, options.seed)
+    frames = _render(sequence, device, progress)
     comparison = Comparison(members, device)
-    tally, panels = _walk(comparison, frames, kinds, progress)
+    tally, panels = _walk(comparison, frames, make_tour(options.seed, STYLE), progress)
     summary = {
         "program": PROGRAM,
         "out": str(options.out),
@@ -110,7 +107,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
         "network": _network(info, digest, len(members)),
         "methods": _methods(comparison, tally),
-        "rooms": tally.by_kind(),
+        "surfaces": tally.by_kind(),
         "components": int(comparison.ufm_star.mixture.components.sum()),
         "points": int(comparison.ufm.points.sum()),
         "versions": versions(),
@@ -121,52 +118,65 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     title = f"ufmstar demo: {len(sequence)} frames, seed {options.seed}"
     outputs = write_pictures(options.out, panels, metrics, comparison.ufm_star, title)
     summary |= {"outputs": outputs, "seconds": perf_counter() - started}
-    write_json_atomic(options.out / _SUMMARY, summary)
+    write_json_atomic(options.out / SUMMARY, summary)
     progress(Progress("pictures", 1, 1, None, 0))
     plain: dict[str, Any] = to_json(summary)
     return plain
 
 
-def room_kinds(sequence: Sequence, seed: int) -> list[str]:
-    """Of every frame, whether the camera stands in a familiar or an unfamiliar room."""
-    tour = make_tour(seed, STYLE)
-    positions = (torch.from_numpy(entry.T_world_cam[:3, 3]) for entry in sequence.entries)
-    return [KINDS[tour.style_at(position)] for position in positions]
+def surface_kinds(tour: Tour, frame: Frame) -> NDArray[np.int64]:
+    """[H, W] at every pixel, whether what it shows stands in a familiar room (0) or the unfamiliar one (1).
+
+    By what is seen, not by where the camera is: through a door it looks into the next room.
+    """
+    assert frame.depth is not None
+    K, T = torch.from_numpy(frame.intrinsics)[None], torch.from_numpy(frame.T_world_cam)
+    points = unproject(torch.from_numpy(frame.depth).double()[None], K)[0] @ T[:3, :3].T + T[:3, 3]
+    names = list(KINDS)
+    of_room = torch.tensor([names.index(style) for style in tour.room_styles])
+    found: NDArray[np.int64] = of_room[tour.room_at(points)].numpy()
+    return found
 
 
-def sheet_rows(kinds: list[str], rows: int = SHEET_ROWS) -> list[int]:
+def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
     """Frames to show: half of them in each kind of room, spread evenly, familiar ones first.
 
     Not the very first frame: nothing has been compared by then.
+
+    Args:
+        unfamiliar: of every frame, whether most of it shows an unfamiliar room.
+        rows: how many, at most.
     """
+    groups = [[i for i, is_new in enumerate(unfamiliar) if is_new == wanted and i > 0] for wanted in (False, True)]
+    present = [group for group in groups if group]
     chosen: list[int] = []
-    present = [kind for kind in KINDS.values() if kind in kinds]
-    for kind in present:
-        there = [index for index, found in enumerate(kinds) if found == kind and index > 0]
-        share = rows // len(present)
-        spread = np.linspace(0, len(there) - 1, share + 1).round().astype(int)[1:]
-        chosen += [there[position] for position in sorted(set(spread.tolist()))] if there else []
+    for group in present:
+        spread = np.linspace(0, len(group) - 1, rows // len(present) + 1).round().astype(int)[1:]
+        chosen += [group[position] for position in sorted(set(spread.tolist()))]
     return chosen
 
 
 def _walk(
-    comparison: Comparison, frames: list[Frame], kinds: list[str], progress: Callable[[Progress], None]
+    comparison: Comparison, frames: list[Frame], tour: Tour, progress: Callable[[Progress], None]
 ) -> tuple[Tally, list[DemoPanel]]:
     """All frames by all methods, with their figures and the rows of the contact sheet."""
     comparison.take(frames[0])  # libraries set themselves up at the first call, which does not count
     comparison.restart()
-    tally = Tally(comparison.methods, [kind for kind in KINDS.values() if kind in kinds])
-    rows, panels = sheet_rows(kinds), {}
+    kinds = [surface_kinds(tour, frame) for frame in frames]
+    unfamiliar = [bool(kind.mean() > 0.5) for kind in kinds]
+    labels, rows = list(KINDS.values()), sheet_rows(unfamiliar)
+    tally, panels = Tally(comparison.methods, labels), {}
     progress(Progress("frames", 0, len(frames), None, 0))
     for index, frame in enumerate(frames):
         compared = comparison.take(frame)
-        depth = compared.estimates[NETWORK].depth
-        truth = truth_at(frame, compared.intrinsics.double().numpy(), (depth.shape[0], depth.shape[1]))
+        K, size = compared.intrinsics.double().numpy(), compared.size
+        truth = truth_at(frame, K, size)
         assert truth is not None
         assert frame.image is not None
-        tally.add(compared, torch.from_numpy(truth), kinds[index])
+        kind = resample_nearest(kinds[index], frame.intrinsics, K, size)
+        tally.add(compared, torch.from_numpy(truth), torch.from_numpy(kind))
         if index in rows:
-            panels[index] = panel(f"frame {index}", kinds[index], frame.image, compared, truth)
+            panels[index] = panel(f"frame {index}", labels[unfamiliar[index]], frame.image, compared, truth)
         components = int(comparison.ufm_star.mixture.components.sum())
         progress(Progress("frames", index + 1, len(frames), components, 0))
     return tally, [panels[row] for row in rows]
@@ -250,35 +260,3 @@ def _device(name: str) -> torch.device:
         return torch.zeros((), device=name).device
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
-
-
-def _prepare(out: Path, *, overwrite: bool) -> None:
-    """Make the folder; files that are not the demo's are never touched.
-
-    Raises:
-        OutputError: the folder holds other files, or an earlier demo and ``overwrite`` is off.
-    """
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"--out {out} is a file, expected a folder")
-    if out.is_dir() and any(out.iterdir()):
-        if not _is_ours(out):
-            raise OutputError(f"--out {out} holds files of someone else: choose an empty or a new folder")
-        if not overwrite:
-            raise OutputError(f"--out {out} holds an earlier demo: --overwrite replaces it")
-        for name in (_SUMMARY, *FILES):
-            (out / name).unlink(missing_ok=True)
-    out.mkdir(parents=True, exist_ok=True)
-    write_json_atomic(out / _SUMMARY, _unfinished())
-
-
-def _unfinished() -> Mapping[str, Any]:
-    """Marks the folder as the demo's until the summary takes its place."""
-    return {"program": PROGRAM, "state": "not finished"}
-
-
-def _is_ours(out: Path) -> bool:
-    try:
-        text = (out / _SUMMARY).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return False
-    return f'"program": "{PROGRAM}"' in text

@@ -55,6 +55,12 @@ class Compared:
     intrinsics: Tensor
     ms: Mapping[str, float]
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the maps [px]."""
+        height, width = self.estimates[NETWORK].depth.shape
+        return height, width
+
 
 class Comparison:
     """All methods side by side, frame by frame.
@@ -165,21 +171,27 @@ class Tally:
         self._variance = dict.fromkeys(self._metrics, (0.0, 0))
         self._ms: dict[str, list[float]] = {}
 
-    def add(self, compared: Compared, truth: Tensor, kind: str) -> None:
+    def add(self, compared: Compared, truth: Tensor, kinds: Tensor) -> None:
         """Add a frame.
 
         Args:
             compared: by all methods.
             truth: [h, w] ground truth [m], 0 = none.
-            kind: of the room that the camera is in.
+            kinds: [h, w] int64 index of the kind of room that a pixel shows.
         """
-        for method, estimate in compared.estimates.items():
-            self._metrics[method, kind].update(estimate.depth, estimate.variance, truth, estimate.valid)
-            chosen = estimate.variance[estimate.valid & (truth > 0)].double()
-            total, pixels = self._variance[method, kind]
-            self._variance[method, kind] = (total + float(chosen.sum()), pixels + chosen.numel())
+        for number, kind in enumerate(self.kinds):
+            there = (kinds == number) & (truth > 0)
+            if bool(there.any()):
+                for method, estimate in compared.estimates.items():
+                    self._add(method, kind, estimate, truth, there & estimate.valid)
         for stage, time in compared.ms.items():
             self._ms.setdefault(stage, []).append(time)
+
+    def _add(self, method: str, kind: str, estimate: Estimate, truth: Tensor, use: Tensor) -> None:
+        self._metrics[method, kind].update(estimate.depth, estimate.variance, truth, use)
+        chosen = estimate.variance[use].double()
+        total, pixels = self._variance[method, kind]
+        self._variance[method, kind] = (total + float(chosen.sum()), pixels + chosen.numel())
 
     def overall(self) -> dict[str, SequenceMetrics]:
         """The metrics of all frames, by method."""

@@ -44,7 +44,7 @@ def table(summary: Mapping[str, Any]) -> str:
 
 def _rooms(summary: Mapping[str, Any], shown: Mapping[str, str]) -> list[str]:
     """RMSE and root mean square sigma by kind of room: where they are equal, sigma is right on average."""
-    kinds = summary["rooms"]
+    kinds = summary["surfaces"]
     head = [""] + [f"{kind}: {what}" for kind in kinds for what in ("RMSE [m]", "sigma [m]")]
     body = [
         [shown[method], *(number(kinds[kind][method][key]) for kind in kinds for key in ("rmse", "rms_sigma"))]
@@ -56,12 +56,15 @@ def _rooms(summary: Mapping[str, Any], shown: Mapping[str, str]) -> list[str]:
 def explanation(summary: Mapping[str, Any]) -> str:
     """Where the outputs are and what to look at, in a few lines."""
     out, made = summary["out"], summary["outputs"]
-    seen, unseen = summary["rooms"]
-    lines = [f"The networks were trained on rooms like the {seen} ones, never on one like the {unseen} one."]
+    seen, unseen = summary["surfaces"]
+    lines = [
+        f"The networks were trained on rooms like the {seen} ones, never on one like the {unseen} one. The first",
+        "three rows judge the same depth. Better: delta1 high, NLL, ECE and AUSE low, and a sigma that equals the RMSE beside it.",
+    ]
     told = {
-        SHEET: f"columns 3 to 5 share one scale: does sigma light up where the true error does? Last rows: {unseen}",
-        CURVES: "above the diagonal on the left a method is too timid, below it too bold; the nearer, the better",
-        PLY: f"what UfM* remembers, brighter = views disagree; any splat viewer ({ELLIPSOIDS}: MeshLab, Blender)",
+        SHEET: f"the last three columns share a scale: does sigma glow where the error does? {unseen} rooms below",
+        CURVES: "nearer to the diagonal is better; on the left, below it a method claims too much",
+        PLY: f"what UfM* remembers, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
     }
     lines += [f"{out}/{name}: {text}" for name, text in told.items() if made[name] is None]
     lines += [f"no {name}: {reason}" for name, reason in made.items() if reason is not None]

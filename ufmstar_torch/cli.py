@@ -179,7 +179,8 @@ def _demo(options: Any) -> dict[str, Any]:
     Raises:
         UsageError: the options do not fit, or what they name is not there.
     """
-    from ufmstar_torch.eval.demo import DemoOptions, OutputError, run_demo
+    from ufmstar_torch.eval.demo import DemoOptions, run_demo
+    from ufmstar_torch.eval.demo_folder import OutputError
 
     try:
         _set_threads(options.threads)
