@@ -19,6 +19,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -200,8 +201,8 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
             raise ValueError(f"tour {seed}: frame {frame.name} has no image or depth")
         image[i] = frame.image.transpose(2, 0, 1)
         depth[i] = np.rint(frame.depth / _UNIT).clip(0, _FARTHEST)
-    arrays = zip(files, (image, depth, sequence.intrinsics), strict=True)
-    write_together({path: partial(np.save, arr=array) for path, array in arrays})
+    arrays: tuple[NDArray[Any], ...] = (image, depth, sequence.intrinsics)
+    write_together({path: partial(np.save, arr=array) for path, array in zip(files, arrays, strict=True)})
 
 
 def _rendered(folder: Path, seeds: list[int], settings: TourSettings, workers: int) -> Iterable[None]:
