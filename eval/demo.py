@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.camera import unproject
-from ufmstar_torch.eval.demo_folder import PROGRAM, SUMMARY, prepare
+from ufmstar_torch.eval.demo_folder import PROGRAM, SUMMARY, DemoError, prepare
 from ufmstar_torch.eval.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.demo_options import FRAMES, OUT, SEED
 from ufmstar_torch.eval.demo_pictures import DemoPanel, panel, write_pictures
@@ -56,7 +56,7 @@ class DemoOptions:
         overwrite: replace an earlier demo in ``out``.
 
     Raises:
-        ValueError: a number is out of range.
+        DemoError: a number is out of range.
     """
 
     out: Path = OUT
@@ -68,9 +68,9 @@ class DemoOptions:
 
     def __post_init__(self) -> None:
         if self.frames < 2:
-            raise ValueError(f"--frames must be at least 2, got {self.frames}: one view has nothing to disagree with")
+            raise DemoError(f"--frames must be at least 2, got {self.frames}: one view has nothing to disagree with")
         if self.seed < 0:
-            raise ValueError(f"--seed must be at least 0, got {self.seed}")
+            raise DemoError(f"--seed must be at least 0, got {self.seed}")
 
 
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
@@ -84,9 +84,10 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         What summary.json holds; ``demo_report`` makes a table of it.
 
     Raises:
-        OutputError: the folder holds something else, or an earlier demo and ``overwrite`` is off.
+        DemoError: the folder holds something else, or an earlier demo and ``overwrite`` is off; the device is
+            not there.
         FileNotFoundError, CheckpointError: the networks cannot be loaded.
-        ValueError: the device is not there, or the networks state no variance.
+        ValueError: the networks state no variance.
         OSError: the results cannot be written.
     """
     started = perf_counter()
@@ -254,9 +255,9 @@ def _device(name: str) -> torch.device:
     """The device, if it is there.
 
     Raises:
-        ValueError: it is not.
+        DemoError: it is not.
     """
     try:
         return torch.zeros((), device=name).device
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
+        raise DemoError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error

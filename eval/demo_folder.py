@@ -14,25 +14,25 @@ SUMMARY = "summary.json"
 UNFINISHED = {"program": PROGRAM, "state": "not finished"}
 
 
-class OutputError(ValueError):
-    """The output folder cannot be used as asked; the message says what to do."""
+class DemoError(ValueError):
+    """What was asked for cannot be done; the message says what to do."""
 
 
 def prepare(out: Path, *, overwrite: bool) -> None:
     """Make the folder; files that are not the demo's are never touched.
 
     Raises:
-        OutputError: the folder holds other files, or a finished demo and ``overwrite`` is off.
+        DemoError: the folder holds other files, or a finished demo and ``overwrite`` is off.
         OSError: it cannot be made.
     """
     if out.exists() and not out.is_dir():
-        raise OutputError(f"--out {out} is a file, expected a folder")
+        raise DemoError(f"--out {out} is a file, expected a folder")
     if out.is_dir() and any(out.iterdir()):
         earlier = _earlier(out)
         if earlier is None:
-            raise OutputError(f"--out {out} holds files of someone else: choose an empty or a new folder")
+            raise DemoError(f"--out {out} holds files of someone else: choose an empty or a new folder")
         if earlier != UNFINISHED and not overwrite:
-            raise OutputError(f"--out {out} holds an earlier demo: --overwrite replaces it")
+            raise DemoError(f"--out {out} holds an earlier demo: --overwrite replaces it")
         for name in FILES:
             (out / name).unlink(missing_ok=True)
     out.mkdir(parents=True, exist_ok=True)

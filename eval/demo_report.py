@@ -58,8 +58,8 @@ def explanation(summary: Mapping[str, Any]) -> str:
     out, made = summary["out"], summary["outputs"]
     seen, unseen = summary["surfaces"]
     lines = [
-        f"The networks were trained on rooms like the {seen} ones, never on one like the {unseen} one. The first",
-        "three rows judge the same depth. Better: delta1 high, NLL, ECE and AUSE low, and a sigma that equals the RMSE beside it.",
+        f"The networks were trained on rooms like the {seen} ones, never on one like the {unseen} one.",
+        "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
     ]
     told = {
         SHEET: f"the last three columns share a scale: does sigma glow where the error does? {unseen} rooms below",

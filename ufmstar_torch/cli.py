@@ -180,10 +180,13 @@ def _demo(options: Any) -> dict[str, Any]:
         UsageError: the options do not fit, or what they name is not there.
     """
     from ufmstar_torch.eval.demo import DemoOptions, run_demo
-    from ufmstar_torch.eval.demo_folder import OutputError
+    from ufmstar_torch.eval.demo_folder import DemoError
 
     try:
         _set_threads(options.threads)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    try:
         chosen = DemoOptions(
             out=options.out,
             frames=options.frames,
@@ -194,7 +197,7 @@ def _demo(options: Any) -> dict[str, Any]:
         )
         with _Bars() as bars:
             return run_demo(chosen, bars.show)
-    except (OutputError, FileNotFoundError) as error:
+    except (DemoError, FileNotFoundError) as error:
         raise UsageError(_one_line(error)) from error
 
 

@@ -1,0 +1,441 @@
+"""``ufmstar demo``: its rows against the pipeline and independent sums, its outputs, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from runs import read_summary
+
+from ufmstar_torch import UncertainDepth, cli
+from ufmstar_torch.eval import calibration_plot, colours, demo, demo_folder, plots
+from ufmstar_torch.eval.calibration_plot import draw_calibration
+from ufmstar_torch.eval.demo import DemoOptions, sheet_rows, surface_kinds
+from ufmstar_torch.eval.demo_methods import ENSEMBLE, METHODS, NETWORK, UFM, UFM_STAR, Comparison, Tally
+from ufmstar_torch.eval.demo_pictures import FILES
+from ufmstar_torch.eval.demo_report import explanation, table
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
+from ufmstar_torch.eval.ufm import UfM
+from ufmstar_torch.models import NetworkSpec, build_network, save_trained
+
+SIZE, FRAMES, SEED = (64, 96), 7, 5
+SPEC = NetworkSpec(widths=0.1, positive="softplus", size=SIZE, preprocess="resize")
+SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
+
+
+def members(count=3, spec=SPEC):
+    """Networks without training: their depths differ, which is all that the plumbing needs."""
+    torch.manual_seed(0)
+    networks = [build_network(spec).eval() for _ in range(count)]
+    with torch.no_grad():
+        for n, network in enumerate(networks):
+            network.backbone.head.norm.weight *= 30  # depth that follows the image
+            network.backbone.head.norm.bias += 0.1 * n
+    return networks
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "three.safetensors"
+    save_trained(path, members(), SPEC, info={"note": "a test"})
+    return path
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return tour_sequence(SEED, frames=FRAMES, size=SIZE, style="mixed")
+
+
+@pytest.fixture(scope="module")
+def done(weights, tmp_path_factory):
+    """One demo through the command line: (folder, exit code, stdout, stderr). Nobody may change the folder."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    words = ["--weights", weights, "--out", out, "--frames", FRAMES, "--seed", SEED]
+    with pytest.MonkeyPatch.context() as patch:
+        told = {"out": [], "err": []}
+        patch.setattr("sys.stdout", Recorder(told["out"]))
+        patch.setattr("sys.stderr", Recorder(told["err"]))
+        code = cli.main(["demo", *map(str, words)])
+    return out, code, "".join(told["out"]), "".join(told["err"])
+
+
+class Recorder:
+    """A stream that remembers; capfd is of function scope."""
+
+    encoding = "utf-8"
+
+    def __init__(self, parts):
+        self.parts = parts
+
+    def write(self, text):
+        self.parts.append(text)
+        return len(text)
+
+    def flush(self):
+        pass
+
+
+# ---- the whole command ----
+
+
+def test_the_command_prints_one_table_and_says_where_everything_is(done):
+    out, code, told, _ = done
+    assert code == 0
+    lines = told.splitlines()
+    for name in ("delta1", "NLL", "ECE_delta", "ECE_q", "AUSE [m]", "network ms", "+ ms", "state kB"):
+        assert name in lines[0]
+    assert [line[:26].strip() for line in lines[1:5]] == [
+        "3 members in turn, alone", "with UfM", "with UfM*", "all 3 members per image",
+    ]  # fmt: skip
+    for name in ("contact_sheet.png", "calibration.png", "mixture.ply", "summary.json"):
+        assert f"{out}/{name}: " in told
+    assert max(map(len, lines)) <= 130 + len(str(out))
+
+
+def test_everything_is_there_and_complete(done):
+    out, *_ = done
+    assert sorted(p.name for p in out.iterdir()) == sorted([*FILES, "summary.json"])
+    summary = read_summary(out)
+    assert summary["outputs"] == dict.fromkeys(FILES)
+    for picture in ("contact_sheet.png", "calibration.png"):
+        assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    header = (out / "mixture.ply").read_bytes().split(b"end_header")[0].decode()
+    assert f"element vertex {summary['components']}\n" in header
+    curves = json.loads((out / "curves.json").read_text())
+    assert len(curves) == 4
+    assert all(len(values["ece_q_observed"]) == 10 for values in curves.values())
+
+
+def test_the_summary_says_what_made_it(done, weights):
+    out, *_ = done
+    summary = read_summary(out)
+    assert summary["program"] == "ufmstar demo"
+    assert summary["tour"] == {"seed": SEED, "style": "mixed", "frames": FRAMES, "size": list(SIZE)}
+    network = summary["network"]
+    assert (network["file"], network["members"]) == (weights.name, 3)
+    assert network["training"] == {"note": "a test"}
+    assert NetworkSpec.from_dict(network["spec"]) == SPEC
+    assert len(network["sha256"]) == 64
+    assert torch.__version__.startswith(summary["versions"]["torch"])
+    assert summary["seconds"] > 0
+
+
+def test_times_and_memory_of_every_row(done):
+    summary = read_summary(done[0])
+    rows = summary["methods"]
+    assert list(rows) == list(METHODS)
+    assert all(rows[m]["network_ms"] == rows[NETWORK]["network_ms"] > 0 for m in (UFM, UFM_STAR))
+    assert rows[ENSEMBLE]["network_ms"] > rows[NETWORK]["network_ms"], "three inferences take longer than one"
+    assert rows[UFM]["uncertainty_ms"] > 0
+    assert rows[UFM_STAR]["uncertainty_ms"] > 0
+    assert rows[NETWORK]["uncertainty_ms"] is rows[ENSEMBLE]["uncertainty_ms"] is None
+    assert rows[UFM]["state_bytes"] == 40 * summary["points"] > 0
+    assert rows[UFM_STAR]["state_bytes"] == 64 * summary["components"] > 0
+    assert rows[NETWORK]["state_bytes"] == rows[ENSEMBLE]["state_bytes"] == 0
+
+
+def test_progress_goes_to_stderr(done):
+    _, _, told, progress = done
+    for stage in ("rooms", "kernels", "frames", "pictures"):
+        assert f"{stage}: 100%" in progress
+        assert f"{stage}: 100%" not in told
+
+
+# ---- the rows are what they say ----
+
+
+@pytest.fixture(scope="module")
+def compared(sequence):
+    comparison = Comparison(members(), torch.device("cpu"))
+    return comparison, [comparison.take(frame) for frame in sequence]
+
+
+def inputs(frame):
+    image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+    return image, torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
+
+
+def test_ufm_star_is_the_pipeline_with_members_in_turn(sequence, compared):
+    networks = members()
+    pipeline, added = UncertainDepth(networks, preprocess=networks[0].preprocess), 0.0
+    for index, frame in enumerate(sequence):
+        want, got = pipeline(*inputs(frame)), compared[1][index].estimates
+        assert want.member == index % 3
+        for method in (NETWORK, UFM, UFM_STAR):
+            assert torch.equal(got[method].depth, want.depth[0])
+        assert torch.equal(got[UFM_STAR].variance.nan_to_num(-1), want.variance[0].nan_to_num(-1))
+        assert torch.equal(got[NETWORK].variance, want.prediction.variance[0])
+        added += float((got[UFM_STAR].variance - got[NETWORK].variance).nanmean())
+    assert added > 0, "the members disagree"
+
+
+def test_ufm_judges_the_same_predictions(sequence, compared):
+    networks, ufm = members(), UfM()
+    for index, frame in enumerate(sequence):
+        image, pose, K = inputs(frame)
+        with torch.no_grad():
+            x, K = networks[0].preprocess(image, K)
+            prediction = networks[index % 3](x)
+        want = ufm(prediction.depth, pose, K, prediction.aleatoric_variance)
+        assert torch.equal(compared[1][index].estimates[UFM].variance, want.variance[0])
+
+
+def test_the_ensemble_row_is_the_mixture_of_all_members(sequence, compared):
+    networks, frame = members(), sequence[3]
+    image, _, K = inputs(frame)
+    with torch.no_grad():
+        predictions = [network(network.preprocess(image, K)[0]) for network in networks]
+    d = torch.stack([p.depth[0] for p in predictions]).double()
+    a = torch.stack([p.aleatoric_variance[0] for p in predictions]).double()
+    got = compared[1][3].estimates[ENSEMBLE]
+    assert torch.allclose(got.depth.double(), d.mean(0), atol=1e-6)
+    assert torch.allclose(got.variance.double(), a.mean(0) + d.var(0, correction=0), rtol=1e-5)
+
+
+def test_restart_forgets_everything(sequence, compared):
+    comparison = Comparison(members(), torch.device("cpu"))
+    comparison.take(sequence[4])
+    comparison.restart()
+    again = comparison.take(sequence[0]).estimates
+    for method, estimate in compared[1][0].estimates.items():
+        assert torch.equal(again[method].variance.nan_to_num(-1), estimate.variance.nan_to_num(-1))
+
+
+def test_one_network_is_no_ensemble(sequence):
+    comparison = Comparison(members(1), torch.device("cpu"))
+    assert comparison.methods == (NETWORK, UFM, UFM_STAR)
+    assert ENSEMBLE not in comparison.take(sequence[0]).estimates
+
+
+def test_what_cannot_be_compared_is_refused(sequence):
+    with pytest.raises(ValueError, match="at least one network"):
+        Comparison([], torch.device("cpu"))
+    plain = Comparison(members(1, replace(SPEC, method="depth")), torch.device("cpu"))
+    with pytest.raises(ValueError, match="a variance of their own"):
+        plain.take(sequence[0])
+
+
+# ---- the figures ----
+
+
+def test_pixels_belong_to_the_room_they_show():
+    """Against the renderer, which knows the primitive behind every pixel and its room."""
+    tour = make_tour(SEED, "mixed")
+    frames = tour_sequence(SEED, frames=30, size=SIZE, style="mixed")
+    both = 0
+    for entry in frames.entries[::3]:
+        view = render(tour, torch.from_numpy(entry.T_world_cam), torch.from_numpy(frames.intrinsics), *SIZE)
+        found = surface_kinds(
+            tour, Frame(0, "", None, view.depth.float().numpy(), entry.T_world_cam, frames.intrinsics)
+        )
+        rooms = tour.surfaces.rooms[view.surface].numpy()
+        only = rooms[..., 1] < 0  # not the frame of a door, which belongs to two rooms
+        hall = np.array([style == "hall" for style in tour.room_styles])
+        assert (found[only] == hall[rooms[..., 0]][only]).mean() > 0.995
+        both += 0.05 < found.mean() < 0.95
+    assert both >= 2, "some frames must show both kinds through a door"
+
+
+def test_figures_by_kind_and_overall(sequence, compared):
+    tour = make_tour(SEED, "mixed")
+    tally, metrics = Tally(METHODS, ("a", "b")), SequenceMetrics()
+    squares, spread = {"a": [], "b": []}, {"a": [], "b": []}
+    for frame, one in zip(sequence, compared[1], strict=True):
+        kinds, truth = surface_kinds(tour, frame), torch.from_numpy(frame.depth)
+        kinds[:, : SIZE[1] // 3] = 1  # so that there are both kinds in every frame
+        tally.add(one, truth, torch.from_numpy(kinds))
+        estimate = one.estimates[UFM_STAR]
+        metrics.update(estimate.depth, estimate.variance, truth, estimate.valid)
+        for number, kind in enumerate("ab"):
+            use = (kinds == number) & (frame.depth > 0) & estimate.valid.numpy()
+            squares[kind].append((estimate.depth.numpy()[use].astype(float) - frame.depth[use]) ** 2)
+            spread[kind].append(estimate.variance.numpy()[use].astype(float))
+    by_kind, whole = tally.by_kind(), tally.overall()[UFM_STAR].compute()
+    for kind in "ab":
+        figures = by_kind[kind][UFM_STAR]
+        assert figures["rmse"] == pytest.approx(np.concatenate(squares[kind]).mean() ** 0.5, rel=1e-6)
+        assert figures["rms_sigma"] == pytest.approx(np.concatenate(spread[kind]).mean() ** 0.5, rel=1e-6)
+    expected = metrics.compute()
+    assert whole.keys() == expected.keys()
+    for name, value in expected.items():
+        assert whole[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
+    assert tally.median_ms()[NETWORK] == np.median([one.ms[NETWORK] for one in compared[1]])
+
+
+def test_the_table_shows_the_figures_of_the_summary(done):
+    summary = read_summary(done[0])
+    text = table(summary)
+    for method in METHODS:
+        for key in ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse"):
+            assert f"{summary['methods'][method]['figures'][key]:.3g}" in text
+        for kind in ("familiar", "unfamiliar"):
+            assert f"{summary['surfaces'][kind][method]['rms_sigma']:.3g}" in text
+    assert done[2].startswith(text)
+    assert explanation(summary) in done[2]
+
+
+@pytest.mark.parametrize(
+    ("unfamiliar", "expected"),
+    [
+        ([False] * 10 + [True] * 10, [3, 6, 9, 13, 16, 19]),
+        ([False] * 20, [4, 7, 10, 13, 16, 19]),
+        ([True, True], [1]),
+        ([False, True], [1]),
+        ([False, False, True], [1, 2]),
+    ],
+    ids=["both", "familiar only", "two frames", "one of each", "three frames"],
+)
+def test_rows_of_the_sheet(unfamiliar, expected):
+    rows = sheet_rows(unfamiliar)
+    assert len(rows) == len(expected) == len(set(rows))
+    assert all(abs(a - b) <= 1 for a, b in zip(rows, expected, strict=True))
+    assert 0 not in rows
+    assert rows == sorted(rows, key=lambda row: (unfamiliar[row], row))
+
+
+# ---- what goes wrong ----
+
+
+@pytest.fixture
+def ufmstar(capfd):
+    def call(*words):
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return call
+
+
+def test_a_folder_of_someone_else_is_left_alone(ufmstar, weights, tmp_path):
+    (tmp_path / "summary.json").write_text('{"program": "ufmstar run"}')
+    (tmp_path / "contact_sheet.png").write_text("mine")
+    code, _, err = ufmstar("demo", "--out", tmp_path, "--weights", weights, "--overwrite")
+    assert code == 2
+    assert "holds files of someone else" in err
+    assert (tmp_path / "contact_sheet.png").read_text() == "mine"
+    (tmp_path / "file").write_text("")
+    assert "is a file" in ufmstar("demo", "--out", tmp_path / "file", "--weights", weights)[2]
+
+
+def test_an_earlier_demo_is_replaced_only_when_asked(done, tmp_path):
+    for name in ("summary.json", "mixture.ply"):
+        (tmp_path / name).write_bytes((done[0] / name).read_bytes())
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(demo_folder.DemoError, match="--overwrite replaces it"):
+        demo_folder.prepare(tmp_path, overwrite=False)
+    assert (tmp_path / "mixture.ply").exists()
+    demo_folder.prepare(tmp_path, overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["notes.txt", "summary.json"]
+    demo_folder.prepare(tmp_path, overwrite=False)  # one that was interrupted needs no permission
+
+
+def test_missing_weights_are_named(ufmstar, tmp_path, monkeypatch):
+    code, _, err = ufmstar("demo", "--out", tmp_path / "out", "--weights", tmp_path / "none.safetensors")
+    assert (code, "no such file" in err, "none.safetensors" in err) == (2, True, True)
+    monkeypatch.setattr(demo, "_WEIGHTS", ("weights", "gone.safetensors"))
+    code, _, err = ufmstar("demo", "--out", tmp_path / "out")
+    assert code == 2
+    assert "weights/gone.safetensors" in err
+    assert "--weights FILE" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_holds_no_networks_is_named(ufmstar, tmp_path):
+    bad = tmp_path / "bad.safetensors"
+    bad.write_bytes(b"not this")
+    code, _, err = ufmstar("demo", "--out", tmp_path / "out", "--weights", bad)
+    assert code != 0
+    assert "bad.safetensors" in err
+    assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--frames", 1), "--frames must be at least 2"),
+        (("--seed", -1), "--seed must be at least 0"),
+        (("--device", "cuda:99"), "--device cuda:99 is not available"),
+        (("--threads", 0), "--threads must be at least 1"),
+    ],
+    ids=str,
+)
+def test_impossible_options_are_named(ufmstar, weights, tmp_path, words, told):
+    code, _, err = ufmstar("demo", "--out", tmp_path / "out", "--weights", weights, *words)
+    assert code == 2
+    assert told in err
+
+
+def test_an_unknown_option_is_refused(capfd):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["demo", "--frame-rate", "3"])
+    assert ended.value.code == 2
+    assert "--frame-rate" in capfd.readouterr().err
+
+
+def test_without_matplotlib_there_is_still_the_same_table(weights, tmp_path, monkeypatch, ufmstar, done):
+    def missing():
+        raise ImportError("pictures need matplotlib: pip install 'ufmstar-torch[viz]'")
+
+    for module in (colours, plots, calibration_plot):
+        monkeypatch.setattr(module, "require_matplotlib", missing)
+    colours.colour_table.cache_clear()
+    out = tmp_path / "out"
+    code, told, _ = ufmstar("demo", "--out", out, "--weights", weights, "--frames", FRAMES, "--seed", SEED)
+    assert code == 0
+    again, before = (read_summary(folder)["methods"] for folder in (out, done[0]))
+    assert all(again[method]["figures"] == before[method]["figures"] for method in METHODS)
+    assert told.splitlines()[3].startswith("  with UfM*")
+    assert "no contact_sheet.png: pictures need matplotlib" in told
+    assert (out / "mixture.npz").exists()
+    assert not (out / "contact_sheet.png").exists()
+    assert read_summary(out)["outputs"]["curves.json"] is None
+
+
+def test_ctrl_c_is_told_as_such(monkeypatch, ufmstar):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "run_demo", interrupted)
+    assert ufmstar("demo") == (130, "", "ufmstar demo: interrupted\n")
+
+
+# ---- the calibration picture ----
+
+
+def test_the_calibration_picture_needs_something_to_draw(tmp_path):
+    with pytest.raises(ValueError, match="1 to 6 methods"):
+        draw_calibration(tmp_path / "x.png", {})
+    assert not (tmp_path / "x.png").exists()
+
+
+# ---- what the package brings ----
+
+
+@pytest.mark.skipif(not SHIPPED.is_file(), reason="the checkpoint has not been trained yet")
+def test_the_shipped_networks_are_small_and_several():
+    from ufmstar_torch.models.trained import load_trained, read_info
+
+    assert SHIPPED.stat().st_size <= 6_000_000
+    info = read_info(SHIPPED)
+    assert info.members >= 3
+    assert "command" in json.dumps(info.info), "a checkpoint says which command trained it"
+    networks = load_trained(SHIPPED)
+    comparison = Comparison(networks, torch.device("cpu"))
+    frames = tour_sequence(DemoOptions().seed, frames=40, size=info.spec.size, style="mixed")
+    tour, tally = make_tour(DemoOptions().seed, "mixed"), Tally(METHODS, ("familiar", "unfamiliar"))
+    for index in range(0, 40, 2):
+        frame = frames[index]
+        kinds = torch.from_numpy(surface_kinds(tour, frame))
+        tally.add(comparison.take(frame), torch.from_numpy(frame.depth), kinds)
+    found = tally.by_kind()
+    assert found["familiar"][UFM_STAR]["delta1"] > 0.6
+    assert found["unfamiliar"][UFM_STAR]["rms_sigma"] > found["familiar"][UFM_STAR]["rms_sigma"]
+    assert found["unfamiliar"][UFM_STAR]["nll"] < found["unfamiliar"][NETWORK]["nll"]
