@@ -83,9 +83,11 @@ class Checkpoints(pl.Callback):
 
 
 class Stops(pl.Callback):
-    """Ends a training in good order: by the clock, or when asked to.
+    """Ends a training in good order: with its last step, by the clock, or when asked to; in each case after a
+    validation.
 
     Args:
+        total: steps of the whole training.
         deadline: ``time.monotonic()`` at which to stop, or None.
         asked: whether somebody wants it to stop.
 
@@ -93,7 +95,8 @@ class Stops(pl.Callback):
         reason: why it was stopped, or None.
     """
 
-    def __init__(self, deadline: float | None, asked: Callable[[], bool] | None = None) -> None:
+    def __init__(self, total: int, deadline: float | None = None, asked: Callable[[], bool] | None = None) -> None:
+        self.total = total
         self.deadline = deadline
         self.asked = asked
         self.reason: str | None = None
@@ -109,6 +112,7 @@ class Stops(pl.Callback):
             reason = (None, TIME, SIGNAL)[int(code)]
         if reason is not None:
             self.reason = reason
+        if reason is not None or trainer.global_step >= self.total:
             trainer.should_stop = True
 
 

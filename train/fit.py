@@ -50,7 +50,8 @@ def fit(
     end = began + 60 * job.settings.max_minutes if job.settings.max_minutes else None
     # Other processes of a distributed training find the folder prepared by the first.
     first = rank_zero_only.rank == 0
-    with open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext():
+    folder = open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext()
+    with folder, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         stopped: str | None = "failed"
         try:
             stopped = train_members(job, end=end, asked=asked)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -83,15 +83,15 @@ def train_member(
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / NAME
     stored = read_checkpoint(checkpoint) if checkpoint.is_file() else None
-    stops = Stops(deadline, asked)
     history = History(folder, s.log_every, None if stored is None else Start.after(stored))
-    callbacks = [stops, history, Checkpoints(checkpoint, s.checkpoint_every)]
-    with quiet_lightning(), torch.random.fork_rng():
-        trainer = make_trainer(job, member, callbacks)
+    with quiet_lightning():
+        trainer = make_trainer(job, member)
         data = make_data(job, member, trainer.world_size)
-        if s.examples:
-            trainer.callbacks.insert(0, Examples(folder, data, s.examples, epochs(job, data)))
         total = total_steps(job, data)
+        stops = Stops(total, deadline, asked)
+        examples = [Examples(folder, data, s.examples, epochs(job, data))] if s.examples else []
+        # In this order: whether to stop is known before the checkpoint is written.
+        trainer.callbacks[:0] = [*examples, stops, history, Checkpoints(checkpoint, s.checkpoint_every)]
         module = TrainingModule(new_network(job, member), job.recipe, total, job.seed(member))
         trainer.fit(module, data, ckpt_path=None if stored is None else checkpoint, weights_only=True)
     # Who asks for a stop at the last step gets a finished training.
@@ -137,7 +137,7 @@ def _steps_per_epoch(job: Job, data: DepthDataModule) -> int:
     return images // batch
 
 
-def make_trainer(job: Job, member: int, callbacks: Sequence[pl.Callback]) -> pl.Trainer:
+def make_trainer(job: Job, member: int) -> pl.Trainer:
     """Lightning's trainer; nothing of it writes checkpoints but :class:`Checkpoints`."""
     r, s = job.recipe, job.settings
     return pl.Trainer(
@@ -150,7 +150,7 @@ def make_trainer(job: Job, member: int, callbacks: Sequence[pl.Callback]) -> pl.
         max_steps=r.max_steps or -1,
         gradient_clip_val=r.clip or None,
         logger=tensorboard(job, member),
-        callbacks=[*callbacks, *([TQDMProgressBar(leave=True)] if s.progress else [])],
+        callbacks=[TQDMProgressBar(leave=True)] if s.progress else [],
         sync_batchnorm=s.sync_batchnorm,
         plugins=[AtomicCheckpointIO()],
         log_every_n_steps=1,

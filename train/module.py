@@ -11,7 +11,8 @@ import lightning.pytorch as pl
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
-from torch.optim import Adam
+from torch.nn.utils import get_total_norm
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
@@ -57,6 +58,7 @@ class TrainingModule(pl.LightningModule):
         self.residuals = Sums()
         self.losses = Sums()
         self.validation = ValidationSums()
+        self._batch_idx = 0
 
     @property
     def result(self) -> nn.Module:
@@ -78,6 +80,7 @@ class TrainingModule(pl.LightningModule):
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Random numbers that depend on nothing but seed, process and step."""
+        self._batch_idx = batch_idx
         torch.manual_seed(step_seed(self.seed, self.global_rank, self.global_step))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -96,13 +99,21 @@ class TrainingModule(pl.LightningModule):
         mine = torch.stack([total.detach().double(), count.double(), error.square().sum(), valid.sum().double()])
         together, world = self._over_processes(mine)
         if not math.isfinite(together[0]):
-            raise NonFiniteLossError(self._blame(batch, batch_idx, float(total.detach())))
+            raise NonFiniteLossError(self._blame("loss", batch_idx, float(total.detach())))
         self.residuals = self.residuals.plus(*together[2:].tolist())
         self.losses = self.losses.plus(*together[:2].tolist())
         mean = together[0] / together[1].clamp(min=1)
         self.log("train_loss", mean.float(), prog_bar=True, batch_size=len(target))
         self.log("learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=1)
         return total * (world / together[1].clamp(min=1)).to(total)
+
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
+        """Raise NonFiniteLossError where a finite loss has a gradient that is not, before it spoils the weights."""
+        if self.trainer.precision == "16-mixed":
+            return  # there such steps are left out, and the loss is scaled down
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
+        if gradients and not math.isfinite(get_total_norm(gradients)):
+            raise NonFiniteLossError(self._blame("gradient", self._batch_idx))
 
     def optimizer_step(self, *arguments: Any, **named: Any) -> None:
         """A step, and the running mean after it (here, so that a checkpoint after the step holds both)."""
@@ -179,12 +190,14 @@ class TrainingModule(pl.LightningModule):
         batches.set_epoch(self.current_epoch, batch_idx)
         return [loader.dataset.source.name(key.frame) for key in next(iter(batches))]
 
-    def _blame(self, batch: Batch, batch_idx: int, mine: float) -> str:
-        told = f", samples {', '.join(self._samples(batch_idx))}"
-        process = f" (process {self.global_rank}: {mine})" if self.trainer.world_size > 1 else ""
+    def _blame(self, what: str, batch_idx: int, mine: float | None = None) -> str:
+        place = f"epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step})"
+        samples = f"samples {', '.join(self._samples(batch_idx))}"
+        if self.trainer.world_size > 1:
+            samples = f"process {self.global_rank}{f' with loss {mine}' if mine is not None else ''}, {samples}"
         return (
-            f"the loss is not finite in epoch {self.current_epoch}, batch {batch_idx} (step {self.global_step}{told})"
-            f"{process}; a smaller learning rate or clip = 1 may help; the last checkpoint before it is kept"
+            f"the {what} is not finite in {place}, {samples}; a smaller learning rate or --clip 1 may help; "
+            "the checkpoint before it is kept"
         )
 
 

@@ -1,0 +1,522 @@
+"""Recipes, the training module's arithmetic, what a training leaves on disk, and its command line."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from shared_data import require_shared
+from torch import nn
+from trainings import RECIPE, SPEC, tiny_job, with_network, write_frames
+
+from ufmstar_torch import cli
+from ufmstar_torch.models.checkpoints import CheckpointError, read_safetensors
+from ufmstar_torch.models.spec import NetworkSpec, build_network
+from ufmstar_torch.models.trained import load_trained, read_info, save_trained
+from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.train.examples import camera_image
+from ufmstar_torch.train.fit import fit
+from ufmstar_torch.train.history import METRICS, read_rows
+from ufmstar_torch.train.member import WEIGHTS, make_data, new_network
+from ufmstar_torch.train.module import NonFiniteLossError, TrainingModule, move_average, share_of_rate, step_seed
+from ufmstar_torch.train.options import parse_train, recipe_from, train_parser
+from ufmstar_torch.train.presets import OURS, PRESETS, Recipe, preset, table
+from ufmstar_torch.train.progress import Sums, ValidationSums, constant_nll
+from ufmstar_torch.train.start import starting_network, train_only
+
+ONE_STEP = replace(RECIPE, max_steps=1)
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """A sequence. Nobody may change it."""
+    return write_frames(tmp_path_factory.mktemp("frames") / "walk")
+
+
+@pytest.fixture
+def ufmstar(capfd):
+    """Calls the program: (exit code, stdout, stderr)."""
+
+    def call(*words):
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return call
+
+
+# ---- recipes ----
+
+
+def test_every_method_of_the_paper_is_a_preset_of_both_architectures():
+    methods = {"depth-only", "aleatoric", "evidential", "mc-dropout", "ensemble", "batch-ensemble"}
+    assert set(PRESETS) == {f"{a}-{m}" for a in ("monodepth2", "fastdepth") for m in methods} | {"demo"}
+    for name, recipe in PRESETS.items():
+        if name == "demo":
+            continue
+        # Section V-A.
+        assert (recipe.network.size, recipe.epochs, recipe.weight_decay) == ((224, 224), 50, 1e-4)
+        assert (recipe.beta1, recipe.beta2) == (0.9, 0.999)
+        assert recipe.network.dropout == (0.2 if name.endswith("mc-dropout") else 0)
+        assert max(recipe.members, recipe.network.members) == (10 if "ensemble" in name else 1)
+        assert recipe.learning_rate == OURS[recipe.network.architecture]["learning_rate"]
+
+
+def test_the_table_has_a_row_for_every_preset():
+    lines = table().splitlines()
+    assert [line.split()[0] for line in lines] == ["preset", *PRESETS]
+    row = dict(zip(re.split(r"\s{2,}", lines[0]), re.split(r"\s{2,}", lines[6]), strict=True))
+    assert (row["preset"], row["members"], row["learning rate"]) == ("monodepth2-batch-ensemble", "10", "0.0001 cosine")
+
+
+def test_the_demo_fits_into_six_megabytes():
+    recipe = preset("demo")
+    numbers = sum(value.numel() for value in build_network(recipe.network).state_dict().values())
+    assert recipe.half
+    assert 3 <= recipe.members <= 4
+    # Half precision, with some room for the tensors that it cannot hold and for what the file says of itself.
+    assert 2.1 * numbers * recipe.members < 6e6
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_recipes_survive_json(name):
+    assert Recipe.from_dict(json.loads(json.dumps(PRESETS[name].to_dict()))) == PRESETS[name]
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"epoch": 3}, r"Recipe has no \['epoch'\]"),
+        ({"epochs": 0}, r"Recipe\.epochs must be in \[1"),
+        ({"epochs": 2.5}, r"Recipe\.epochs must be int"),
+        ({"learning_rate": 0}, r"Recipe\.learning_rate must be in \(0"),
+        ({"learning_rate": float("nan")}, r"Recipe\.learning_rate must be in"),
+        ({"beta2": 1.0}, r"Recipe\.beta2 must be in \[0, 1\)"),
+        ({"schedule": "linear"}, r"Recipe\.schedule must be one of cosine, constant"),
+        ({"network": {"width": 2}}, r"NetworkSpec has no \['width'\]"),
+        ({"network": {"method": "batch_ensemble", "members": 4}, "members": 2}, r"members must be 1 for a batch"),
+    ],
+)
+def test_impossible_recipes_are_named(values, told):
+    with pytest.raises(ValueError, match=told):
+        Recipe.from_dict(values)
+
+
+def test_members_are_the_ensembles_or_the_batch_ensembles():
+    assert preset("fastdepth-ensemble").with_members(3).members == 3
+    recipe = preset("fastdepth-batch-ensemble").with_members(3)
+    assert (recipe.members, recipe.network.members) == (1, 3)
+
+
+# ---- arithmetic ----
+
+
+def test_the_learning_rate_rises_and_falls_as_a_cosine():
+    recipe = Recipe(warmup_steps=4)
+    rates = [share_of_rate(step, 24, recipe) for step in range(24)]
+    assert rates[:4] == pytest.approx([0.2, 0.4, 0.6, 0.8])
+    assert rates[4:] == pytest.approx([(1 + math.cos(math.pi * n / 20)) / 2 for n in range(20)])
+    assert share_of_rate(30, 24, recipe) == 0
+    assert share_of_rate(1000, 24, replace(recipe, schedule="constant")) == 1
+
+
+def test_seeds_of_steps_differ():
+    seeds = {step_seed(s, rank, step) for s in range(4) for rank in range(4) for step in range(-1, 200)}
+    assert len(seeds) == 4 * 4 * 201
+    assert all(0 <= seed < 2**63 for seed in seeds)
+
+
+def test_the_running_mean_is_the_one_by_hand():
+    averaged, network = nn.BatchNorm1d(2), nn.BatchNorm1d(2)
+    expected = torch.ones(2)
+    for n in range(5):
+        with torch.no_grad():
+            network.weight.fill_(n)
+            network.num_batches_tracked.fill_(n)
+        move_average(averaged, network, 0.75)
+        expected = 0.75 * expected + 0.25 * n
+    torch.testing.assert_close(averaged.weight.detach(), expected)
+    assert averaged.num_batches_tracked == 4
+
+
+def test_the_yardstick_is_the_likelihood_of_one_variance():
+    generator = torch.Generator().manual_seed(0)
+    depth = 1 + torch.rand(2, 5, 7, generator=generator, dtype=torch.float64)
+    predicted = depth + torch.randn(2, 5, 7, generator=generator, dtype=torch.float64) / 3
+    valid = torch.rand(2, 5, 7, generator=generator) < 0.6
+    variance = torch.full_like(depth, 0.3)
+    prediction = DepthPrediction(predicted, 0.25 * variance, 0.75 * variance)
+    sums = ValidationSums()
+    for n in range(2):
+        part = DepthPrediction(*(value[n : n + 1] for value in (predicted, 0.25 * variance, 0.75 * variance)))
+        sums = sums.plus(part, depth[n : n + 1], valid[n : n + 1])
+    assert sums.pixels == valid.sum()
+    error, truth = (predicted - depth)[valid].numpy(), depth[valid].numpy()
+    figures = sums.figures(Sums(0.3 * 11, 11))
+    normal = torch.distributions.Normal(predicted[valid], 0.3**0.5)
+    assert figures["val_nll"] == pytest.approx(-float(normal.log_prob(depth[valid]).mean()), rel=1e-12)
+    # With the variance that the head says everywhere, there is no gain.
+    assert figures["val_nll_constant"] == pytest.approx(figures["val_nll"], rel=1e-12)
+    assert figures["val_rmse"] == pytest.approx(np.sqrt((error**2).mean()))
+    assert figures["val_rel"] == pytest.approx((abs(error) / truth).mean())
+    ratio = np.maximum((truth + error) / truth, truth / (truth + error))
+    assert figures["val_delta1"] == pytest.approx(((ratio < 1.25) & (ratio > 0)).mean())
+    # No constant does better than the mean squared error.
+    best = figures["val_nll_constant_best"]
+    assert all(best <= constant_nll((error**2).mean(), v) for v in np.geomspace(1e-3, 10, 200))
+    assert best == pytest.approx(constant_nll((error**2).mean(), (error**2).mean()))
+    alone = ValidationSums().plus(DepthPrediction(prediction.depth), depth, valid)
+    assert "val_nll" not in alone.figures(Sums())
+
+
+def test_invalid_pixels_count_for_nothing():
+    depth = torch.tensor([[[1.0, 0.0, float("nan"), 2.0]]])
+    valid = torch.tensor([[[True, True, True, False]]])
+    prediction = DepthPrediction(torch.tensor([[[1.5, 9.0, 9.0, 9.0]]]), torch.ones(1, 1, 4))
+    sums = ValidationSums().plus(prediction, depth, valid)
+    assert (sums.pixels, sums.squared, sums.with_variance) == (1, 0.25, 1)
+
+
+# ---- trainings ----
+
+
+def test_it_learns_depth_and_the_head_beats_every_constant(frames, tmp_path):
+    recipe = replace(RECIPE, epochs=25, average=0.0)
+    summary = fit(tiny_job(frames, tmp_path / "out", recipe, augment=False, checkpoint_every=0))
+    rows = read_rows(tmp_path / "out" / "member_0" / METRICS)
+    first, last = ({name: float(value) for name, value in rows[i].items()} for i in (0, -1))
+    assert [int(row["epoch"]) for row in rows] == list(range(25))
+    assert last["step"] == 75
+    assert last["train_loss"] < first["train_loss"] - 0.8
+    assert last["val_rmse"] < 0.75 * first["val_rmse"]
+    assert last["val_nll"] < last["val_nll_constant_best"] - 0.2
+    assert last["val_nll_constant_best"] <= last["val_nll_constant"]
+    assert summary["mean"]["val_nll"] == last["val_nll"]
+
+
+@pytest.fixture(scope="module")
+def pair(frames, tmp_path_factory):
+    """Folder and summary of an ensemble of two, stored in half precision; the last of 4 steps is inside an epoch."""
+    out = tmp_path_factory.mktemp("trained") / "out"
+    recipe = replace(RECIPE, members=2, max_steps=4, half=True)
+    return out, fit(tiny_job(frames, out, recipe), command=["ufmstar", "train"])
+
+
+def test_what_a_training_leaves(pair):
+    out, summary = pair
+    assert summary["stopped"] is None
+    assert summary["command"] == ["ufmstar", "train"]
+    assert torch.__version__.startswith(summary["versions"]["torch"])
+    assert {"cpu", "cores", "threads", "gpus"} <= set(summary["hardware"])
+    assert summary["seconds"] > 0
+    stored = json.loads((out / "summary.json").read_text())
+    assert stored["members"] == summary["members"]
+    # Validated at the end, although no epoch ended there.
+    assert [(m["steps"], m["figures"]["step"]) for m in summary["members"]] == [(4, 4), (4, 4)]
+
+
+def test_the_file_of_all_members_predicts_as_the_members(pair):
+    out, _ = pair
+    image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    members = load_trained(out / WEIGHTS)
+    assert read_info(out / WEIGHTS).info["recipe"]["members"] == 2
+    for n, member in enumerate(members):
+        (alone,) = load_trained(out / f"member_{n}" / WEIGHTS)
+        torch.testing.assert_close(member(image).depth, alone(image).depth, atol=0.02, rtol=0.02)
+    assert (members[0](image).depth - members[1](image).depth).abs().max() > 1e-3
+
+
+def test_pictures_and_logs(frames, tmp_path):
+    out = tmp_path / "out"
+    fit(tiny_job(frames, out, replace(RECIPE, epochs=2), tensorboard=True, examples=2))
+    assert list((out / "tensorboard" / "member_0").glob("events.*"))
+    pictures = sorted((out / "member_0" / "examples").iterdir())
+    assert [path.name for path in pictures] == ["epoch_000.png", "epoch_001.png"]
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
+
+
+def test_the_file_of_all_members_predicts_as_the_members(trained):
+    out, _ = trained
+    image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    members = load_trained(out / WEIGHTS)
+    assert read_info(out / WEIGHTS).info["recipe"]["members"] == 2
+    for n, member in enumerate(members):
+        (alone,) = load_trained(out / f"member_{n}" / WEIGHTS)
+        # Stored in half precision.
+        torch.testing.assert_close(member(image).depth, alone(image).depth, atol=0.02, rtol=0.02)
+    assert (members[0](image).depth - members[1](image).depth).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"method": "depth"},
+        {"method": "evidential"},
+        {"method": "mc_dropout", "dropout": 0.2},
+        {"method": "batch_ensemble", "members": 2},
+    ],
+    ids=lambda network: network["method"],
+)
+def test_every_method_trains(frames, tmp_path, network):
+    recipe = replace(with_network(RECIPE, **network), max_steps=3, batch_size=4)
+    summary = fit(tiny_job(frames, tmp_path / "out", recipe, examples=1))
+    figures = summary["members"][0]["figures"]
+    assert math.isfinite(figures["val_rmse"])
+    assert ("val_nll" in figures) == (network["method"] != "depth")
+    assert len(load_trained(tmp_path / "out" / WEIGHTS)) == network.get("members", 1)
+
+
+def test_a_resnet_trains(frames, tmp_path):
+    network = NetworkSpec(architecture="monodepth2", layers=18, size=(64, 64), preprocess="resize")
+    summary = fit(tiny_job(frames, tmp_path / "out", replace(ONE_STEP, network=network, average=0.0)))
+    assert math.isfinite(summary["members"][0]["figures"]["val_nll"])
+
+
+def test_bfloat16_trains_and_its_loss_is_in_single_precision(frames, tmp_path):
+    recipe = replace(RECIPE, epochs=1, average=0.0)
+    losses = []
+    for name, precision in (("full", "32-true"), ("mixed", "bf16-mixed")):
+        fit(tiny_job(frames, tmp_path / name, recipe, precision=precision))
+        losses.append(float(read_rows(tmp_path / name / "member_0" / METRICS)[-1]["train_loss"]))
+    assert losses[0] != losses[1]
+    assert losses[0] == pytest.approx(losses[1], rel=0.05)
+
+
+def test_the_factors_of_a_batch_ensemble_do_not_decay(frames, tmp_path):
+    recipe = with_network(RECIPE, method="batch_ensemble", members=2)
+    module = TrainingModule(build_network(recipe.network), recipe, 10)
+    groups = module.configure_optimizers()["optimizer"].param_groups
+    assert [group["weight_decay"] for group in groups] == [1e-4, 0.0]
+    assert len(groups[1]["params"]) == len(module.network.factors())
+    assert sum(len(group["params"]) for group in groups) == len(list(module.network.parameters()))
+
+
+@pytest.mark.parametrize("average", [0.0, 0.9])
+def test_a_loss_that_is_not_finite_names_its_samples_and_loses_nothing(frames, tmp_path, monkeypatch, average):
+    """The second member diverges at its step 2, the first of the two is there nevertheless."""
+    recipe = replace(RECIPE, members=2, epochs=1, average=average)
+    original = TrainingModule._distribution
+
+    def poisoned(module, image):
+        distribution = original(module, image)
+        bad = module.seed == 1 and module.global_step == 1
+        return replace(distribution, log_variance=distribution.log_variance * (float("nan") if bad else 1.0))
+
+    monkeypatch.setattr(TrainingModule, "_distribution", poisoned)
+    job = tiny_job(frames, tmp_path / "out", recipe, checkpoint_every=1)
+    told = r"the loss is not finite in epoch 0, batch 1 \(step 1\), samples "
+    with pytest.raises(NonFiniteLossError, match=told) as caught:
+        fit(job)
+    data = make_data(job, 1, 1)
+    batches = data.train_dataloader().batches
+    batches.set_epoch(0, 1)
+    for key in next(iter(batches)):
+        assert data.train_set.source.name(key.frame) in str(caught.value)
+    assert len(load_trained(tmp_path / "out" / WEIGHTS)) == 1
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["stopped"] == "failed"
+    monkeypatch.undo()
+    assert fit(job, resume=True)["stopped"] is None
+
+
+def test_a_gradient_that_is_not_finite_stops_before_it_does_harm(frames, tmp_path, monkeypatch):
+    """sqrt(0) has a finite value and no finite gradient."""
+    original = TrainingModule._distribution
+
+    def poisoned(module, image):
+        distribution = original(module, image)
+        return replace(distribution, depth=distribution.depth + (distribution.depth * 0).sqrt())
+
+    monkeypatch.setattr(TrainingModule, "_distribution", poisoned)
+    with pytest.raises(NonFiniteLossError, match=r"the gradient is not finite in epoch 0, batch 0 .*samples"):
+        fit(tiny_job(frames, tmp_path / "out", ONE_STEP))
+
+
+def test_training_leaves_torchs_random_numbers_alone(frames, tmp_path):
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    fit(tiny_job(frames, tmp_path / "out", ONE_STEP))
+    assert torch.equal(torch.rand(3), expected)
+
+
+# ---- starts ----
+
+
+def test_members_start_with_weights_of_their_own_and_the_same_again(frames, tmp_path):
+    job = tiny_job(frames, tmp_path / "out")
+    key = "backbone.encoder.0.conv.weight"
+    first, again, other = (new_network(job, member).state_dict()[key] for member in (0, 0, 1))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_a_trained_file_is_a_start(tmp_path):
+    path = tmp_path / "start.safetensors"
+    members = [build_network(SPEC) for _ in range(2)]
+    save_trained(path, members, SPEC)
+    for n in range(3):
+        state = starting_network(SPEC, path, n).state_dict()
+        assert all(torch.equal(state[key], value) for key, value in members[n % 2].state_dict().items())
+    # Another head on the same backbone, at another size.
+    spec = replace(SPEC, method="evidential", size=(64, 32))
+    network = starting_network(spec, path)
+    for key, value in members[0].backbone.state_dict().items():
+        assert torch.equal(network.backbone.state_dict()[key], value)
+    assert network.head.out_channels == 3
+    with pytest.raises(ValueError, match=r"init: .*start\.safetensors holds .*widths=0\.05.*does not fit"):
+        starting_network(replace(SPEC, widths=0.1), path)
+    with pytest.raises(FileNotFoundError):
+        starting_network(SPEC, tmp_path / "none.safetensors")
+
+
+def test_a_start_that_does_not_fit_is_refused(tmp_path):
+    path = tmp_path / "weights.pth"
+    torch.save({"conv1.weight": torch.ones(1)}, path)
+    with pytest.raises(ValueError, match=r"a fastdepth starts from \.onnx or a trained \.safetensors"):
+        starting_network(SPEC, path)
+    with pytest.raises(CheckpointError):
+        starting_network(NetworkSpec(architecture="monodepth2", layers=18), path)
+
+
+def test_the_shared_weights_are_starts():
+    spec = NetworkSpec(widths="pruned", norm=False)
+    onnx, resnet = require_shared("weights/fastdepth_nyu.onnx"), "weights/resnet50_v1_imagenet_fp16_nofc.pth"
+    try:
+        network = starting_network(spec, onnx)
+    except CheckpointError:
+        network = starting_network(replace(spec, norm=True), onnx)
+    from ufmstar_torch.models.fastdepth import FastDepth
+
+    for key, value in FastDepth.from_onnx(onnx).state_dict().items():
+        assert torch.equal(network.backbone.state_dict()[key], value)
+    with pytest.raises(ValueError, match=r"--network\.widths pruned or full"):
+        starting_network(NetworkSpec(widths=0.5), onnx)
+    spec = NetworkSpec(architecture="monodepth2", strides="v1")
+    weights = torch.load(require_shared(resnet), weights_only=True)
+    network = starting_network(spec, require_shared(resnet))
+    first = next(key for key in weights if key.endswith("conv1.weight"))
+    assert torch.equal(network.backbone.encoder.state_dict()[first], weights[first].float())
+
+
+def test_only_the_named_part_is_trained(frames, tmp_path):
+    job = tiny_job(frames, tmp_path / "out", replace(ONE_STEP, average=0.0), trainable=("head", "backbone.decoder.4"))
+    before = {key: value.clone() for key, value in new_network(job, 0).state_dict().items()}
+    fit(job)
+    after, _ = read_safetensors(tmp_path / "out" / "member_0" / WEIGHTS, prefix="member.0.")
+    # Batch norms of the parts that are not trained keep their statistics, too.
+    changed = {key for key in before if not torch.equal(before[key], after[key])}
+    assert {".".join(key.split(".")[:3]) for key in changed} == {"head.weight", "head.bias", "backbone.decoder.4"}
+
+
+def test_a_part_that_is_not_there_is_named():
+    network = build_network(SPEC)
+    with pytest.raises(ValueError, match=r"no parameter begins with 'tail'; there are backbone\.decoder, "):
+        train_only(network, ["head", "tail"])
+    assert train_only(network, ["head"]) == sum(p.numel() for p in network.head.parameters())
+
+
+# ---- pictures ----
+
+
+def test_the_camera_image_comes_back():
+    image = torch.randint(0, 256, (3, 4, 6), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    preprocess = NetworkSpec(architecture="monodepth2", preprocess="resize").input()
+    preprocess = replace(preprocess, size=None)
+    seen = preprocess.apply_image(image[None])[0]
+    assert np.array_equal(camera_image(seen, preprocess), image.permute(1, 2, 0).numpy())
+
+
+# ---- command line ----
+
+
+def words(frames, out, *more):
+    base = ["train", "--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", frames, "--out", out]
+    base += ["--part", "0:12", "--validation-part", "12:16", "--network.size", "[32,32]", "--network.widths", "0.05"]
+    base += ["--accelerator", "cpu", "--batch-size", "4", "--examples", "0", "--no-tensorboard", "--no-progress"]
+    return [*base, *more]
+
+
+def test_the_list_of_presets(ufmstar):
+    code, out, err = ufmstar("train", "--list")
+    assert (code, out, err) == (0, table() + "\n", "")
+
+
+def test_a_training_by_command(ufmstar, frames, tmp_path):
+    code, out, err = ufmstar(*words(frames, tmp_path / "out", "--max-steps", 2, "--members", 2))
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0].split()[:3] == ["member", "steps", "seconds"]
+    assert [line.split()[:2] for line in out.splitlines()[1:3]] == [["0", "2"], ["1", "2"]]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["command"][:4] == ["ufmstar", "train", "--preset", "fastdepth-aleatoric"]
+    assert Recipe.from_dict(summary["recipe"]).network.widths == 0.05
+    code, _, err = ufmstar(*words(frames, tmp_path / "out", "--max-steps", 2, "--members", 2))
+    assert code == 1
+    assert re.fullmatch(r"ufmstar train: failed: --out .* holds an earlier training: --resume .*\n", err)
+    code, _, err = ufmstar(*words(frames, tmp_path / "out", "--max-steps", 2, "--members", 2, "--resume"))
+    assert (code, err) == (0, "")
+
+
+def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
+    code, _, err = ufmstar(*words(frames, tmp_path / "out", "--max-minutes", 1e-9))
+    assert (code, err) == (130, "ufmstar train: time budget spent; --resume goes on\n")
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--epochs", "0"], r"Recipe\.epochs must be in \[1"),
+        (["--epochs", "two"], r"epochs"),
+        (["--learning-speed", "2"], r"[Uu]nrecognized arguments: --learning-speed 2"),
+        (["--network.widths", "wide"], r"NetworkSpec\.widths must be"),
+        (["--augment.flip", "2"], r"AugmentationConfig\.flip must lie in \[0, 1\]"),
+        (["--resume", "--overwrite"], "contradict each other"),
+        (["--data", "tour"], "--data tour takes no --root"),
+        (["--preset", "resnet"], "preset"),
+        (["--threads", "0"], "--threads must be at least 1"),
+        (["--strategy", "ddp_spawn"], "must start processes as scripts"),
+    ],
+)
+def test_mistakes_are_one_line(ufmstar, frames, tmp_path, more, told):
+    code, out, err = ufmstar(*words(frames, tmp_path / "out", *more))
+    assert (code, out) == (2, "")
+    assert err.startswith("ufmstar train: ")
+    assert err.count("\n") == 1
+    assert re.search(told, err)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("missing", ["--preset", "--data", "--out"])
+def test_what_is_missing_is_named(ufmstar, frames, tmp_path, missing):
+    line = words(frames, tmp_path / "out")
+    at = line.index(missing)
+    code, _, err = ufmstar(*line[:at], *line[at + 2 :])
+    assert code == 2
+    assert f"{missing} is missing" in err or missing == "--data"
+
+
+def test_a_file_may_hold_the_options(tmp_path):
+    file = tmp_path / "train.yaml"
+    file.write_text("preset: fastdepth-ensemble\nmembers: 3\nlearning_rate: 0.002\nnetwork: {widths: 0.5}\n")
+    options = parse_train(train_parser(), ["--config", str(file), "--epochs", "7"])
+    recipe = recipe_from(options)
+    expected = replace(preset("fastdepth-ensemble"), members=3, learning_rate=0.002, epochs=7)
+    assert recipe == replace(expected, network=replace(expected.network, widths=0.5))
+    file.write_text("preset: fastdepth-ensemble\nlearning_speed: 2\n")
+    from jsonargparse import ArgumentError
+
+    with pytest.raises(ArgumentError, match="learning_speed"):
+        parse_train(train_parser(), ["--config", str(file)])
+
+
+def test_every_value_of_a_recipe_has_an_option():
+    options = parse_train(train_parser(), [])
+    assert {f.name for f in fields(Recipe)} - {"network"} <= set(options)
+    assert {f.name for f in fields(NetworkSpec)} - {"members"} == set(options["network"])
+    assert Path(__file__).exists()
