@@ -50,7 +50,9 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sequence():
-    return tour_sequence(SEED, frames=FRAMES, size=SIZE, style="mixed")
+    """Frames that overlap, as those of a long tour do."""
+    tour = tour_sequence(SEED, frames=80, size=SIZE, style="mixed")
+    return [tour[index] for index in range(FRAMES)]
 
 
 @pytest.fixture(scope="module")
