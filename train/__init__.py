@@ -13,15 +13,24 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.augment import AugmentationConfig as AugmentationConfig
     from ufmstar_torch.train.batches import EpochBatches as EpochBatches
     from ufmstar_torch.train.batches import EpochLoader as EpochLoader
+    from ufmstar_torch.train.checkpoints import ResumeError as ResumeError
     from ufmstar_torch.train.data import DepthDataModule as DepthDataModule
     from ufmstar_torch.train.data_config import DataConfig as DataConfig
     from ufmstar_torch.train.losses import loss_of as loss_of
     from ufmstar_torch.train.losses import loss_sums as loss_sums
+    from ufmstar_torch.train.member import Job as Job
+    from ufmstar_torch.train.module import NonFiniteLossError as NonFiniteLossError
+    from ufmstar_torch.train.module import TrainingModule as TrainingModule
     from ufmstar_torch.train.nyu import NyuFrames as NyuFrames
     from ufmstar_torch.train.nyu import convert_labelled as convert_labelled
+    from ufmstar_torch.train.presets import PRESETS as PRESETS
+    from ufmstar_torch.train.presets import Recipe as Recipe
+    from ufmstar_torch.train.presets import preset as preset
     from ufmstar_torch.train.samples import SampleDataset as SampleDataset
     from ufmstar_torch.train.samples import SampleError as SampleError
     from ufmstar_torch.train.sequence_data import SequenceFrames as SequenceFrames
+    from ufmstar_torch.train.settings import FitSettings as FitSettings
+    from ufmstar_torch.train.start import starting_network as starting_network
     from ufmstar_torch.train.tour_data import TourSettings as TourSettings
     from ufmstar_torch.train.tour_data import tour_frames as tour_frames
 
@@ -32,14 +41,23 @@ _HOME = {
     "DepthDataModule": "data",
     "EpochBatches": "batches",
     "EpochLoader": "batches",
+    "FitSettings": "settings",
+    "Job": "member",
+    "NonFiniteLossError": "module",
     "NyuFrames": "nyu",
+    "PRESETS": "presets",
+    "Recipe": "presets",
+    "ResumeError": "checkpoints",
     "SampleDataset": "samples",
     "SampleError": "samples",
     "SequenceFrames": "sequence_data",
     "TourSettings": "tour_data",
+    "TrainingModule": "module",
     "convert_labelled": "nyu",
     "loss_of": "losses",
     "loss_sums": "losses",
+    "preset": "presets",
+    "starting_network": "start",
     "tour_frames": "tour_data",
 }
 

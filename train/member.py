@@ -13,6 +13,7 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
+
 from ufmstar_torch.eval.files import write_json_atomic
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import save_trained

@@ -5,6 +5,8 @@ from __future__ import annotations
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, fields, replace
+from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
 
@@ -150,7 +152,7 @@ def _add_fields(group: Any, config: type, prefix: str, without: Sequence[str], *
         parts = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
         # Text takes every word, so it comes last.
         parts = tuple(sorted(dict.fromkeys((*parts, *((type(None),) if unset else ()))), key=lambda part: part is str))
-        kind = Union[parts]
+        kind = reduce(or_, parts)
         group.add_argument(f"--{_dashes(prefix + f.name)}", type=kind, default=default, help=told)
 
 
