@@ -11,6 +11,8 @@ import ufmstar_torch
 home = Path(ufmstar_torch.__file__).parent
 assert "site-packages" in str(home), f"imported from {home}, expected an installed package"
 assert (home / "py.typed").exists(), "py.typed is missing from the archive"
+weights = home / "models" / "weights" / "demo.safetensors"
+assert weights.exists(), "the demo's networks are missing from the archive"
 names = [m.name for m in pkgutil.walk_packages([str(home)], "ufmstar_torch.")]
 for name in names:
     importlib.import_module(name)

@@ -33,9 +33,10 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
 
 
 def test_both_commands_are_one_line_each():
-    main, tests = blocks("bash")
-    assert len(main.strip().splitlines()) == len(tests.strip().splitlines()) == 1
-    assert "ufmstar run" in main
+    main, tests, own = blocks("bash")
+    assert all(len(block.strip().splitlines()) == 1 for block in (main, tests, own))
+    assert main.strip().endswith("ufmstar demo"), "the main job needs no file of the reader's"
+    assert "ufmstar run" in own
     assert tests.strip().endswith("pytest")
     between = README.split("<!-- test-command -->")[1].split("<!-- end -->")[0]
     assert tests in between, "CI runs what stands between the markers"
