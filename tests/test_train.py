@@ -64,7 +64,7 @@ def test_every_method_of_the_paper_is_a_preset_of_both_architectures():
         # Section V-A.
         assert (recipe.network.size, recipe.epochs, recipe.weight_decay) == ((224, 224), 50, 1e-4)
         assert (recipe.beta1, recipe.beta2) == (0.9, 0.999)
-        assert recipe.network.dropout == (0.2 if name.endswith("mc-dropout") else 0)
+        assert recipe.network.dropout == 0.2
         assert max(recipe.members, recipe.network.members) == (10 if "ensemble" in name else 1)
         assert recipe.learning_rate == OURS[recipe.network.architecture]["learning_rate"]
 

@@ -34,6 +34,7 @@ def command(job):
     words = ["--preset", "fastdepth-aleatoric", "--data", "sequences", "--root", *job.data.paths]
     words += ["--part", job.data.part, "--validation-part", job.data.validation_part, "--out", str(job.settings.out)]
     words += ["--network.widths", str(n.widths), "--network.norm", "false", "--network.positive", n.positive]
+    words += ["--network.dropout", str(n.dropout)]
     words += ["--network.size", str(list(n.size)), "--network.preprocess", n.preprocess]
     for name in ("epochs", "batch_size", "learning_rate", "average", "clip", "warmup_steps"):
         words += [f"--{name.replace('_', '-')}", str(getattr(r, name))]
