@@ -79,7 +79,7 @@ class ValidationSums:
         nll, counted = error.new_zeros(()), 0
         parts = [v for v in (prediction.aleatoric_variance, prediction.epistemic_variance) if v is not None]
         if parts:
-            variance = sum(part[use].double() for part in parts).clamp(min=VARIANCE_FLOOR)
+            variance = torch.stack([part[use].double() for part in parts]).sum(0).clamp(min=VARIANCE_FLOOR)
             nll, counted = constant_nll_sum(error.square() / variance, variance), len(truth)
         more = torch.stack([error.square().sum(), (error.abs() / truth).sum(), within.sum().double(), nll]).tolist()
         added = (len(truth), *more, counted)
