@@ -15,6 +15,7 @@ from shared_data import require_shared
 from tiny_networks import Linear, constant_head
 from torch import Tensor
 
+from ufmstar_torch.eval.sequences.images import read_color
 from ufmstar_torch.models.distribution import EvidentialDepth, GaussianDepth, PointDepth
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import (
@@ -191,6 +192,23 @@ def test_depth_is_unchanged_on_published_weights(method: str) -> None:
     assert float(expected.std()) > 0.01
     assert torch.equal(observed.depth, expected)
     assert (observed.variance is None) == (method == "depth")
+
+
+def test_an_untrained_head_says_about_a_metre_on_trained_features() -> None:
+    """In training mode, on frames unlike the backbone's: otherwise the first steps of fine-tuning see errors of
+    hundreds of standard deviations."""
+    backbone = FastDepth.from_onnx(require_shared("weights/fastdepth_nyu.onnx"))
+    folder = require_shared("data/rgbd_dataset_freiburg1_xyz/rgb")
+    files = sorted(folder.glob("*.png"))
+    images = [torch.from_numpy(read_color(file)).permute(2, 0, 1) for file in files[:: len(files) // 4]]
+    image = backbone.preprocess.apply_image(torch.stack(images))
+    maps = []
+    for seed in range(3):
+        torch.manual_seed(seed)
+        with torch.inference_mode():
+            maps.append(with_head(backbone, "aleatoric").train().distribution(image).log_variance)
+    assert all(float(s.abs().max()) < 2 for s in maps)
+    assert float((maps[0] - maps[1]).abs().max()) > 1e-3, "members start equal"
 
 
 @pytest.mark.parametrize("method", list(HEADS))
