@@ -98,6 +98,24 @@ def test_the_kernel_at_points_agrees_with_the_reference(config, dtype, tolerance
         assert fast.disagreement[~finite].isnan().all()
 
 
+def test_sorting_points_into_leaves_changes_nothing():
+    """Many small components, so that every leaf has a selection of its own, against one point at a time and the sum."""
+    m = mixture(1, 400, 5)
+    m = m.replace(mean=m.mean * 6, covariance=m.covariance * 0.05)
+    generator = torch.Generator().manual_seed(0)
+    at_components = m.mean[:, torch.randint(400, (500,), generator=generator)]
+    points = at_components + 0.01 * torch.randn(1, 500, 3, generator=generator, dtype=torch.float64)
+    points[0, 17, 1], points[0, 18, 2] = torch.nan, torch.inf
+    together = regress_cpu.regress(m, points, EXACT).disagreement[0]
+    alone = [regress_cpu.regress(m, points[:, i : i + 1], EXACT).disagreement[0, 0] for i in range(500)]
+    assert torch.equal(together.nan_to_num(-1), torch.stack(alone).nan_to_num(-1))
+    assert together[[17, 18]].isnan().all()
+    finite = points[0].isfinite().all(-1)
+    exact = regress(m, points, EXACT).disagreement[0]
+    torch.testing.assert_close(together[finite], exact[finite], rtol=0, atol=1e-13)
+    assert (exact[finite] - EXACT.prior_mean).abs().mean() > 0.02, "or the test tests nothing"
+
+
 def test_far_away_the_prior_rules():
     m = mixture(1, 8, 1)
     far = torch.full((1, 3, 3), 50.0, dtype=torch.float64)

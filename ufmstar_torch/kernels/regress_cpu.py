@@ -27,11 +27,11 @@ from numba.extending import overload
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.kernels.regress_points_cpu import at_points, compiled, prepare
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
 from ufmstar_torch.regress import regress as regress_reference
 
-compiled: Any = njit(cache=True, nogil=True)
 # The innermost loop, with multiply and add joined where the processor can: one rounding less, not one more.
 contracted: Any = njit(cache=True, nogil=True, fastmath={"contract"})
 
@@ -42,7 +42,6 @@ EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
 _TILE = 16  # pixels; 256 points fill vector registers and still lie close together
 _SHARE = 128 * 128  # pixels; below that a thread costs more than it saves
 _BLOCK = 4  # tiles; a block of 64 x 64 pixels is culled first
-_HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 
 
 def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig) -> Regression:
@@ -77,39 +76,11 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
     out = torch.empty(points.shape[:2], dtype=points.dtype)
     out_f = torch.empty(*points.shape[:2], mixture.features.shape[2], dtype=points.dtype)
     fields = (mixture.mean, mixture.covariance, mixture.weight, mixture.disagreement, mixture.features)
-    _at_points(
+    at_points(
         points.detach().contiguous().numpy(), *(value.detach().double().contiguous().numpy() for value in fields),
         config.prior_weight, config.prior_mean, EPSILON[points.dtype], out.numpy(), out_f.numpy(),
     )  # fmt: skip
     return Regression(out, out_f)
-
-
-@compiled
-def _at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
-    for b in range(points.shape[0]):
-        index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
-        limit = math.log(epsilon * prior_weight / max(index.size, 1))
-        sums = np.zeros(features.shape[2])
-        for p in range(points.shape[1]):
-            x, y, z = np.float64(points[b, p, 0]), np.float64(points[b, p, 1]), np.float64(points[b, p, 2])
-            evidence, total = prior_weight, prior_weight * prior_mean
-            sums[:] = 0
-            for j in range(index.size):
-                k, W = index[j], whitening[j]
-                dx, dy, dz = x - mean[b, k, 0], y - mean[b, k, 1], z - mean[b, k, 2]
-                y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
-                exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
-                if exponent < limit:
-                    continue
-                w = math.exp(exponent)  # NaN comes through, for points that are not finite
-                evidence += w
-                total += w * m[b, k]
-                for g in range(sums.size):
-                    sums[g] += w * features[b, k, g]
-            known = x + y + z
-            out[b, p] = total / evidence if known - known == 0 else np.nan
-            for g in range(sums.size):
-                out_f[b, p, g] = sums[g] / evidence if known - known == 0 else np.nan
 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
@@ -147,28 +118,6 @@ def _share_out(kernel: Any, *arguments: Any) -> None:
         kernel(*arguments, 0, shares)
         for other in others:
             other.result()
-
-
-@compiled
-def _prepare(mean, covariance, weight):
-    """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
-    index = np.flatnonzero(weight > 0)
-    whitening = np.empty((index.size, 6))
-    log_peak = np.empty(index.size)
-    for i in range(index.size):
-        S = covariance[index[i]]
-        least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # fusion keeps pivots far above it
-        l00 = math.sqrt(max(S[0, 0], least))
-        l10, l20 = S[1, 0] / l00, S[2, 0] / l00
-        l11 = math.sqrt(max(S[1, 1] - l10 * l10, least))
-        l21 = (S[2, 1] - l20 * l10) / l11
-        l22 = math.sqrt(max(S[2, 2] - l20 * l20 - l21 * l21, least))
-        whitening[i, 0] = 1 / l00
-        whitening[i, 1], whitening[i, 2] = -l10 / (l00 * l11), 1 / l11
-        whitening[i, 4], whitening[i, 5] = -l21 / (l11 * l22), 1 / l22
-        whitening[i, 3] = -(l20 * whitening[i, 0] + l21 * whitening[i, 1]) / l22
-        log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - _HALF_LOG_TWO_PI_CUBED
-    return index, whitening, log_peak
 
 
 @compiled
@@ -362,7 +311,7 @@ def _exact(
     side = _TILE * _BLOCK
     rows, columns = (height + side - 1) // side, (width + side - 1) // side
     for b in range(depth.shape[0]):
-        index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
+        index, whitening, log_peak = prepare(mean[b], covariance[b], weight[b])
         local = np.hstack((mean[b][index], whitening))
         components = np.arange(index.size)
         for block in range(first, rows * columns, shares):
@@ -428,7 +377,7 @@ def _neighbourhood(
 ):  # fmt: skip
     """All streams; of their rows every ``shares``-th, from ``first`` on."""
     for b in range(depth.shape[0]):
-        index, whitening, log_peak = _prepare(mean[b], covariance[b], weight[b])
+        index, whitening, log_peak = prepare(mean[b], covariance[b], weight[b])
         local = np.hstack((mean[b][index], whitening))
         extent = np.empty((index.size, 3))
         for k in range(index.size):

@@ -1,0 +1,145 @@
+"""Gaussian mixture regression at points of any kind on the CPU (numba), the exact sum with culling that costs no bit.
+
+A component is left out at a point where it would add less than eps pi_0 / K to the denominator. Outside of an
+axis-aligned box around its mean that is so everywhere: points are sorted by place, and each handful of neighbours
+looks only at the components whose boxes meet its own.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+compiled: Any = njit(cache=True, nogil=True)
+
+_LEAF = 16  # points; below that choosing components costs more than it saves
+_HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
+
+
+@compiled
+def prepare(mean, covariance, weight):
+    """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
+    index = np.flatnonzero(weight > 0)
+    whitening = np.empty((index.size, 6))
+    log_peak = np.empty(index.size)
+    for i in range(index.size):
+        S = covariance[index[i]]
+        least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # fusion keeps pivots far above it
+        l00 = math.sqrt(max(S[0, 0], least))
+        l10, l20 = S[1, 0] / l00, S[2, 0] / l00
+        l11 = math.sqrt(max(S[1, 1] - l10 * l10, least))
+        l21 = (S[2, 1] - l20 * l10) / l11
+        l22 = math.sqrt(max(S[2, 2] - l20 * l20 - l21 * l21, least))
+        whitening[i, 0] = 1 / l00
+        whitening[i, 1], whitening[i, 2] = -l10 / (l00 * l11), 1 / l11
+        whitening[i, 4], whitening[i, 5] = -l21 / (l11 * l22), 1 / l22
+        whitening[i, 3] = -(l20 * whitening[i, 0] + l21 * whitening[i, 1]) / l22
+        log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - _HALF_LOG_TWO_PI_CUBED
+    return index, whitening, log_peak
+
+
+@compiled
+def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
+    """Regress m [B, K] and features [B, K, F] at points [B, P, 3] into out [B, P] and out_f [B, P, F]; NaN where a
+    point is not finite."""
+    for b in range(points.shape[0]):
+        index, whitening, log_peak = prepare(mean[b], covariance[b], weight[b])
+        limit = math.log(epsilon * prior_weight / max(index.size, 1))
+        boxes = _boxes(mean[b], covariance[b], index, log_peak, limit)
+        everyone = np.arange(points.shape[1])
+        near = _touched(points[b], everyone, np.arange(index.size), boxes)
+        order, leaf = _by_place(points[b], everyone, near.size)
+        sums = np.zeros(features.shape[2])
+        for first in range(0, order.size, leaf):
+            kept = _touched(points[b], order[first : first + leaf], near, boxes)
+            for p in order[first : first + leaf]:
+                x, y, z = np.float64(points[b, p, 0]), np.float64(points[b, p, 1]), np.float64(points[b, p, 2])
+                evidence, total = prior_weight, prior_weight * prior_mean
+                sums[:] = 0
+                for j in kept:
+                    k, W = index[j], whitening[j]
+                    dx, dy, dz = x - mean[b, k, 0], y - mean[b, k, 1], z - mean[b, k, 2]
+                    y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
+                    exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
+                    if exponent < limit:
+                        continue
+                    w = math.exp(exponent)
+                    evidence += w
+                    total += w * m[b, k]
+                    for g in range(sums.size):
+                        sums[g] += w * features[b, k, g]
+                known = x + y + z
+                out[b, p] = total / evidence if known - known == 0 else np.nan
+                for g in range(sums.size):
+                    out_f[b, p, g] = sums[g] / evidence if known - known == 0 else np.nan
+
+
+@compiled
+def _boxes(mean, covariance, index, log_peak, limit):
+    """Per component the box [2, 3] (least and greatest corner) outside of which it adds less than ``limit``.
+
+    log_peak - q/2 >= limit is an ellipsoid q <= r^2, which spans r sqrt(Sigma_ii) along axis i. The boxes are a
+    millionth larger, far more than the rounding of q: culling by them changes no bit of the result. A component whose
+    peak is too low has an empty box.
+    """
+    boxes = np.empty((index.size, 2, 3))
+    for j in range(index.size):
+        S, square = covariance[index[j]], 2 * (log_peak[j] - limit)
+        least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # as in prepare
+        for i in range(3):
+            half = math.sqrt(square * (S[i, i] + least)) * (1 + 1e-6) if square >= 0 else -np.inf
+            boxes[j, 0, i], boxes[j, 1, i] = mean[index[j], i] - half, mean[index[j], i] + half
+    return boxes
+
+
+@compiled
+def _touched(points, chosen, candidates, boxes):
+    """Those candidates, in their order, whose box meets the bounding box of the chosen points."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for p in chosen:
+        for i in range(3):
+            value = np.float64(points[p, i])
+            if value - value == 0:
+                low[i], high[i] = min(low[i], value), max(high[i], value)
+    kept = np.empty(candidates.size, np.int64)
+    n = 0
+    for j in candidates:
+        x = boxes[j, 0, 0] <= high[0] and low[0] <= boxes[j, 1, 0]
+        y = boxes[j, 0, 1] <= high[1] and low[1] <= boxes[j, 1, 1]
+        if x and y and boxes[j, 0, 2] <= high[2] and low[2] <= boxes[j, 1, 2]:
+            kept[n] = j
+            n += 1
+    return kept[:n]
+
+
+@compiled
+def _by_place(points, everyone, components):
+    """Points in the order of a k-d tree, and how many of them, next to each other, make a leaf.
+
+    The more components there are, the more a leaf's own selection of them saves; a level of the tree costs a
+    point about as much as some tens of components.
+    """
+    order, leaf = everyone.copy(), max(everyone.size, 1)
+    levels = min(6, components // 64)
+    while levels > 0 and leaf > _LEAF:
+        levels -= 1
+        for first in range(0, order.size, leaf):
+            part = order[first : first + leaf].copy()
+            widest, axis = -1.0, 0
+            for i in range(3):
+                low, high = np.inf, -np.inf
+                for p in part:
+                    value = np.float64(points[p, i])
+                    if value - value == 0:
+                        low, high = min(low, value), max(high, value)
+                if high - low > widest:
+                    widest, axis = high - low, i
+            keys = np.empty(part.size)
+            for n in range(part.size):
+                keys[n] = points[part[n], axis]
+            order[first : first + leaf] = part[np.argsort(keys)]
+        leaf = (leaf + 1) // 2
+    return order, leaf
