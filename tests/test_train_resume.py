@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -142,6 +143,25 @@ def test_a_finished_member_is_not_trained_again(frames, tmp_path):
     assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
 
 
+def test_sigterm_reaches_who_asks_for_the_stop(frames, tmp_path):
+    """Lightning's own handler would end the program with success, without weights and without a result."""
+    received = []
+
+    def asked():
+        if (tmp_path / "out" / "member_0" / STEPS).exists() and not received:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return bool(received)
+
+    before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
+    try:
+        summary = fit(tiny_job(frames, tmp_path / "out"), asked=asked)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert received == [signal.SIGTERM]
+    assert summary["stopped"] == "stopped"
+    assert summary["members"][0]["steps"] in (1, 2)
+
+
 # ---- what must not be lost ----
 
 
@@ -213,7 +233,9 @@ def test_a_folder_in_use_is_refused(frames, tmp_path):
     from ufmstar_torch.train.folder import open_folder
 
     job = tiny_job(frames, tmp_path / "out")
-    with open_folder(job), pytest.raises(FolderError, match="another training is writing there"), open_folder(
-        job, resume=True
+    with (
+        open_folder(job),
+        pytest.raises(FolderError, match="another training is writing there"),
+        open_folder(job, resume=True),
     ):
         pass

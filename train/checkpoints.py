@@ -10,6 +10,8 @@ numbers, nor a progress bar, nor another number of workers, can change what a co
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 import zipfile
 from collections.abc import Callable
@@ -100,6 +102,13 @@ class Stops(pl.Callback):
         self.deadline = deadline
         self.asked = asked
         self.reason: str | None = None
+        self._sigterm = signal.getsignal(signal.SIGTERM)
+
+    def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
+        """SIGTERM stays with who asks for the stop: Lightning has just put a handler of its own before it, which
+        ends the program with success and without a result."""
+        if self.asked is not None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self._sigterm)
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
         """All processes stop after the same step."""

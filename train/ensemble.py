@@ -70,9 +70,7 @@ def share_of_time(end: float | None, turns: int) -> float | None:
     return None if end is None else now + max(0.0, end - now) / turns
 
 
-def _side_by_side(
-    job: Job, members: Sequence[int], end: float | None, asked: Callable[[], bool] | None
-) -> str | None:
+def _side_by_side(job: Job, members: Sequence[int], end: float | None, asked: Callable[[], bool] | None) -> str | None:
     """Each member in a process of its own, on a GPU of its own where there are some."""
     context = get_context("spawn")
     count = min(job.settings.member_processes, len(members))
