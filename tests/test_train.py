@@ -16,7 +16,9 @@ from torch import nn
 from trainings import RECIPE, SPEC, tiny_job, with_network, write_frames
 
 from ufmstar_torch import cli
+from ufmstar_torch.models.batch_layer import BatchLayer
 from ufmstar_torch.models.checkpoints import CheckpointError, read_safetensors
+from ufmstar_torch.models.monodepth2 import MonodepthResNet
 from ufmstar_torch.models.spec import NetworkSpec, build_network
 from ufmstar_torch.models.trained import load_trained, read_info, save_trained
 from ufmstar_torch.prediction import DepthPrediction
@@ -362,6 +364,57 @@ def test_a_trained_file_is_a_start(tmp_path):
         starting_network(replace(SPEC, widths=0.1), path)
     with pytest.raises(FileNotFoundError):
         starting_network(SPEC, tmp_path / "none.safetensors")
+
+
+def test_an_aleatoric_start_of_mc_dropout_keeps_its_head(tmp_path):
+    path = tmp_path / "start.safetensors"
+    network = build_network(SPEC)
+    save_trained(path, network, SPEC)
+    started = starting_network(replace(SPEC, method="mc_dropout", dropout=0.2), path)
+    assert all(torch.equal(started.state_dict()[key], value) for key, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("architecture", ["fastdepth", "monodepth2"])
+def test_a_batch_ensemble_starts_from_weights_and_near_them(tmp_path, architecture):
+    plain = SPEC if architecture == "fastdepth" else NetworkSpec("monodepth2", layers=18, strides="v1", size=(64, 64))
+    path = tmp_path / ("start.safetensors" if architecture == "fastdepth" else "resnet.pth")
+    torch.manual_seed(0)
+    source = build_network(plain)
+    if architecture == "fastdepth":
+        save_trained(path, source, plain)
+    else:
+        torch.save(source.backbone.encoder.state_dict(), path)
+    torch.manual_seed(1)
+    network = starting_network(replace(plain, method="batch_ensemble", members=3), path)
+    layers = {name: layer for name, layer in network.network.named_modules() if isinstance(layer, BatchLayer)}
+    part = "backbone." if architecture == "fastdepth" else "backbone.encoder."
+    filled = {name: layer for name, layer in layers.items() if name.startswith(part)}
+    assert len(filled) > 15
+    for name, layer in filled.items():
+        assert torch.equal(layer.shared.weight, source.get_submodule(name).weight), name
+    factors = torch.cat([factor.detach().flatten() for factor in network.factors()])
+    assert factors.mean().item() == pytest.approx(1, abs=0.02)
+    assert 0.05 < factors.std().item() < 0.15
+
+
+@pytest.mark.parametrize(("held", "wanted"), [(18, 34), (34, 18)])
+def test_a_monodepth2_of_another_resnet_is_refused(tmp_path, held, wanted):
+    """Many of its tensors have the same names and shapes."""
+    network = MonodepthResNet(held)
+    torch.save(
+        {f"encoder.{key}": value for key, value in network.encoder.state_dict().items()}, tmp_path / "encoder.pth"
+    )
+    decoder = {
+        f"decoder.{2 * (4 - i) + n}.conv.conv.{kind}": getattr(getattr(level, part), kind)
+        for i, level in enumerate(network.levels)
+        for n, part in enumerate(("before", "after"))
+        for kind in ("weight", "bias")
+    }
+    torch.save(decoder, tmp_path / "depth.pth")
+    started = starting_network(NetworkSpec("monodepth2", layers=held), tmp_path)
+    assert torch.equal(started.backbone.levels[4].before.weight, network.levels[4].before.weight)
+    with pytest.raises(ValueError, match=rf"does not hold a ResNet{wanted}: .* another --network\.layers may"):
+        starting_network(NetworkSpec("monodepth2", layers=wanted), tmp_path)
 
 
 def test_a_start_that_does_not_fit_is_refused(tmp_path):

@@ -14,6 +14,10 @@ from ufmstar_torch.models.spec import NetworkSpec, build_backbone, build_network
 from ufmstar_torch.models.trained import read_info
 
 IMAGENET = "imagenet"
+# [1] Spread of a BatchEnsemble's factors around pretrained weights. With .5, that of a start from nothing, FastDepth's
+# published network errs by 63 % of the depth instead of 28 % before the first step (HoloLens frames, batch
+# statistics), with .1 by 33 %; its members still differ by half a metre.
+PRETRAINED_STD = 0.1
 WAYS = f"trained .safetensors, FastDepth's .onnx, ResNet weights (.pth, or {IMAGENET!r}), or Monodepth2's folder"
 
 
@@ -22,10 +26,10 @@ def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> D
 
     Args:
         spec: what to build.
-        init: None, or one of: a file that this program trained (the same method: all of it; another one: its
-            encoder and decoder, below a new head); FastDepth's weights as .onnx; the ImageNet weights of a ResNet in
-            torchvision's keys, or "imagenet", which torchvision downloads; the folder with Monodepth2's
-            encoder.pth and depth.pth.
+        init: None, or one of: a file that this program trained (the same method, or aleatoric and mc_dropout: all
+            of it; another one: its encoder and decoder, below a new head); FastDepth's weights as .onnx; the
+            ImageNet weights of a ResNet in torchvision's keys, or "imagenet", which torchvision downloads; the
+            folder with Monodepth2's encoder.pth and depth.pth of the same ResNet.
         member: number in an ensemble; of a trained ensemble it starts from the same member.
 
     Raises:
@@ -38,8 +42,8 @@ def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> D
     if init.suffix == ".safetensors" and _is_trained(init):
         return _from_trained(spec, init, member)
     if spec.architecture == "fastdepth":
-        return build_network(spec, _from_onnx(spec, init))
-    return build_network(spec, _from_resnet(spec, init))
+        return build_network(spec, _from_onnx(spec, init), std=PRETRAINED_STD)
+    return build_network(spec, _from_resnet(spec, init), std=PRETRAINED_STD)
 
 
 def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
@@ -76,11 +80,13 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
     state = {key: value.float() if value.is_floating_point() else value for key, value in state.items()}
     source = build_network(info.spec)
     fill(source, state, str(path))
-    own = replace(info.spec, size=spec.size, preprocess=spec.preprocess, dropout=spec.dropout, method=spec.method)
-    own = replace(own, members=spec.members)
+    shared = ("size", "preprocess", "dropout", "method", "members")
+    own = replace(info.spec, **{name: getattr(spec, name) for name in shared})
     if own != spec:
         raise ValueError(f"init: {path} holds {info.spec}, which does not fit {spec}")
-    if (info.spec.method, info.spec.members) == (spec.method, spec.members):
+    # "mc_dropout" is an aleatoric network that samples at test time.
+    trained, wanted = ("aleatoric" if m == "mc_dropout" else m for m in (info.spec.method, spec.method))
+    if (trained, info.spec.members) == (wanted, spec.members):
         network: DepthNetwork = build_network(spec)
         fill(network, source.state_dict(), str(path))
         return network
@@ -88,7 +94,7 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
         raise ValueError(f"init: {path} holds a batch_ensemble, whose backbone is not one network's")
     backbone = build_backbone(spec)
     fill(backbone, source.backbone.state_dict(), str(path))
-    return build_network(spec, backbone)
+    return build_network(spec, backbone, std=PRETRAINED_STD)
 
 
 def _from_onnx(spec: NetworkSpec, path: Path) -> Backbone:
@@ -112,7 +118,15 @@ def _from_resnet(spec: NetworkSpec, path: Path) -> Backbone:
     if not isinstance(backbone, MonodepthResNet):
         raise ValueError(f"init: {path} is no start for {spec.architecture}; expected {WAYS}")
     if path.is_dir():
-        load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
+        report = load_monodepth2(backbone, path / "encoder.pth", path / "depth.pth")
+        # Of another ResNet some tensors fit by chance, and the start would be one from nothing.
+        wrong = [key for key in report.kept if key.startswith("encoder.") and not key.endswith("num_batches_tracked")]
+        wrong += [key for key in report.skipped if key.startswith("encoder.") and not key.startswith("encoder.fc.")]
+        if wrong:
+            raise ValueError(
+                f"init: {path} does not hold a ResNet{spec.layers}: {len(wrong)} tensors of one do not fit the other, "
+                f"first {wrong[0]!r}; another --network.layers may"
+            )
         return backbone
     weights = None if str(path) == IMAGENET else path
     source = MonodepthResNet.imagenet(weights, spec.layers, strides=spec.strides)
