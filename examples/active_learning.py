@@ -64,7 +64,7 @@ class Settings:
     rounds: int = 2
     spacing: int = 4
     pixels: int = 1000
-    steps: int = 40
+    steps: int = 30
     batch: int = 4
     learning_rate: float = 3e-4
     strategies: tuple[str, ...] = STRATEGIES
