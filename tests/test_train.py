@@ -22,14 +22,16 @@ from ufmstar_torch.models.monodepth2 import MonodepthResNet
 from ufmstar_torch.models.spec import NetworkSpec, build_network
 from ufmstar_torch.models.trained import load_trained, read_info, save_trained
 from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.examples import camera_image
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.history import METRICS, read_rows
-from ufmstar_torch.train.member import WEIGHTS, make_data, new_network
+from ufmstar_torch.train.member import WEIGHTS, Job, make_data, new_network
 from ufmstar_torch.train.module import NonFiniteLossError, TrainingModule, move_average, share_of_rate, step_seed
 from ufmstar_torch.train.options import parse_train, recipe_from, train_parser
 from ufmstar_torch.train.presets import OURS, PRESETS, Recipe, preset, table
 from ufmstar_torch.train.progress import Sums, ValidationSums, constant_nll
+from ufmstar_torch.train.settings import FitSettings
 from ufmstar_torch.train.start import starting_network, train_only
 
 ONE_STEP = replace(RECIPE, max_steps=1)
@@ -115,6 +117,19 @@ def test_members_are_the_ensembles_or_the_batch_ensembles():
     assert preset("fastdepth-ensemble").with_members(3).members == 3
     recipe = preset("fastdepth-batch-ensemble").with_members(3)
     assert (recipe.members, recipe.network.members) == (1, 3)
+
+
+def test_ensembles_of_different_seeds_share_no_member(tmp_path):
+    job = Job(preset("demo"), DataConfig(kind="tour"), FitSettings(out=tmp_path))
+    jobs = [replace(job, settings=replace(job.settings, seed=seed)) for seed in range(3)]
+    assert len({j.seed(member) for j in jobs for member in range(1000)}) == 3 * 1000
+    assert [job.seed(member) for member in range(10)] == list(range(10))
+    # Weights come from the seed: the second member of one is not the first of the next.
+    second, first = new_network(jobs[0], 1), new_network(jobs[1], 0)
+    key = "backbone.encoder.0.conv.weight"
+    assert not torch.equal(second.state_dict()[key], first.state_dict()[key])
+    with pytest.raises(ValueError, match=r"Recipe\.members must be in \[1, 1000\]"):
+        Recipe(members=1001)
 
 
 # ---- arithmetic ----

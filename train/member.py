@@ -22,7 +22,7 @@ from ufmstar_torch.train.data import DataConfig, DepthDataModule
 from ufmstar_torch.train.examples import Examples
 from ufmstar_torch.train.history import METRICS, History, Start, read_rows
 from ufmstar_torch.train.module import TrainingModule, step_seed
-from ufmstar_torch.train.presets import Recipe
+from ufmstar_torch.train.presets import MOST_MEMBERS, Recipe
 from ufmstar_torch.train.settings import FitSettings
 from ufmstar_torch.train.start import starting_network, train_only
 
@@ -49,8 +49,12 @@ class Job:
         return self.settings.out / f"member_{member}"
 
     def seed(self, member: int) -> int:
-        """Of a member's first weights, order of samples, augmentation and dropout."""
-        return self.settings.seed + member
+        """Of a member's first weights, order of samples, augmentation and dropout.
+
+        Two trainings with different seeds share none: seed + member would give seeds 0 and 1 nine of ten members in
+        common.
+        """
+        return self.settings.seed * MOST_MEMBERS + member
 
 
 def new_network(job: Job, member: int) -> DepthNetwork:

@@ -28,7 +28,7 @@ KINDS = ("nyu", "sequences", "tour")
 # Fields that other options or the recipe fill in.
 _TAKEN = ("kind", "paths", "batch_size", "seed", "augmentation")
 _SETTINGS_HELP = {
-    "seed": "of member 0; member n has seed + n",
+    "seed": "of the training; member n has 1000 seed + n, so that trainings with different seeds share none",
     "init": "weights to start from: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth or the word imagenet",
     "trainable": "train only parameters whose names begin so",
     "accelerator": "cpu, gpu or auto",

@@ -21,6 +21,8 @@ OURS: dict[str, dict[str, Any]] = {
     "fastdepth": {"learning_rate": 1e-3, "batch_size": 8, "schedule": "cosine"},
 }
 SCHEDULES = ("cosine", "constant")
+# Of an ensemble; seeds of two trainings lie that far apart (``train.member.Job.seed``).
+MOST_MEMBERS = 1000
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class Recipe:
 
 # Field -> smallest and largest value, and whether each is allowed itself.
 _RANGES: dict[str, tuple[float, float, str]] = {
-    "members": (1, 1000, "[]"),
+    "members": (1, MOST_MEMBERS, "[]"),
     "epochs": (1, 1e6, "[]"),
     "max_steps": (0, 1e9, "[]"),
     "batch_size": (1, 1e5, "[]"),

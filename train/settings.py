@@ -10,7 +10,7 @@ from pathlib import Path
 class FitSettings:
     """Attributes:
         out: folder for everything that is written.
-        seed: of member 0; member n has seed + n.
+        seed: of the training; member n has 1000 seed + n, so that trainings with different seeds share none.
         init: weights to start from, or None; see ``train.start.starting_network``.
         trainable: only parameters whose names begin so are trained; empty = all of them.
         accelerator, devices, nodes, strategy, precision: as Lightning's Trainer takes them; of the strategies,
