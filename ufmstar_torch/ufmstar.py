@@ -199,7 +199,7 @@ class UfMStar(nn.Module):
         average: bool = False,
     ) -> MeanUncertainty:
         """Like :meth:`forward`, but regress only a seeded sample of pixels: an average per image for
-        active learning at a fraction of the cost (section "Compute- and memory efficiency").
+        active learning (section "Compute- and memory efficiency"); only the regression gets cheaper with fewer pixels.
 
         Args:
             pixels: size of the sample per image; or
