@@ -19,7 +19,8 @@ class EpochBatches(Sampler[list[SampleKey]]):
     ``world * batch_size`` among them, so that together they take the steps of one process with that batch
     size; what is left at the end of the order and fills no batch is left out in that epoch. Validation:
     everything once, in order, process ``rank`` takes every ``world``-th frame; processes may then have
-    unequal numbers of batches, or none.
+    unequal numbers of batches. One without any frame gets the last one, as a sample that does not count: the
+    first validation batch after a training step synchronises the processes, so each must have one.
 
     ``len`` is the number of batches in the whole epoch, also where iteration starts inside it.
 
@@ -60,17 +61,20 @@ class EpochBatches(Sampler[list[SampleKey]]):
     def __len__(self) -> int:
         if self.shuffle:
             return self.length // (self.batch_size * self.world)
-        mine = len(range(self.rank, self.length, self.world))
-        return -(-mine // self.batch_size)
+        return -(-len(self._order()) // self.batch_size)
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, order = self.epoch, self._order()
         for batch in range(self.start_batch, len(self)):
-            yield [SampleKey(epoch, int(frame)) for frame in self._batch(order, batch)]
+            yield [SampleKey(epoch, int(frame), self._counts()) for frame in self._batch(order, batch)]
+
+    def _counts(self) -> bool:
+        """Whether this process has frames of its own."""
+        return self.shuffle or self.rank < self.length
 
     def _order(self) -> np.ndarray:
         if not self.shuffle:
-            return np.arange(self.rank, self.length, self.world)
+            return np.arange(min(self.rank, self.length - 1), self.length, self.world)
         return np.random.default_rng((self.seed, self.epoch)).permutation(self.length)
 
     def _batch(self, order: np.ndarray, batch: int) -> np.ndarray:

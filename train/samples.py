@@ -48,10 +48,11 @@ class Sample(TypedDict):
 
 class SampleKey(NamedTuple):
     """Which frame in which epoch: what a sampler yields, so that augmentation differs between epochs and is
-    the same for any number of workers."""
+    the same for any number of workers. ``counts``: otherwise no pixel of the sample is valid."""
 
     epoch: int
     frame: int
+    counts: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,12 +135,12 @@ class SampleDataset(Dataset[Sample]):
             IndexError: no such frame.
             SampleError: a broken file with ``on_bad_file="raise"``, or none that can be read.
         """
-        epoch, index = key if isinstance(key, tuple) else SampleKey(0, key)
+        epoch, index, counts = SampleKey(*key) if isinstance(key, tuple) else SampleKey(0, key)
         if not 0 <= index < len(self):
             raise IndexError(f"index must lie in [0, {len(self)}), got {index}")
         raw, found = self._readable(index)
         sample = make_sample(raw, self.preprocess, self.augmentation, (self.seed, epoch, index))
-        if self.evaluate and found != index:
+        if not counts or (self.evaluate and found != index):
             sample["valid"] = torch.zeros_like(sample["valid"])
         return sample
 
