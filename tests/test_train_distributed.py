@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import os
+import signal
+import socket
 import subprocess
 import sys
+import textwrap
+import time
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+import torch.distributed as dist
 from trainings import RECIPE, tiny_job, with_network, write_frames
 
+from ufmstar_torch.eval.run_folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train.ensemble import share_of_time
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.history import METRICS, STEPS, read_rows
+from ufmstar_torch.train.launch import prepared_by_first
 from ufmstar_torch.train.member import WEIGHTS, make_data
 from ufmstar_torch.train.settings import FitSettings
 
@@ -46,8 +56,15 @@ def losses(out):
     return [float(row["train_loss"]) for row in read_rows(out / "member_0" / STEPS)]
 
 
-def test_two_processes_give_the_losses_of_one(frames, tmp_path):
-    fit(tiny_job(frames, tmp_path / "one", PLAIN))
+@pytest.fixture(scope="module")
+def alone(frames, tmp_path_factory):
+    """The folder of a training by one process. Nobody may change it."""
+    out = tmp_path_factory.mktemp("alone") / "one"
+    fit(tiny_job(frames, out, PLAIN))
+    return out
+
+
+def test_two_processes_give_the_losses_of_one(frames, alone, tmp_path):
     job = tiny_job(frames, tmp_path / "two", PLAIN)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
@@ -55,13 +72,133 @@ def test_two_processes_give_the_losses_of_one(frames, tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(losses(tmp_path / "two")) == 3
-    assert losses(tmp_path / "two") == pytest.approx(losses(tmp_path / "one"), abs=1e-6)
-    mine, theirs = (read_safetensors(tmp_path / name / "member_0" / WEIGHTS)[0] for name in ("two", "one"))
+    assert losses(tmp_path / "two") == pytest.approx(losses(alone), abs=1e-6)
+    mine, theirs = (read_safetensors(out / "member_0" / WEIGHTS)[0] for out in (tmp_path / "two", alone))
     for name, value in theirs.items():
         torch.testing.assert_close(mine[name], value, atol=2e-5, rtol=0, msg=name)
-    validations = [read_rows(tmp_path / name / "member_0" / METRICS)[-1] for name in ("two", "one")]
+    validations = [read_rows(out / "member_0" / METRICS)[-1] for out in (tmp_path / "two", alone)]
     for name in ("train_loss", "val_nll", "val_nll_constant", "val_nll_constant_best", "val_rmse", "val_delta1"):
         assert float(validations[0][name]) == pytest.approx(float(validations[1][name]), abs=2e-4), name
+
+
+def free_port():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+def start(frames, out, here, settings, environment):
+    """A process that trains as PLAIN says, over what is in ``out``; it leaves the file ``here`` when it begins."""
+    code = f"""
+        import sys
+        from pathlib import Path
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from trainings import tiny_job
+        from ufmstar_torch.train.fit import fit
+        from test_train_distributed import PLAIN
+        job = tiny_job({str(frames)!r}, Path({str(out)!r}), PLAIN, strategy="ddp", **{settings!r})
+        Path({str(here)!r}).touch()
+        fit(job, overwrite=True)
+    """
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", **environment}
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)], stderr=subprocess.PIPE, text=True, env=environment
+    )
+
+
+def as_torchrun(rank):
+    return {"TORCHELASTIC_RUN_ID": "none", "WORLD_SIZE": "2", "RANK": str(rank), "LOCAL_RANK": str(rank)}
+
+
+def as_two_computers(rank):
+    return {"NODE_RANK": str(rank)}
+
+
+@pytest.mark.parametrize(
+    ("launch", "settings"), [(as_torchrun, {"devices": 2}), (as_two_computers, {"devices": 1, "nodes": 2})]
+)
+def test_the_second_process_may_come_first(frames, alone, tmp_path, launch, settings):
+    """It must not see what an earlier training left."""
+    out = tmp_path / "out"
+    fit(tiny_job(frames, out, replace(PLAIN, max_steps=2, learning_rate=0.1)))
+    port = {"MASTER_PORT": str(free_port())}
+    processes = []
+    try:
+        processes.append(start(frames, out, tmp_path / "here", settings, {**launch(1), **port}))
+        end = time.monotonic() + 250
+        while not (tmp_path / "here").exists() and time.monotonic() < end:
+            time.sleep(0.1)
+        time.sleep(2)
+        processes.append(start(frames, out, tmp_path / "there", settings, {**launch(0), **port}))
+        told = [process.communicate(timeout=250)[1] for process in reversed(processes)]
+    finally:
+        for process in processes:
+            process.kill()
+    assert [process.returncode for process in processes] == [0, 0], told
+    assert losses(out) == pytest.approx(losses(alone), abs=1e-6)
+
+
+@pytest.fixture
+def meeting(monkeypatch):
+    """Makes what a trainer of a process of two knows; their store is already there, as torchrun's is."""
+    store = dist.TCPStore("127.0.0.1", 0, None, True, wait_for_workers=False)
+    monkeypatch.setenv("MASTER_PORT", str(store.port))
+    monkeypatch.setenv("TORCHELASTIC_USE_AGENT_STORE", "True")
+    environment = SimpleNamespace(main_address="127.0.0.1", main_port=store.port, keep=store)
+
+    def trainer(rank):
+        strategy = SimpleNamespace(cluster_environment=environment)
+        return SimpleNamespace(world_size=2, global_rank=rank, is_global_zero=rank == 0, strategy=strategy)
+
+    return trainer
+
+
+def test_every_training_waits_for_its_own_preparation(meeting, tmp_path):
+    for _ in range(2):
+        with (
+            pytest.raises(FolderError, match=r"process 1 of 2 has waited 0\.1 s for the first"),
+            prepared_by_first(nullcontext(), meeting(1), tmp_path, wait=0.1),
+        ):
+            pass
+        with prepared_by_first(nullcontext(), meeting(0), tmp_path, wait=10):
+            pass
+
+
+def test_all_processes_end_where_the_first_cannot_prepare(meeting, tmp_path):
+    @contextmanager
+    def refused():
+        raise FolderError("holds an earlier training")
+        yield
+
+    with pytest.raises(FolderError, match=r"^holds"), prepared_by_first(refused(), meeting(0), tmp_path, wait=10):
+        pass
+    told = "^the first process could not prepare the folder: holds an earlier training"
+    with pytest.raises(FolderError, match=told), prepared_by_first(refused(), meeting(1), tmp_path, wait=10):
+        pass
+    # Each computer with a disk of its own.
+    with prepared_by_first(nullcontext(), meeting(0), tmp_path, wait=10):
+        pass
+    other = prepared_by_first(nullcontext(), meeting(1), tmp_path / "nowhere", wait=10)
+    with pytest.raises(FolderError, match="all machines must see the folder"), other:
+        pass
+
+
+def test_one_validation_frame_for_two_processes(frames, tmp_path):
+    """With batch norm, whose statistics DistributedDataParallel sends around in the first validation batch."""
+    job = tiny_job(frames, tmp_path / "out", replace(PLAIN, max_steps=2))
+    job = replace(job, data=replace(job.data, validation_part="12:13"))
+    words = [*command(job), "--max-steps", "2", "--network.norm", "true", "--debug"]
+    process = subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=tmp_path, start_new_session=True
+    )
+    try:
+        told = process.communicate(timeout=250)[0]
+    finally:
+        # Its process group, where one waits for the other.
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode == 0, told
+    assert float(read_rows(tmp_path / "out" / "member_0" / METRICS)[-1]["val_rmse"]) > 0
 
 
 def test_the_processes_above_had_unequal_numbers_of_valid_pixels(frames, tmp_path):

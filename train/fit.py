@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict
 from typing import Any
 
 import torch
-from lightning.pytorch.utilities import rank_zero_only
 
 from ufmstar_torch.eval.benchmark_machine import hardware, versions
 from ufmstar_torch.eval.files import write_json_atomic
 from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.ensemble import read_result, stored_network, train_members
 from ufmstar_torch.train.folder import SUMMARY, open_folder
-from ufmstar_torch.train.member import WEIGHTS, Job
+from ufmstar_torch.train.launch import prepared_by_first
+from ufmstar_torch.train.member import WEIGHTS, Job, make_trainer, quiet_lightning
 
 # Figures that describe a validation, in metrics.csv's names.
 FIGURES = ("val_nll", "val_nll_constant", "val_nll_constant_best", "val_delta1", "val_rmse", "val_rel")
@@ -48,9 +47,11 @@ def fit(
     """
     began = time.monotonic()
     end = began + 60 * job.settings.max_minutes if job.settings.max_minutes else None
-    # Other processes of a distributed training find the folder prepared by the first.
-    first = rank_zero_only.rank == 0
-    folder = open_folder(job, resume=resume, overwrite=overwrite) if first else nullcontext()
+    # Of several processes, a trainer knows which is the first, whoever started them.
+    with quiet_lightning():
+        trainer = make_trainer(job, 0)
+    first = trainer.is_global_zero
+    folder = prepared_by_first(open_folder(job, resume=resume, overwrite=overwrite), trainer, job.settings.out)
     with folder, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
         stopped: str | None = "failed"
         try:

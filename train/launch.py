@@ -1,0 +1,98 @@
+"""Several processes that train together: the first prepares the folder, the others wait until it has.
+
+A launcher (torchrun, SLURM, one command per computer) starts processes in any order, and their process group exists
+only once Lightning trains. Until then they meet at the store of torch.distributed's rendezvous. It belongs to this
+launch, so that nothing an earlier one left can be mistaken for the first process's word.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import cast
+
+import lightning.pytorch as pl
+import torch.distributed as dist
+from lightning.pytorch.strategies import ParallelStrategy
+
+from ufmstar_torch.eval.run_folder import FolderError
+
+# Longer than the processes of a launch are apart, also where machines are handed out one after another.
+WAIT_SECONDS = 600.0
+_READY = "ready"
+
+
+@contextmanager
+def prepared_by_first(
+    prepare: AbstractContextManager[None], trainer: pl.Trainer, out: Path, *, wait: float = WAIT_SECONDS
+) -> Iterator[None]:
+    """Within this, the first process is within ``prepare``, and the others are after its beginning.
+
+    Args:
+        prepare: entered by the first process alone.
+        trainer: knows how many processes there are, and where they meet.
+        out: the folder that is prepared, for messages.
+        wait: longest time [s] that the others wait.
+
+    Raises:
+        FolderError: the first process could not prepare the folder, or the others have waited in vain.
+        OSError: from ``prepare``.
+    """
+    first = trainer.is_global_zero
+    # The first process holds the store up to the end: it serves the others.
+    try:
+        store = _meet(trainer, wait) if trainer.world_size > 1 else None
+        key = "" if store is None else _key(store, trainer.global_rank)
+        if store is not None and not first:
+            store.wait([key], timedelta(seconds=wait))
+    except dist.DistError as error:
+        raise FolderError(
+            f"--out {out}: process {trainer.global_rank} of {trainer.world_size} has waited {wait:g} s for the first "
+            f"process to prepare it ({str(error).splitlines()[0]}); was it started, and with the same MASTER_ADDR and "
+            "MASTER_PORT?"
+        ) from error
+    with ExitStack() as held:
+        if first:
+            told = "the first process was interrupted"
+            try:
+                held.enter_context(prepare)
+                told = _READY
+            except (OSError, ValueError) as error:
+                told = str(error)
+                raise
+            finally:
+                if store is not None:
+                    store.set(key, told)
+        elif store is not None and (told := store.get(key).decode()) != _READY:
+            raise FolderError(f"the first process could not prepare the folder: {told}")
+        elif not out.is_dir():
+            raise FolderError(f"--out {out} is not there: all machines must see the folder of the first process")
+        yield
+
+
+def _meet(trainer: pl.Trainer, wait: float) -> dist.TCPStore:
+    """The store where process group and this meet: torchrun's own, or else one that the first process opens."""
+    environment = cast(ParallelStrategy, trainer.strategy).cluster_environment
+    if environment is None:
+        raise ValueError(f"{type(trainer.strategy).__name__} says of no environment where its processes meet")
+    # A port that Lightning has chosen for this launch: what it starts later, and its process group, take the same.
+    os.environ.setdefault("MASTER_PORT", str(environment.main_port))
+    served = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == str(True)
+    return dist.TCPStore(
+        environment.main_address,
+        environment.main_port,
+        None,
+        trainer.is_global_zero and not served,
+        timedelta(seconds=wait),
+        wait_for_workers=False,
+        multi_tenant=not served,
+    )
+
+
+def _key(store: dist.Store, rank: int) -> str:
+    """Where the word stands: a new one for every restart by torchrun, and every training of the same processes."""
+    attempt = f"ufmstar/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}"
+    return f"{attempt}/prepared/{store.add(f'{attempt}/trainings/{rank}', 1)}"
