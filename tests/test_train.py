@@ -354,6 +354,24 @@ def test_training_leaves_torchs_random_numbers_alone(frames, tmp_path):
 # ---- starts ----
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--preset", "monodepth2-aleatoric"], True),
+        (["--preset", "monodepth2-aleatoric", "--init", "imagenet"], False),
+        (["--preset", "fastdepth-aleatoric"], False),
+    ],
+)
+def test_an_encoder_that_starts_from_nothing_is_told(ufmstar, frames, tmp_path, words, told):
+    (tmp_path / "x").write_text("nothing is trained: the folder is refused")
+    code, _, said = ufmstar("train", *words, "--data", "sequences", "--root", frames, "--out", tmp_path)
+    assert code == cli.FAILED
+    remark = (
+        "ufmstar train: the ResNet50 encoder starts from nothing; the paper's starts from ImageNet: --init imagenet"
+    )
+    assert said.splitlines()[:-1] == [remark] * told
+
+
 def test_members_start_with_weights_of_their_own_and_the_same_again(frames, tmp_path):
     job = tiny_job(frames, tmp_path / "out")
     key = "backbone.encoder.0.conv.weight"

@@ -46,6 +46,13 @@ def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> D
     return build_network(spec, _from_resnet(spec, init), std=PRETRAINED_STD)
 
 
+def missing_start(spec: NetworkSpec, init: Path | None) -> str | None:
+    """What to tell of a start that is not the paper's, or None."""
+    if spec.architecture != "monodepth2" or init is not None:
+        return None
+    return f"the ResNet{spec.layers} encoder starts from nothing; the paper's starts from ImageNet: --init {IMAGENET}"
+
+
 def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
     """Leave only the parameters whose names begin with one of ``prefixes`` to be trained, in place.
 

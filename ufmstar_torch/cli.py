@@ -103,8 +103,14 @@ def train(arguments: Sequence[str]) -> int:
         job = job_from(options)
     except (ArgumentError, ImportError, OSError, ValueError) as error:
         raise UsageError(_one_line(error)) from error
-    from ufmstar_torch.train.fit import fit, report
+    from lightning.pytorch.utilities import rank_zero_only
 
+    from ufmstar_torch.train.fit import fit, report
+    from ufmstar_torch.train.start import missing_start
+
+    remark = missing_start(job.recipe.network, job.settings.init)
+    if remark and rank_zero_only.rank == 0:
+        print(f"ufmstar train: {remark}", file=sys.stderr)
     how = {"resume": options["resume"], "overwrite": options["overwrite"]}
     try:
         with _stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
