@@ -198,9 +198,7 @@ def table(summary: Mapping[str, Any]) -> str:
         if summary["network_alone"] is not None:
             rows.append(("network alone", summary["network_alone"], uncertainty["mean_network_sigma"]))
         head = ["", *_COLUMNS.values(), "sigma [m]"]
-        body = [
-            [name, *(number(figures.get(key)) for key in _COLUMNS), number(sigma)] for name, figures, sigma in rows
-        ]
+        body = [[name, *(number(figures.get(key)) for key in _COLUMNS), number(sigma)] for name, figures, sigma in rows]
         lines += aligned([head, *body])
         if summary["network_alone"] is None:
             lines.append(f"network alone: no row, {summary['network_alone_reason']}")

@@ -32,6 +32,15 @@ from ufmstar_torch.train.settings import FitSettings
 PLAIN = replace(with_network(RECIPE, norm=False), epochs=1, learning_rate=0.002, clip=0.0)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Sums depend on how many threads share them, and the processes that are compared have one."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
     """A sequence. Nobody may change it."""

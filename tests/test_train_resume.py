@@ -26,6 +26,15 @@ from ufmstar_torch.train.member import RESULT, WEIGHTS
 DROPOUT = with_network(method="mc_dropout", dropout=0.2)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Sums depend on how many threads share them, and the processes that are compared have one."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
     """A sequence. Nobody may change it."""
@@ -71,6 +80,8 @@ def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninter
     code = f"""
         import os, signal, sys
         from pathlib import Path
+        import torch
+        torch.set_num_threads(1)
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from trainings import tiny_job
         from ufmstar_torch.train import fit as fit_module
