@@ -77,7 +77,7 @@ class Checkpoints(pl.Callback):
 
     def on_save_checkpoint(self, trainer: pl.Trainer, module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
         """The sampler's position."""
-        loop = trainer.fit_loop.epoch_loop
+        loop: Any = trainer.fit_loop.epoch_loop
         done = loop.batch_progress.current.processed
         ended = loop._num_ready_batches_reached()
         epoch = trainer.current_epoch

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 import numpy as np
@@ -13,7 +14,6 @@ from ufmstar_torch.eval.plots import FramePanel, contact_sheet, fit_scales, map_
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.data import DepthDataModule
-from ufmstar_torch.train.module import TrainingModule
 from ufmstar_torch.train.samples import Sample
 
 FOLDER = "examples"
@@ -38,7 +38,7 @@ class Examples(pl.Callback):
         self.last = epochs - 1
         self.every = max(1, epochs // PICTURES)
 
-    def on_validation_end(self, trainer: pl.Trainer, module: TrainingModule) -> None:
+    def on_validation_end(self, trainer: pl.Trainer, module: Any) -> None:
         """Draw, if it is this epoch's turn."""
         epoch = trainer.current_epoch
         due = epoch % self.every == 0 or epoch == self.last or trainer.should_stop

@@ -97,7 +97,7 @@ def mean_figures(results: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 def report(summary: dict[str, Any]) -> str:
     """The members' figures as a table."""
-    rows = [("member", "steps", "seconds", *FIGURES)]
+    rows: list[tuple[str, ...]] = [("member", "steps", "seconds", *FIGURES)]
     for result in summary["members"]:
         figures = [f"{result['figures'][name]:.4g}" if name in result["figures"] else "-" for name in FIGURES]
         rows.append((str(result["member"]), str(result["steps"]), f"{result['seconds']:g}", *figures))

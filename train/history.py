@@ -21,7 +21,6 @@ import lightning.pytorch as pl
 
 from ufmstar_torch.eval.files import write_atomic
 from ufmstar_torch.train.checkpoints import POSITION
-from ufmstar_torch.train.module import TrainingModule
 
 SECONDS = "ufmstar_seconds"
 METRICS, STEPS = "metrics.csv", "steps.csv"
@@ -91,7 +90,7 @@ class History(pl.Callback):
             row = {"train_loss": told.get("train_loss"), "learning_rate": told.get("learning_rate")}
             self._append(STEPS, STEP_COLUMNS, trainer, row)
 
-    def on_train_epoch_end(self, trainer: pl.Trainer, module: TrainingModule) -> None:
+    def on_train_epoch_end(self, trainer: pl.Trainer, module: Any) -> None:
         """A row of metrics.csv."""
         if trainer.is_global_zero:
             self._append(

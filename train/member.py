@@ -90,7 +90,7 @@ def train_member(
     stored = read_checkpoint(checkpoint) if checkpoint.is_file() else None
     history = History(folder, s.log_every, None if stored is None else Start.after(stored))
     with quiet_lightning():
-        trainer = make_trainer(job, member)
+        trainer: Any = make_trainer(job, member)
         data = make_data(job, member, trainer.world_size)
         total = total_steps(job, data)
         stops = Stops(total, deadline, asked)
@@ -145,12 +145,13 @@ def _steps_per_epoch(job: Job, data: DepthDataModule) -> int:
 def make_trainer(job: Job, member: int) -> pl.Trainer:
     """Lightning's trainer; nothing of it writes checkpoints but :class:`Checkpoints`."""
     r, s = job.recipe, job.settings
+    precision: Any = s.precision  # one of many literals, which Lightning checks
     return pl.Trainer(
         accelerator=("gpu" if torch.cuda.is_available() else "cpu") if s.accelerator == "auto" else s.accelerator,
         devices=s.devices,
         num_nodes=s.nodes,
         strategy=s.strategy,
-        precision=s.precision,
+        precision=precision,
         max_epochs=-1 if r.max_steps else r.epochs,
         max_steps=r.max_steps or -1,
         gradient_clip_val=r.clip or None,

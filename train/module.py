@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.train.losses import loss_sums
 from ufmstar_torch.train.presets import Recipe
 from ufmstar_torch.train.progress import Sums, ValidationSums
@@ -50,20 +51,21 @@ class TrainingModule(pl.LightningModule):
     def __init__(self, network: nn.Module, recipe: Recipe, total_steps: int, seed: int = 0) -> None:
         super().__init__()
         # Half the time of a step on CPUs, and what tensor cores want.
-        self.network = network.to(memory_format=torch.channels_last)
+        self.network: Any = network.to(memory_format=torch.channels_last)
         self.recipe = recipe
         self.total_steps = total_steps
         self.seed = seed
-        self.averaged = copy.deepcopy(network).requires_grad_(False) if recipe.average else None
+        self.averaged: Any = copy.deepcopy(network).requires_grad_(False) if recipe.average else None
         self.residuals = Sums()
         self.losses = Sums()
         self.validation = ValidationSums()
         self._batch_idx = 0
 
     @property
-    def result(self) -> nn.Module:
+    def result(self) -> DepthNetwork:
         """The network to keep: the running mean where there is one."""
-        return self.network if self.averaged is None else self.averaged
+        kept: DepthNetwork = self.network if self.averaged is None else self.averaged
+        return kept
 
     # ---- training ----
 
@@ -128,7 +130,7 @@ class TrainingModule(pl.LightningModule):
         if self.losses.pixels:
             self.log("train_loss_epoch", self.losses.mean(), sync_dist=True)
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> Any:
         """Adam and the schedule, step by step."""
         r = self.recipe
         # Decay pulls to 0; the factors of a BatchEnsemble belong around 1.
@@ -185,7 +187,7 @@ class TrainingModule(pl.LightningModule):
 
     def _samples(self, batch_idx: int) -> list[str]:
         """Names of the frames in this process's batch; their order follows from the epoch."""
-        loader = self.trainer.train_dataloader
+        loader: Any = self.trainer.train_dataloader
         batches = copy.copy(loader.batches)
         batches.set_epoch(self.current_epoch, batch_idx)
         return [loader.dataset.source.name(key.frame) for key in next(iter(batches))]

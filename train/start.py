@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -100,7 +101,8 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
     if info.spec.method == "batch_ensemble":
         raise ValueError(f"init: {path} holds a batch_ensemble, whose backbone is not one network's")
     backbone = build_backbone(spec)
-    fill(backbone, source.backbone.state_dict(), str(path))
+    held: Any = source.backbone
+    fill(backbone, held.state_dict(), str(path))
     return build_network(spec, backbone, std=PRETRAINED_STD)
 
 

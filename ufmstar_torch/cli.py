@@ -108,8 +108,9 @@ def train(arguments: Sequence[str]) -> int:
     from ufmstar_torch.train.fit import fit, report
     from ufmstar_torch.train.start import missing_start
 
+    process: Any = rank_zero_only
     remark = missing_start(job.recipe.network, job.settings.init)
-    if remark and rank_zero_only.rank == 0:
+    if remark and process.rank == 0:
         print(f"ufmstar train: {remark}", file=sys.stderr)
     how = {"resume": options["resume"], "overwrite": options["overwrite"]}
     try:
