@@ -1,0 +1,1 @@
+"""Latency, power, energy and memory of the paper's rows (imported lazily)."""

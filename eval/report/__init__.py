@@ -1,0 +1,1 @@
+"""``ufmstar report``: tables, figures and one page from the results of ``ufmstar eval`` (imported lazily)."""

@@ -1,0 +1,104 @@
+"""The rows of the paper's tables: which network, how often it is run, and what judges its views.
+
+A row's name is the paper's: "Ensemble", "UfM-MCD-100K", "UfM*-Aleatoric", "UfM*-FullBatchEnsemble",
+"UfM*-DepthOnly-fixed-param".
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+# What a network was trained to say, by the name it has alone, and the one it has behind UfM or UfM*.
+BASES = {
+    "ensemble": ("Ensemble", "Ensemble"),
+    "mc_dropout": ("MC-Dropout", "MCD"),
+    "batch_ensemble": ("BatchEnsemble", "BatchEnsemble"),
+    "evidential": ("Evidential", "Evidential"),
+    "aleatoric": ("Aleatoric", "Aleatoric"),
+    "depth_only": ("DepthOnly", "DepthOnly"),
+}
+# Those that say more when they are run several times on an image.
+MANY = ("ensemble", "mc_dropout", "batch_ensemble")
+ALONE, UFM, UFM_STAR = "alone", "ufm", "ufm_star"
+FUSIONS = (ALONE, UFM, UFM_STAR)
+_NAME = re.compile(r"(?P<fusion>UfM\*?)-(?P<full>Full)?(?P<base>[A-Za-z]+)(-(?P<cap>\d+)K)?(?P<fixed>-fixed-param)?")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row.
+
+    Attributes:
+        base: a key of ``BASES``.
+        fusion: "alone" (the network's own variance), "ufm" or "ufm_star".
+        full: behind UfM or UfM*, run all members (or samples) on every image instead of one in turn.
+        max_points: of UfM; None = unpruned.
+        fixed_param: of UfM*, the segmentation's thresholds in pixels as at 224 x 224, whatever the image's size.
+
+    Raises:
+        ValueError: the fields do not go together.
+    """
+
+    base: str
+    fusion: str = ALONE
+    full: bool = False
+    max_points: int | None = None
+    fixed_param: bool = False
+
+    def __post_init__(self) -> None:
+        if self.base not in BASES:
+            raise ValueError(f"base must be one of {', '.join(BASES)}, got {self.base!r}")
+        if self.fusion not in FUSIONS:
+            raise ValueError(f"fusion must be one of {', '.join(FUSIONS)}, got {self.fusion!r}")
+        if self.full and (self.fusion == ALONE or self.base not in MANY):
+            raise ValueError(f"full goes with UfM or UfM* behind one of {', '.join(MANY)}")
+        if self.max_points is not None and (self.fusion != UFM or self.max_points < 1000 or self.max_points % 1000):
+            raise ValueError(f"max_points goes with UfM and is a multiple of 1000, got {self.max_points}")
+        if self.fixed_param and self.fusion != UFM_STAR:
+            raise ValueError("fixed_param goes with UfM*")
+
+    @property
+    def name(self) -> str:
+        """As the paper prints it."""
+        alone, behind = BASES[self.base]
+        if self.fusion == ALONE:
+            return alone
+        cap = "" if self.max_points is None else f"-{self.max_points // 1000}K"
+        prefix = "UfM" if self.fusion == UFM else "UfM*"
+        return f"{prefix}-{'Full' if self.full else ''}{behind}{cap}{'-fixed-param' if self.fixed_param else ''}"
+
+    @property
+    def every_member(self) -> bool:
+        """Whether all members (or samples) are run on every image, not one in turn."""
+        return self.base in MANY and (self.full or self.fusion == ALONE)
+
+    @property
+    def uses_aleatoric(self) -> bool:
+        """Whether the network's own variance is used; "DepthOnly" ignores it."""
+        return self.base != "depth_only"
+
+    @classmethod
+    def parse(cls, name: str) -> Method:
+        """The row of that name.
+
+        Raises:
+            ValueError: no row is called so.
+        """
+        by_alone = {alone: base for base, (alone, _) in BASES.items()}
+        if name in by_alone:
+            return cls(by_alone[name])
+        by_behind = {behind: base for base, (_, behind) in BASES.items()}
+        found = _NAME.fullmatch(name)
+        if found is None or found["base"] not in by_behind:
+            told = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full with {', '.join(by_behind)}"
+            raise ValueError(
+                f"no method is called {name!r}; there are {told}, UfM's with -100K, UfM*'s with -fixed-param"
+            )
+        return cls(
+            base=by_behind[found["base"]],
+            fusion=UFM_STAR if found["fusion"] == "UfM*" else UFM,
+            full=found["full"] is not None,
+            max_points=None if found["cap"] is None else 1000 * int(found["cap"]),
+            fixed_param=found["fixed"] is not None,
+        )
