@@ -9,6 +9,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.check import SequenceCheck as SequenceCheck
     from ufmstar_torch.eval.sequences.check import check_sequence as check_sequence
     from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder
+    from ufmstar_torch.eval.sequences.find import Found as Found
+    from ufmstar_torch.eval.sequences.find import find_sequences as find_sequences
     from ufmstar_torch.eval.sequences.frame import Frame as Frame
     from ufmstar_torch.eval.sequences.frame import FrameError as FrameError
     from ufmstar_torch.eval.sequences.frame import Sequence as Sequence
@@ -17,12 +19,14 @@ if TYPE_CHECKING:
 
 _HOME = {
     "DepthFolder": "depth_folder",
+    "Found": "find",
     "Frame": "frame",
     "FrameError": "frame",
     "Sequence": "frame",
     "SequenceCheck": "check",
     "Skipped": "frame",
     "check_sequence": "check",
+    "find_sequences": "find",
     "open_sequence": "layout",
 }
 

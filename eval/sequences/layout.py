@@ -127,8 +127,8 @@ def detect_layout(path: Path, explicit: bool = False) -> str:
     Raises:
         ValueError: none or several fit.
     """
-    fitting = [name for name, (detect, _, _) in _READERS.items() if name != "generic" and detect(path)]
-    if not fitting and (explicit or generic.detect(path)):
+    fitting = layouts_of(path)
+    if not fitting and explicit:
         return "generic"
     if len(fitting) == 1:
         return fitting[0]
@@ -137,3 +137,14 @@ def detect_layout(path: Path, explicit: bool = False) -> str:
     wanted = "\n".join(f"  {name}: {looked_for}" for name, (_, _, looked_for) in _READERS.items())
     inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
     raise ValueError(f"{path} has no known layout. Looked for\n{wanted}\nand found {inside}")
+
+
+def layouts_of(path: Path) -> list[str]:
+    """The layouts whose files lie in ``path``, all of them; ``generic`` only where no other fits."""
+    fitting = [name for name, (detect, _, _) in _READERS.items() if name != "generic" and detect(path)]
+    return fitting or (["generic"] if generic.detect(path) else [])
+
+
+def parts_of(path: Path, layout: str) -> list[Path]:
+    """The single sequences of a path that has this layout: itself, or folders in it that hold one each."""
+    return tartanair.trajectory_folders(path) if layout == "tartanair" else [path]

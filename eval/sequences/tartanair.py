@@ -33,7 +33,7 @@ _NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 
 
 def detect(path: Path) -> bool:
     """Whether the folder has this layout, itself or in trajectory folders below it."""
-    return bool(_trajectory_folders(path))
+    return bool(trajectory_folders(path))
 
 
 def open_tartanair(path: Path, options: Options) -> Sequence:
@@ -44,7 +44,7 @@ def open_tartanair(path: Path, options: Options) -> Sequence:
             images; a malformed pose line.
     """
     options.reject("tartanair", "trajectory", "images", "depth", "fps", "depth_intrinsics", "T_color_depth")
-    folders = _trajectory_folders(path)
+    folders = trajectory_folders(path)
     if len(folders) > 1:
         raise ValueError(f"{path} holds the trajectories {[folder.name for folder in folders]}: open one of them")
     folder = folders[0]
@@ -63,7 +63,8 @@ def open_tartanair(path: Path, options: Options) -> Sequence:
     return make_sequence(name, "tartanair", frames, K, image_size=size, depth_size=depth_size)
 
 
-def _trajectory_folders(path: Path) -> list[Path]:
+def trajectory_folders(path: Path) -> list[Path]:
+    """The folders with a trajectory: ``path``, or those called PNNN in it."""
     folders = [path, *sorted(path.glob("P[0-9]*"))] if path.is_dir() else []
     return [f for f in folders if (f / "pose_left.txt").is_file() and (f / "image_left").is_dir()]
 

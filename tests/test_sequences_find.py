@@ -1,0 +1,109 @@
+"""Sequences below a root: all of them, each once, by names that do not depend on the order on disk."""
+
+from __future__ import annotations
+
+import shutil
+
+import layouts
+import pytest
+
+from ufmstar_torch.eval.sequences import find_sequences, open_sequence
+
+
+def found(root, **options):
+    return {one.name: (one.layout, one.path) for one in find_sequences(root, **options)}
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A disk with a sequence of each of several layouts, at different depths."""
+    layouts.write_tum(tmp_path / "tum", frames=1)
+    layouts.write_seven_scenes(tmp_path / "7scenes" / "chess", frames=1)
+    shutil.copytree(tmp_path / "7scenes" / "chess" / "seq-01", tmp_path / "7scenes" / "chess" / "seq-02")
+    layouts.write_scannet(tmp_path / "scans", frames=1)
+    layouts.write_tartanair(tmp_path, frames=1)
+    shutil.copytree(tmp_path / "office" / "P000", tmp_path / "office" / "P001")
+    layouts.write_generic(tmp_path / "a" / "b", frames=1)
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "readme.txt").write_text("nothing")
+    return tmp_path
+
+
+NAMES = {
+    "7scenes__chess__seq-01": "7scenes",
+    "7scenes__chess__seq-02": "7scenes",
+    "a__b__walk": "generic",
+    "office__P000": "tartanair",
+    "office__P001": "tartanair",
+    "scans__scene0000_00": "scannet",
+    "tum__rgbd_dataset_freiburg2_desk": "tum",
+}
+
+
+def test_every_sequence_is_found_once_by_its_place(root):
+    assert {name: layout for name, (layout, _) in found(root).items()} == NAMES
+    assert [one.name for one in find_sequences(root)] == sorted(NAMES)
+    for one in find_sequences(root):
+        assert open_sequence(one.path, one.layout).layout == one.layout
+
+
+def test_a_sequence_itself_is_found_at_depth_0(root):
+    assert found(root / "a" / "b" / "walk", max_depth=0) == {"walk": ("generic", root / "a" / "b" / "walk")}
+    assert found(root / "office", max_depth=0) == {
+        "P000": ("tartanair", root / "office" / "P000"),
+        "P001": ("tartanair", root / "office" / "P001"),
+    }
+    assert found(root, max_depth=0) == {}
+
+
+def test_depth_is_limited(root):
+    assert "a__b__walk" not in found(root, max_depth=2)
+    assert "a__b__walk" in found(root, max_depth=3)
+    assert set(found(root, max_depth=1)) == {"office__P000", "office__P001"}
+
+
+def test_only_one_layout(root):
+    assert set(found(root, layout="tartanair")) == {"office__P000", "office__P001"}
+    assert found(root, layout="generic") == {"a__b__walk": ("generic", root / "a" / "b" / "walk")}
+
+
+def test_links_in_a_circle_end_and_links_do_not_double(root):
+    (root / "a" / "again").symlink_to(root)
+    (root / "a" / "b" / "walk2").symlink_to(root / "a" / "b" / "walk")
+    (root / "0first").symlink_to(root / "scans")
+    assert {name: layout for name, (layout, _) in found(root, max_depth=9).items()} == NAMES
+
+
+def test_a_link_to_somewhere_else_counts(root, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    layouts.write_generic(elsewhere, frames=1)
+    (root / "linked").symlink_to(elsewhere)
+    assert set(found(root)) == {*NAMES, "linked__walk"}
+
+
+def test_hidden_folders_and_those_of_others_are_left_out(root, monkeypatch):
+    shutil.copytree(root / "a" / "b" / "walk", root / ".trash" / "walk")
+    shut = root / "lost+found"
+    shut.mkdir()
+    listing = type(root).iterdir
+
+    def guarded(path):
+        if path == shut:  # a root user may read everything, so that modes would test nothing
+            raise PermissionError(13, "Permission denied", str(path))
+        return listing(path)
+
+    monkeypatch.setattr(type(root), "iterdir", guarded)
+    assert set(found(root)) == set(NAMES)
+
+
+def test_what_cannot_be_searched_is_refused(root, tmp_path):
+    with pytest.raises(FileNotFoundError, match="root: no such file or folder"):
+        find_sequences(tmp_path / "absent")
+    with pytest.raises(ValueError, match="max_depth must be at least 0, got -1"):
+        find_sequences(root, max_depth=-1)
+    with pytest.raises(ValueError, match="layout must be one of auto, tum"):
+        find_sequences(root, layout="kitti")
+    shutil.copytree(root / "tum" / "rgbd_dataset_freiburg2_desk", root / "scans" / "scene0000_00", dirs_exist_ok=True)
+    with pytest.raises(ValueError, match="scene0000_00 fits the layouts tum, scannet: pass layout"):
+        find_sequences(root)
+    assert set(found(root, layout="scannet")) == {"scans__scene0000_00"}
