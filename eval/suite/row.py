@@ -1,0 +1,33 @@
+"""A row of a suite: a method under a setting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ufmstar_torch.eval.suite.method import Method
+from ufmstar_torch.eval.suite.setting import DEFAULT, Setting
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is judged.
+
+    Attributes:
+        method: which network, how often it is run, and what judges its views.
+        setting: what an ablation changes about it.
+    """
+
+    method: Method
+    setting: Setting = DEFAULT
+
+    @property
+    def slug(self) -> str:
+        """A name for files: "UfMstar-Ensemble", "UfMstar-Ensemble@0c3f..." where the setting is not the default."""
+        name, setting = self.method.name.replace("*", "star"), self.setting.slug
+        return f"{name}@{setting}" if setting else name
+
+    @property
+    def label(self) -> str:
+        """For people: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
+        changed = ", ".join(f"{name} {value}" for name, value in self.setting.to_dict().items())
+        return f"{self.method.name} ({changed})" if changed else self.method.name
