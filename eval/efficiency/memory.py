@@ -1,0 +1,62 @@
+"""Memory as the paper splits it: the network that predicts depth, what uncertainty adds to it, and the multiview state.
+
+A megabyte is 10^6 bytes, as in the paper: 100,000 points of 40 bytes are its 4.0 MB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+MEGABYTE = 1e6
+
+
+def tensor_bytes(modules: nn.Module | Iterable[nn.Module]) -> int:
+    """Bytes of the parameters and buffers of modules; what several of them share counts once."""
+    held: dict[tuple[int, int], int] = {}
+    for module in [modules] if isinstance(modules, nn.Module) else modules:
+        for tensor in _tensors(module):
+            held[tensor.data_ptr(), tensor.nbytes] = tensor.nbytes
+    return sum(held.values())
+
+
+def _tensors(module: nn.Module) -> list[Tensor]:
+    return [t for t in (*module.parameters(), *module.buffers()) if t.numel()]
+
+
+@dataclass(frozen=True)
+class NetworkMemory:
+    """Weights and buffers of a network [bytes].
+
+    Attributes:
+        depth: of one network that predicts depth alone.
+        uncertainty: of all else: heads, further members, factors of a BatchEnsemble.
+    """
+
+    depth: int
+    uncertainty: int
+
+    @classmethod
+    def of(cls, members: Sequence[nn.Module], depth: nn.Module) -> NetworkMemory:
+        """Of what is kept to run ``members``, beyond what ``depth`` alone needs.
+
+        Raises:
+            ValueError: the members hold less than the network for depth.
+        """
+        alone, everything = tensor_bytes(depth), tensor_bytes(members)
+        if everything < alone:
+            raise ValueError(f"members hold {everything} bytes, less than the {alone} of one network for depth")
+        return cls(alone, everything - alone)
+
+
+def overhead_percent(uncertainty: float, depth: float) -> float:
+    """Share of uncertainty in the whole [%]: 100 u / (u + d), of bytes or of joules.
+
+    Raises:
+        ValueError: a negative amount, or nothing at all.
+    """
+    if uncertainty < 0 or depth < 0 or uncertainty + depth <= 0:
+        raise ValueError(f"uncertainty and depth must be amounts, at least one positive, got {uncertainty} and {depth}")
+    return 100 * uncertainty / (uncertainty + depth)
