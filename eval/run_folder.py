@@ -25,6 +25,9 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.files import to_json, write_atomic, write_json_atomic
+from ufmstar_torch.eval.output_folder import FolderError as FolderError
+from ufmstar_torch.eval.output_folder import differences, hold
+from ufmstar_torch.eval.output_folder import flatten as flatten
 from ufmstar_torch.eval.writers import FrameWriter
 
 FORMAT = 1
@@ -34,10 +37,6 @@ MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "ellipsoids.pl
 _RESERVE_BYTES = 2**20
 # Sums with more entries are stored by their non-zero entries: Spearman's 514 x 514 counts are mostly 0.
 _DENSE_ENTRIES = 4096
-
-
-class FolderError(ValueError):
-    """The output folder cannot be used as asked; the message says what to do."""
 
 
 @dataclass
@@ -214,16 +213,9 @@ def _lock(out: Path) -> BinaryIO:
     Raises:
         FolderError: another process holds it.
     """
-    file = (out / "resume" / "lock").open("wb")
-    try:
-        import fcntl
-    except ImportError:  # not a POSIX system: no lock
-        return file
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        file.close()
-        raise FolderError(f"--out {out}: another run is writing there now") from error
+    file = hold(out / "resume" / "lock")
+    if file is None:
+        raise FolderError(f"--out {out}: another run is writing there now")
     return file
 
 
@@ -246,24 +238,6 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 def _require_same(out: Path, now: Mapping[str, Any], then: Mapping[str, Any]) -> None:
     """Raise FolderError, naming every value that differs."""
-    before, after = flatten(then), flatten(now)
-    changed = [key for key in sorted(before.keys() | after.keys()) if before.get(key) != after.get(key)]
-    if changed:
-        told = "; ".join(f"{key} was {_shown(before.get(key))}, now {_shown(after.get(key))}" for key in changed[:5])
-        more = f" and {len(changed) - 5} more" if len(changed) > 5 else ""
-        raise FolderError(f"--resume: the run in {out} was started with other input: {told}{more}")
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings and lists of them as one level, with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, list) and value and isinstance(value[0], Mapping):
-            value = {str(i): item for i, item in enumerate(value)}
-        flat |= flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
-
-
-def _shown(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else text[:16] + '..."'
+    told = differences(then, now)
+    if told:
+        raise FolderError(f"--resume: the run in {out} was started with other input: {told}")
