@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
+from uuid import uuid4
 
 import numpy as np
 import torch
@@ -36,7 +37,8 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]], *, durabl
     They do so in the order given, so the presence of the last one says that all are there.
     """
     # Hidden, and in the same file system, as os.replace needs.
-    temporary = {path: path.with_name(f".{path.name}.{os.getpid()}.tmp") for path in files}
+    # Named at random: processes on several nodes may share both a folder and an id.
+    temporary = {path: path.with_name(f".{path.name}.{uuid4().hex[:12]}.tmp") for path in files}
     try:
         for path, write in files.items():
             with open(temporary[path], "wb") as file:

@@ -89,7 +89,7 @@ class NetworkSource(Source):
         for network in pipeline.networks:
             self.clock.watch(network, "network")
         self._dropout = torch.Generator(device)
-        for network in _stochastic(pipeline.networks):
+        for network in stochastic(pipeline.networks):
             set_sampling(network, True, self._dropout)
 
     def predict(self, frame: Frame) -> UncertainPrediction:
@@ -196,22 +196,9 @@ def network_source(
             of one network that does not sample, ``samples`` for any other.
     """
     files = [Path(file) for file in weights]
-    for folder in files if model in DIRECTORIES else []:
-        if not folder.is_dir():
-            fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
-            raise FileNotFoundError(f"no such directory: {folder}; {fetch}")
-    for file in [*(files if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
-        if not file.is_file():
-            raise FileNotFoundError(f"no such file: {file}")
-    options: dict[str, Any] = {} if spec is None else {"spec": spec}
-    if model == "onnx" and threads is not None:
-        options["threads"] = threads
-    members = _members(model, files, options, offload)
-    wanted = [member.preprocess for member in members]
-    if any(other != wanted[0] for other in wanted[1:]):
-        raise ValueError(f"weights: the members of an ensemble must want the same input, got {wanted}")
+    members = load_members(model, files, spec=spec, offload=offload, threads=threads)
     samples = _passes(members, mode, samples)
-    pipeline = UncertainDepth(members, config, mode=mode, samples=samples, preprocess=wanted[0])
+    pipeline = UncertainDepth(members, config, mode=mode, samples=samples, preprocess=members[0].preprocess)
     identity = {
         "model": model,
         "weights": [{"name": file.name, "sha256": sha256(file)} for file in files],
@@ -222,8 +209,48 @@ def network_source(
     return NetworkSource(pipeline, torch.device(device), identity)
 
 
-def _members(model: str, files: list[Path], options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
-    """The networks in the files, in their order.
+def load_members(
+    model: str,
+    files: Iterable[str | Path],
+    *,
+    spec: str | Path | None = None,
+    offload: bool = False,
+    threads: int | None = None,
+) -> list[DepthNetwork]:
+    """The networks in the files, in their order, in eval mode and on the CPU. They want the same input.
+
+    Args:
+        model, spec, offload, threads: as :func:`network_source` has them.
+        files: of weights.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`network_source`.
+    """
+    paths = [Path(file) for file in files]
+    for folder in paths if model in DIRECTORIES else []:
+        if not folder.is_dir():
+            fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
+            raise FileNotFoundError(f"no such directory: {folder}; {fetch}")
+    for file in [*(paths if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
+        if not file.is_file():
+            raise FileNotFoundError(f"no such file: {file}")
+    options: dict[str, Any] = {} if spec is None else {"spec": spec}
+    if model == "onnx" and threads is not None:
+        options["threads"] = threads
+    members = _loaded(model, paths, options, offload)
+    require_same_input(members)
+    return members
+
+
+def require_same_input(members: Iterable[DepthNetwork]) -> None:
+    """Raises ValueError unless the members of an ensemble want the same input."""
+    wanted = [member.preprocess for member in members]
+    if any(other != wanted[0] for other in wanted[1:]):
+        raise ValueError(f"weights: the members of an ensemble must want the same input, got {wanted}")
+
+
+def _loaded(model: str, files: list[Path], options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
+    """The networks in the files.
 
     Raises:
         ValueError: as :func:`network_source`.
@@ -243,14 +270,14 @@ def _passes(members: list[DepthNetwork], mode: str, samples: int | None) -> int 
         ValueError: mode or samples ask for what the members cannot do.
     """
     alone = len(members) == 1 and mode == "full"
-    if alone and not _stochastic(members):
+    if alone and not stochastic(members):
         raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
     if samples is not None and not alone:
         raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
     return (samples or SAMPLES) if alone else None
 
 
-def _stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:
+def stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:
     """Those of the networks that sample."""
     found = [network.network() if isinstance(network, LazyMember) else network for network in networks]
     return [network for network in found if isinstance(network, MonteCarloDropout)]
