@@ -1,0 +1,169 @@
+"""UfM and UfM* as a row of the table runs them, with their clocks and the bytes that they keep."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.backend import Backend, select
+from ufmstar_torch.config import SPGFConfig
+from ufmstar_torch.eval.benchmark_timing import StageClock
+from ufmstar_torch.eval.suite.method import UFM, UFM_STAR, Method
+from ufmstar_torch.eval.ufm import UfM, UfMConfig
+from ufmstar_torch.frame import check_frame
+from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.step import UfMStarState, step
+
+_KERNELS = ("spgf", "floor_covariance", "correspond", "fuse", "regress", "regress_image", "smooth")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a multiview method is given for a frame.
+
+    Attributes:
+        prediction: [1, h, w] maps, on the network's device.
+        T_world_cam: [1, 4, 4] float64 [m]; ``intrinsics``: [1, 3, 3] float64 of the maps [px].
+        intrinsics: see ``T_world_cam``.
+    """
+
+    prediction: DepthPrediction
+    T_world_cam: Tensor
+    intrinsics: Tensor
+
+    def maps(
+        self, method: Method, device: torch.device
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+        """Depth, pose, intrinsics, A and E as the method takes them, on its device."""
+        p = self.prediction
+        own = (p.aleatoric_variance, p.epistemic_variance) if method.uses_aleatoric else (None, None)
+        A, E = (None if value is None else value.to(device) for value in own)
+        return p.depth.to(device), self.T_world_cam.to(device), self.intrinsics.to(device), A, E
+
+
+class Multiview:
+    """The multiview part of a row, with a state of its own.
+
+    Args:
+        method: behind UfM or UfM*.
+        device: where it runs.
+
+    Raises:
+        ValueError: a method without a multiview part.
+    """
+
+    def __init__(self, method: Method, device: torch.device) -> None:
+        if method.fusion not in (UFM, UFM_STAR):
+            raise ValueError(f"{method.name} has no multiview part")
+        self.method, self.device = method, device
+        self.module = build(method).to(device)
+        self.bytes: list[int] = []
+        self.count: list[int] = []
+
+    def __call__(self, inputs: Inputs) -> Any:
+        """The next frame: its maps to the device, and the step."""
+        return self.module(*inputs.maps(self.method, self.device))
+
+    def note(self) -> None:
+        """Write down what is kept now."""
+        held, count = state_bytes(self.module)
+        self.bytes.append(held)
+        self.count.append(count)
+
+    def memory(self) -> dict[str, float]:
+        """Bytes and points or components after the noted frames: at the end, on average, at most; and of the
+        map that is kept for smoothing [bytes]."""
+        smoothing = self.module.smoothed.nbytes if isinstance(self.module, UfMStar) else 0
+        figures: dict[str, float] = {"smoothing_bytes": smoothing}
+        for name, values in (("bytes", self.bytes), ("count", self.count)):
+            figures |= {
+                f"{name}_end": values[-1],
+                f"{name}_mean": sum(values) / len(values),
+                f"{name}_max": max(values),
+            }
+        return figures
+
+
+class StagedUfMStar:
+    """UfM* on a state of its own, with a clock at every stage; on an accelerator each stage is waited for.
+
+    Args:
+        method: behind UfM*.
+        device: where it runs.
+
+    Raises:
+        ValueError: a method that is not behind UfM*.
+    """
+
+    def __init__(self, method: Method, device: torch.device) -> None:
+        module = build(method)
+        if not isinstance(module, UfMStar):
+            raise ValueError(f"{method.name} is not behind UfM*, whose stages are known")
+        self.method, self.device, self.config = method, device, module.config
+        self.clock = StageClock()
+        self.backend = self.clock.wrap(_waited_for(select(self.config.backend, device.type), device))
+        self.state = UfMStarState.initial(1, self.config, torch.float32, device)
+
+    def __call__(self, inputs: Inputs) -> None:
+        """The next frame."""
+        depth, pose, K, aleatoric, epistemic = inputs.maps(self.method, self.device)
+        with torch.no_grad():
+            synchronize(self.device)
+            self.clock.start()
+            frame = check_frame(
+                depth, pose, K, aleatoric, epistemic, None, None,
+                feature_count=0, rotation_tolerance=self.config.rotation_tolerance,
+            )  # fmt: skip
+            self.clock.checked()
+            self.state, _ = step(self.state, frame, self.config, self.backend)
+            synchronize(self.device)
+            self.clock.stop()
+
+
+def build(method: Method) -> UfM | UfMStar:
+    """The module behind a row, with the paper's settings."""
+    if method.fusion == UFM:
+        return UfM(UfMConfig(max_points=method.max_points))
+    return UfMStar(UfMStarConfig(segment=SPGFConfig(scale_with_image=not method.fixed_param)))
+
+
+def state_bytes(module: UfM | UfMStar) -> tuple[int, int]:
+    """What a module remembers of the views [bytes], without the map for smoothing, and how many points or
+    components that is."""
+    if isinstance(module, UfM):
+        return module.moments.nbytes + module.count.nbytes, int(module.points.sum())
+    mixture = module.mixture
+    components = int(mixture.components.sum())
+    return components * mixture.bytes_per_component(), components
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for what a device still computes."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def waited(call: Callable[..., Any], device: torch.device) -> Callable[..., Any]:
+    """A call that returns when the device has finished."""
+
+    def run(*args: Any, **kwargs: Any) -> Any:
+        result = call(*args, **kwargs)
+        synchronize(device)
+        return result
+
+    return run
+
+
+def _waited_for(backend: Backend, device: torch.device) -> Backend:
+    if device.type == "cpu":
+        return backend
+    kernels: dict[str, Any] = {name: waited(getattr(backend, name), device) for name in _KERNELS}
+    return replace(backend, **kernels)
+
+
