@@ -16,7 +16,7 @@ LAYERS = {"core": 0, "models": 1, "eval": 2, "train": 3}
 HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetrics", "scipy", "cv2", "onnxruntime")
 HEAVY += ("numba",)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-REFERENCE = ("gaussian", "camera", "segment", "correspond", "fuse", "regress", "mixture", "step", "frame")
+REFERENCE = ("gaussian", "camera", "segment", "correspond", "disagree", "fuse", "regress", "mixture", "step", "frame")
 
 
 def layer_of(path: Path) -> str:

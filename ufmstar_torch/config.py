@@ -167,6 +167,9 @@ class UfMStarConfig(_Checked):
 
     # Fusion (section "Multiview Fusion")
     overlap_weighted: bool = False
+    # What m averages: the paper's squared 2-Wasserstein distance, or the squared depth difference where both
+    # Gaussians are seen (``disagree``).
+    disagreement: str = _choice("w2", "overlap")
 
     # Regression (section "Uncertainty Regression")
     prior_weight: float = _number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)

@@ -27,10 +27,12 @@ class Correspondence:
     Attributes:
         match: [B, C, K] True where k is in the correspondence set F_c after the occlusion filter.
         overlap: [B, C, K] Bhattacharyya coefficient beta_ck, 0 where c or k is no candidate.
+        distance: [B, C, K] squared disagreement [m^2] of the pairs that fusion is to average; None = W2^2.
     """
 
     match: Tensor
     overlap: Tensor
+    distance: Tensor | None = None
 
 
 def correspond(

@@ -29,7 +29,8 @@ def fuse(
     For each k the matched c are applied one after the other in increasing index (SPGF's emission order);
     different k are independent. With pi_c (times beta_ck if ``config.overlap_weighted``) and
     lambda = pi_c / (pi_k + pi_c): m_k <- (1-lambda) m_k + lambda W2^2(G_k, G_c), features likewise, mean and
-    covariance move by lambda along the optimal-transport geodesic, pi_k <- pi_k + pi_c.
+    covariance move by lambda along the optimal-transport geodesic, pi_k <- pi_k + pi_c. ``pairs.distance``, where it is
+    given, takes the place of W2^2.
     A c that matches several k is fused into each of them in full.
 
     Args:
@@ -46,12 +47,12 @@ def fuse(
         rounds = int(order[:, -1:].max()) if order.numel() else 0
     for position in range(1, rounds + 1):
         turn = pairs.match & (order == position)  # [B, C, K], at most one c for every k
-        mixture = _fuse_one_each(mixture, current, turn, pairs.overlap, config)
+        mixture = _fuse_one_each(mixture, current, turn, pairs, config)
     return mixture
 
 
 def _fuse_one_each(
-    mixture: GaussianMixture, current: GaussianMixture, turn: Tensor, overlap: Tensor, config: UfMStarConfig
+    mixture: GaussianMixture, current: GaussianMixture, turn: Tensor, pairs: Correspondence, config: UfMStarConfig
 ) -> GaussianMixture:
     """Fuse at most one c into every k."""
     dtype = torch.float64
@@ -64,7 +65,7 @@ def _fuse_one_each(
 
     pi_c, pi_k = of_c(current.weight), mixture.weight.to(dtype)
     if config.overlap_weighted:
-        pi_c = pi_c * torch.gather(overlap, 1, c[:, None])[:, 0].to(dtype)
+        pi_c = pi_c * torch.gather(pairs.overlap, 1, c[:, None])[:, 0].to(dtype)
     lam = torch.where(used, pi_c / (pi_k + pi_c).clamp_min(torch.finfo(dtype).tiny), torch.zeros_like(pi_c))
 
     # Empty slots take part with unit covariances, so that no branch divides by zero; `used` discards them.
@@ -72,6 +73,9 @@ def _fuse_one_each(
     cov_k = torch.where(used[..., None, None], mixture.covariance.to(dtype), eye)
     cov_c = torch.where(used[..., None, None], of_c(current.covariance), eye)
     mean, covariance, distance = geodesic(mixture.mean.to(dtype), cov_k, of_c(current.mean), cov_c, lam)
+
+    if pairs.distance is not None:
+        distance = torch.gather(pairs.distance, 1, c[:, None])[:, 0].to(dtype)
 
     covariance = floor_covariance(covariance, storage_floor(covariance, mixture.covariance.dtype))
 

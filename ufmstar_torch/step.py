@@ -15,6 +15,7 @@ from ufmstar_torch.backend import Backend
 from ufmstar_torch.camera import focal_and_centre, relative_pose, unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
+from ufmstar_torch.disagree import with_overlap_disagreement
 from ufmstar_torch.frame import FRAME_FAULTS, FrameInput
 from ufmstar_torch.fuse import append
 from ufmstar_torch.gaussian import pixel_footprint
@@ -139,6 +140,8 @@ def step(
     R_cam, t_cam = relative_pose(first, frame.T_world_cam)
     previous_cam = state.mixture.to(torch.float64).rigid(R_cam, t_cam)
     pairs = backend.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
+    if config.disagreement == "overlap":
+        pairs = with_overlap_disagreement(pairs, previous_cam, current_cam)
     # What is nearer than the near plane could never be matched again: it is not remembered.
     far_enough = current_cam.mean[..., 2] > config.near_plane
     new = current_cam.valid & far_enough & ~pairs.match.any(dim=2)
@@ -232,7 +235,8 @@ def _pad_pairs(pairs: Correspondence, capacity: int) -> Correspondence:
     if not missing:
         return pairs
     pad = torch.nn.functional.pad
-    return Correspondence(pad(pairs.match, (0, missing)), pad(pairs.overlap, (0, missing)))
+    distance = None if pairs.distance is None else pad(pairs.distance, (0, missing))
+    return Correspondence(pad(pairs.match, (0, missing)), pad(pairs.overlap, (0, missing)), distance)
 
 
 def _read_out(

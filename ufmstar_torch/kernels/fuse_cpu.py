@@ -41,6 +41,8 @@ def fuse(
         *(value.detach().to(torch.float64).contiguous().numpy() for value in new),
         pairs.match.contiguous().numpy(),
         pairs.overlap.contiguous().numpy(),
+        pairs.distance is None,
+        (pairs.overlap if pairs.distance is None else pairs.distance).contiguous().numpy(),
         config.overlap_weighted,
         float(torch.finfo(mixture.covariance.dtype).eps),
     )
@@ -175,7 +177,7 @@ def _floor(covariance, floor):
 @compiled
 def _fuse(
     mean, covariance, weight, disagreement, count, features,
-    mean_c, cov_c, weight_c, features_c, match, overlap, overlap_weighted, epsilon,
+    mean_c, cov_c, weight_c, features_c, match, overlap, wasserstein, given, overlap_weighted, epsilon,
 ):  # fmt: skip
     """Apply every pair in place; after each one the values take the precision they are stored in."""
     work = np.empty((6, 3, 3))
@@ -193,6 +195,8 @@ def _fuse(
                     for j in range(3):
                         cov_k[i, j] = covariance[b, k, i, j]
                 distance = geodesic(mean_k, cov_k, mean_c[b, c], cov_c[b, c], lam, work)
+                if not wasserstein:
+                    distance = given[b, c, k]
                 least[0] = 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2])
                 _floor(cov_k[None], least)
                 for i in range(3):
