@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import random_gaussians
-import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_ufmstar import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import oracle
+import scenes
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.gaussian import wasserstein_squared
