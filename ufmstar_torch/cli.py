@@ -129,6 +129,27 @@ def train(arguments: Sequence[str]) -> int:
     return _told(f"ufmstar train: {summary['stopped']}; --resume goes on", INTERRUPTED)
 
 
+def report(arguments: Sequence[str]) -> int:
+    """tables, figures and a page from what eval has left"""
+    from ufmstar_torch.eval.report.options import parse_report
+
+    options = parse_report(arguments)
+    from ufmstar_torch.eval.report.load import ResultsError, load_results
+    from ufmstar_torch.eval.report.write import summary, write_report
+
+    try:
+        print(summary(load_results(options.out, with_sums=False)))
+        files = write_report(options.out, figures=not options.no_figures, pictures=options.format)
+    except ResultsError as error:
+        raise UsageError(_one_line(error)) from error
+    except (ImportError, OSError, ValueError) as error:
+        if options.debug:
+            traceback.print_exc()
+        return _told(f"ufmstar report: failed: {_one_line(error)}", FAILED)
+    print(f"{options.out}: {', '.join(str(file.relative_to(options.out)) for file in files)}")
+    return OK
+
+
 def demo(arguments: Sequence[str]) -> int:
     """the main job on rendered rooms, with nothing but this package"""
     from ufmstar_torch.eval.demo_options import parse_demo
@@ -146,7 +167,13 @@ def demo(arguments: Sequence[str]) -> int:
     return OK
 
 
-COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {"demo": demo, "run": run, "bench": bench, "train": train}
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
+    "demo": demo,
+    "run": run,
+    "report": report,
+    "bench": bench,
+    "train": train,
+}
 
 
 def _run(options: Mapping[str, Any]) -> dict[str, Any]:

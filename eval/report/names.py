@@ -1,0 +1,129 @@
+"""What figures and settings are called in tables and figures, in which unit, and which way is better."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ufmstar_torch.eval.suite.row import Row
+
+LOWER, HIGHER = "lower", "higher"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A figure as people read it.
+
+    Attributes:
+        key: of ``Record.figures``, or "state.bytes_mean", "ms.network", "frames.done" for the others.
+        name: in Markdown and in figures.
+        latex: in LaTeX.
+        decimals: printed; None = three significant digits.
+        better: "lower", "higher", or None where neither is.
+        unit: "" for a pure number.
+        factor: by which the recorded value is multiplied to have that unit.
+    """
+
+    key: str
+    name: str
+    latex: str
+    decimals: int | None
+    better: str | None = None
+    unit: str = ""
+    factor: float = 1.0
+
+    @property
+    def arrow(self) -> str:
+        """↑ or ↓: the better way."""
+        return {LOWER: "↓", HIGHER: "↑", None: ""}[self.better]
+
+    @property
+    def heading(self) -> str:
+        """For a column: "RMSE [m] ↓"."""
+        return " ".join(filter(None, (self.name, f"[{self.unit}]" if self.unit else "", self.arrow)))
+
+    @property
+    def latex_heading(self) -> str:
+        """The same in LaTeX."""
+        arrow = {LOWER: r"$\downarrow$", HIGHER: r"$\uparrow$", None: ""}[self.better]
+        unit = self.unit.replace("%", r"\%").replace("²", "$^2$")
+        return " ".join(filter(None, (self.latex, f"[{unit}]" if unit else "", arrow)))
+
+
+DELTA1 = Quantity("delta1", "δ₁", r"$\delta_1$", 3, HIGHER)
+NLL = Quantity("nll", "NLL", "NLL", 2, LOWER)
+ECE_DELTA = Quantity("ece_delta", "ECE_δ", r"ECE$_{\delta}$", 3, LOWER)
+ECE_Q = Quantity("ece_q", "ECE_q", r"ECE$_{q}$", 3, LOWER)
+STATE = Quantity("state.bytes_mean", "state", "State", None, None, "MB", 1e-6)
+SPEARMAN = Quantity("spearman", "Spearman", "Spearman", 2, HIGHER)
+AUSE = Quantity("ause_rmse", "AUSE", "AUSE", 3, LOWER, "m")
+UNCERTAINTY_MS = Quantity("ms.uncertainty", "uncertainty", "Uncertainty", 1, None, "ms")
+NETWORK_MS = Quantity("ms.network", "network", "Network", 1, None, "ms")
+TOTAL_MS = Quantity("ms.total", "time per frame", "Time per frame", 1, None, "ms")
+
+# The paper's columns, and those that the field expects beside them.
+MAIN = (DELTA1, NLL, ECE_DELTA, ECE_Q, STATE)
+EXTRA = (
+    Quantity("delta1_ratio", "δ₁ (ratio)", r"$\delta_1$ (ratio)", 3, HIGHER),
+    Quantity("abs_rel", "AbsRel", "AbsRel", 3, LOWER),
+    Quantity("rmse", "RMSE", "RMSE", 3, LOWER, "m"),
+    AUSE,
+    Quantity("aurg_rmse", "AURG", "AURG", 3, HIGHER, "m"),
+    SPEARMAN,
+    Quantity("overconfidence", "overconfidence", "Overconfidence", 3),
+    Quantity("entropy", "entropy", "Entropy", 2, None, "nats"),
+    Quantity("left_out_share", "no depth", "No depth", 1, None, "%", 100.0),
+    Quantity("nll_left_out_share", "no NLL", "No NLL", 1, None, "%", 100.0),
+    NETWORK_MS,
+    UNCERTAINTY_MS,
+)
+# Of which differences between rows are told.
+DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)
+
+# Settings as people call them, with the unit of their values.
+SETTINGS = {
+    "rotation_noise": ("rotation noise", "°"),
+    "translation_noise": ("translation noise", "m"),
+    "skip": ("images skipped", ""),
+    "eta": ("overlap threshold η", ""),
+    "eta_occlusion": ("occlusion threshold η_occl", ""),
+    "ema_alpha": ("smoothing α", ""),
+    "prior_weight": ("prior weight π₀", "px/m³"),
+    "prior_mean": ("prior mean μ₀", "m²"),
+    "overlap_weighted": ("fusion weighted by overlap", ""),
+    "disagreement": ("disagreement", ""),
+    "regression": ("regression", ""),
+    "near_radius": ("search radius", "m"),
+    "far_radius": ("far search radius", "m"),
+    "variance_floor": ("variance floor", "m²"),
+    "segment.min_pixels": ("smallest segment", "px"),
+    "segment.min_rows": ("smallest segment", "rows"),
+    "segment.prune": ("pruning rule", ""),
+    "segment.adaptive_thresh_scale": ("segment threshold a", "px/m"),
+}
+
+
+def setting_name(name: str) -> str:
+    """A setting's name for people; the config's own where it has none."""
+    return SETTINGS.get(name, (name.replace("_", " "), ""))[0]
+
+
+def setting_value(name: str, value: Any) -> str:
+    """A setting's value with its unit: "2°", ".5 m", "on"."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    unit = SETTINGS.get(name, ("", ""))[1]
+    text = f"{value:g}" if isinstance(value, int | float) else str(value)
+    return f"{text}{unit}" if unit == "°" else f"{text} {unit}".strip()
+
+
+def setting_label(values: Mapping[str, Any]) -> str:
+    """A setting for people, "" for the default: "rotation noise 2°, images skipped 4"."""
+    shown = {name: value for name, value in values.items() if name != "seed" or value}
+    return ", ".join(f"{setting_name(name)} {setting_value(name, value)}" for name, value in shown.items())
+
+
+def row_label(row: Row) -> str:
+    """A row for people: "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
+    return ", ".join(filter(None, (row.method.name, setting_label(row.setting.to_dict()))))

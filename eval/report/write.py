@@ -1,0 +1,93 @@
+"""Everything a report consists of, written into the folder of the evaluation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ufmstar_torch.eval.files import write_atomic
+from ufmstar_torch.eval.report.latex import latex
+from ufmstar_torch.eval.report.load import Results, load_results
+from ufmstar_torch.eval.report.markdown import markdown
+from ufmstar_torch.eval.report.table import Table
+from ufmstar_torch.eval.report.tables import difference_table, extra_table, is_empty, main_table, sequence_tables
+from ufmstar_torch.eval.report.tidy import write_tidy
+
+PICTURES = ("svg", "png")
+
+
+def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> list[Path]:
+    """Write tables, figures and the tidy results of an evaluation, finished or not.
+
+    Args:
+        out: the folder of ``ufmstar eval``.
+        figures: False = tables and results alone, which needs no matplotlib.
+        pictures: "svg" or "png".
+
+    Returns:
+        The files, in the order in which they were written.
+
+    Raises:
+        ResultsError: the folder is no evaluation, or its records do not belong together.
+        ValueError: another kind of pictures.
+        ImportError: matplotlib is missing.
+        OSError: a file cannot be written.
+    """
+    if pictures not in PICTURES:
+        raise ValueError(f"pictures must be one of {', '.join(PICTURES)}, got {pictures!r}")
+    results = load_results(out, with_sums=figures)
+    return [*write_tidy(results), *write_tables(results)]
+
+
+def write_tables(results: Results) -> list[Path]:
+    """Write ``tables/NAME.md`` and ``tables/NAME.tex``: main, extra and differences over all sequences and, where
+    there are several data sets, over those of each, and ``sequences-DATASET`` for single sequences.
+
+    Returns:
+        Their paths.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    folder = results.out / "tables"
+    folder.mkdir(exist_ok=True)
+    files: dict[str, list[Table]] = {}
+    each = list(results.datasets) if len(results.datasets) > 1 else []
+    for dataset in (None, *each):
+        suffix = "" if dataset is None else f"-{dataset}"
+        for make in (main_table, extra_table, difference_table):
+            table = make(results, dataset)
+            files[f"{table.name}{suffix}"] = [table]
+    for dataset in results.datasets:
+        files[f"sequences-{dataset}"] = sequence_tables(results, dataset)
+    written = []
+    for name, tables in files.items():
+        told = [table for table in tables if not is_empty(table)]
+        for suffix, render in (("md", markdown), ("tex", latex)):
+            if told:
+                written.append(_write_text(folder / f"{name}.{suffix}", "\n".join(map(render, told))))
+    return written
+
+
+def summary(results: Results) -> str:
+    """The main table, and what is missing or has failed, for a terminal."""
+    parts = [markdown(main_table(results))]
+    if results.failed:
+        parts.append("failed:\n" + "\n".join(f"  {f.dataset}, {f.sequence}: {f.reason}" for f in results.failed))
+    if results.missing:
+        parts.append(_missing(results))
+    parts += [f"note: {note}" for note in results.notes]
+    return "\n".join(parts)
+
+
+def _missing(results: Results) -> str:
+    sequences: dict[tuple[str, str], int] = {}
+    for dataset, sequence, _ in results.missing:
+        sequences[dataset, sequence] = sequences.get((dataset, sequence), 0) + 1
+    told = [f"  {dataset}, {sequence}: {count} row(s)" for (dataset, sequence), count in sequences.items()]
+    more = [f"  and {len(told) - 10} more sequences"] if len(told) > 10 else []
+    return "\n".join(["not evaluated yet (`ufmstar eval ... --resume` goes on):", *told[:10], *more])
+
+
+def _write_text(path: Path, text: str) -> Path:
+    write_atomic(path, lambda file: file.write(text.encode()))
+    return path

@@ -1,0 +1,146 @@
+"""Folders of ``ufmstar eval`` as it leaves them, from drawn numbers: real records and real sums, no network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.files import write_json_atomic
+from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+from ufmstar_torch.eval.suite.method import ALONE, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import Setting
+
+Maps = tuple[Tensor, Tensor | None, Tensor]
+# How far sigma falls short of the error: 1 is calibrated.
+SHORT = {ALONE: 2.5, UFM: 1.8, UFM_STAR: 1.2}
+NETWORK = "FastDepth"
+
+
+def rows_of(*names: str) -> list[Row]:
+    return [Row(Method.parse(name)) for name in names]
+
+
+def draw_maps(row: Row, sequence: str, pixels: int = 3000) -> Maps:
+    """Depth, variance and truth [pixels]; rows of a sequence share depth and truth, noise on poses shortens sigma."""
+    rng = np.random.default_rng(sum(map(ord, sequence)))
+    truth = rng.uniform(1.0, 6.0, pixels)
+    error = rng.uniform(0.05, 0.25) * truth * rng.uniform(0.2, 1.8, pixels)
+    depth = truth + error * rng.standard_normal(pixels)
+    if row.method.base == "depth_only" and row.method.fusion == ALONE:
+        return torch.tensor(depth), None, torch.tensor(truth)
+    noise = row.setting.rotation_noise / 10 + row.setting.translation_noise
+    short = SHORT[row.method.fusion] * (1 + noise) * (0.9 if row.method.max_points is None else 1.0)
+    sigma = error / short * rng.lognormal(0, 0.2, pixels)
+    return torch.tensor(depth), torch.tensor(sigma**2), torch.tensor(truth)
+
+
+def judge(maps: Maps, references: Mapping[str, Tensor]) -> tuple[Record, dict[str, dict[str, Tensor]]]:
+    """A record's figures and curves, and the sums behind them."""
+    depth, variance, truth = maps
+    metrics = SequenceMetrics(with_variance=variance is not None)
+    metrics.update(depth, variance, truth)
+    curves: dict[str, Any] = metrics.curves()
+    sums = {"metrics": dict(metrics.state_dict())}
+    for name, confident in references.items() if variance is not None else ():
+        by_error = NLLByError()
+        by_error.update(depth, variance, truth, confident)
+        curves |= {f"{curve}:{name}": value.tolist() for curve, value in by_error.compute().items()}
+        sums[f"nll_by_error:{name}"] = dict(by_error.state_dict())
+    return Record("", "", "", "", "", figures=metrics.compute(), curves=curves), sums
+
+
+def confident(variance: Tensor) -> Tensor:
+    return variance <= variance.quantile(0.5)
+
+
+def write_sequence(
+    out: Path, suite: str, dataset: str, sequence: str, rows: Iterable[Row], network: str = NETWORK
+) -> None:
+    """Records and sums of the rows on one sequence."""
+    folder = out / "work" / dataset / sequence
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = list(rows)
+    references = {
+        row.method.name: confident(variance)
+        for row in rows
+        if row.setting == Setting() and (row.method.fusion == ALONE or row.method.max_points)
+        for variance in [draw_maps(row, sequence)[1]]
+        if variance is not None
+    }
+    for row in rows:
+        judged, sums = judge(draw_maps(row, sequence), references)
+        torch.save(sums, folder / f"{row.slug}.pt")
+        record_of(suite, dataset, sequence, row, judged, network).save(folder / f"{row.slug}.json")
+
+
+def record_of(suite: str, dataset: str, sequence: str, row: Row, judged: Record, network: str = NETWORK) -> Record:
+    """The whole record of a judged row."""
+    size = {ALONE: 0.0, UFM: 40.0 * (row.method.max_points or 1_900_000), UFM_STAR: 64.0 * 400}[row.method.fusion]
+    members = 10 if row.method.every_member else 1
+    state = {"bytes_mean": size, "bytes_max": 1.2 * size, "bytes_end": size, "count_mean": size / 64}
+    return Record(
+        suite=suite,
+        dataset=dataset,
+        sequence=sequence,
+        network=network,
+        method=row.method.name,
+        setting=row.setting.to_dict(),
+        frames={"selected": 42, "done": 40, "skipped": 2, "reasons": {"pose is not finite": 2}},
+        figures=judged.figures,
+        curves=judged.curves,
+        state=state if size else {},
+        ms={"network": 9.0 * members, "uncertainty": {ALONE: 0.2, UFM: 14.0, UFM_STAR: 10.0}[row.method.fusion]},
+        provenance={"device": "cpu"},
+    )
+
+
+def write_about(out: Path, suite: str, title: str, rows: Sequence[Row], sequences: Sequence[tuple[str, str]]) -> None:
+    """``eval.json``."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_json_atomic(
+        out / "eval.json",
+        {
+            "format": 1,
+            "suite": suite,
+            "title": title,
+            "networks": {row.method.base: {"label": NETWORK} for row in rows},
+            "rows": [{"method": row.method.name, "setting": row.setting.to_dict()} for row in rows],
+            "datasets": sorted({dataset for dataset, _ in sequences}),
+            "sequences": [{"dataset": dataset, "sequence": sequence} for dataset, sequence in sequences],
+            "missing_bases": [],
+            "settings": {},
+            "versions": {},
+            "machine": {},
+        },
+    )
+
+
+def write_evaluation(
+    out: Path,
+    rows: Sequence[Row],
+    sequences: Sequence[tuple[str, str]],
+    *,
+    suite: str = "paper-table-1",
+    title: str = "Uncertainty quality",
+    unfinished: Sequence[tuple[str, str]] = (),
+    failed: Mapping[tuple[str, str], str] | None = None,
+) -> Path:
+    """A folder; ``unfinished`` sequences have no record yet, ``failed`` ones a reason."""
+    failed = failed or {}
+    write_about(out, suite, title, rows, [*sequences, *unfinished, *failed])
+    for dataset, sequence in sequences:
+        write_sequence(out, suite, dataset, sequence, rows)
+    for (dataset, sequence), reason in failed.items():
+        folder = out / "work" / dataset / sequence
+        folder.mkdir(parents=True)
+        values = {"sequence": sequence, "reason": reason, "rows": [row.slug for row in rows]}
+        (folder / "failed.json").write_text(json.dumps(values))
+    return out
