@@ -110,6 +110,7 @@ class BaseNetwork:
         label: as shown, "FastDepth".
         digest: tells these networks from others in a cache.
         identity: plain values for the record of what was run.
+        networks: the members as they are run, on ``device``; none of ground truth.
         passes: inferences that "all" takes.
         needs_image: whether it predicts from the image; from the depth map otherwise.
 
@@ -122,6 +123,7 @@ class BaseNetwork:
     def __init__(self, choice: NetworkChoice, device: torch.device, *, samples: int = SAMPLES) -> None:
         self.choice, self.base = choice, choice.base
         self._predictor: Predictor
+        self.networks: tuple[DepthNetwork, ...] = ()
         if choice.model == TRUTH:
             self.needs_image, self._members, self.passes = False, 1, 1
             self._predictor = TruthPredictor(choice.size)
@@ -132,7 +134,7 @@ class BaseNetwork:
         members = _load(choice)
         sampling = self.base == "mc_dropout"
         check_members(self.base, members, device)
-        self.needs_image, self._members = True, len(members)
+        self.needs_image, self._members, self.networks = True, len(members), tuple(members)
         self.passes = samples if sampling else len(members)
         self._predictor = MemberPredictor(members, device, sampling=sampling)
         files = [_identity(file) for file in choice.weights]
