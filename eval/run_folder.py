@@ -28,6 +28,7 @@ from ufmstar_torch.eval.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.output_folder import FolderError as FolderError
 from ufmstar_torch.eval.output_folder import differences, hold
 from ufmstar_torch.eval.output_folder import flatten as flatten
+from ufmstar_torch.eval.packed_sums import pack, unpack
 from ufmstar_torch.eval.writers import FrameWriter
 
 FORMAT = 1
@@ -35,8 +36,6 @@ PROGRAM = "ufmstar run"
 # Outputs that are made from the finished frames; the frames themselves are FrameWriter's.
 MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json")
 _RESERVE_BYTES = 2**20
-# Sums with more entries are stored by their non-zero entries: Spearman's 514 x 514 counts are mostly 0.
-_DENSE_ENTRIES = 4096
 
 
 @dataclass
@@ -163,23 +162,8 @@ class RunFolder:
 
 def _storable(checkpoint: Checkpoint) -> dict[str, Any]:
     """The checkpoint as it is stored: plain values and tensors, large ones by their non-zero entries."""
-    metrics = {name: {key: _packed(value) for key, value in sums.items()} for name, sums in checkpoint.metrics.items()}
+    metrics = {name: {key: pack(value) for key, value in sums.items()} for name, sums in checkpoint.metrics.items()}
     return {**checkpoint.__dict__, "format": FORMAT, "metrics": metrics}
-
-
-def _packed(value: Tensor) -> Tensor | dict[str, Any]:
-    if value.numel() <= _DENSE_ENTRIES:
-        return value
-    flat = value.flatten()
-    index = flat.nonzero()[:, 0]
-    return {"shape": list(value.shape), "index": index.to(torch.int32), "values": flat[index]}
-
-
-def _unpacked(value: Tensor | dict[str, Any]) -> Tensor:
-    if isinstance(value, Tensor):
-        return value
-    flat = value["values"].new_zeros(value["shape"]).flatten()
-    return flat.index_put((value["index"].long(),), value["values"]).reshape(value["shape"])
 
 
 def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
@@ -203,7 +187,7 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
         raise FolderError(
             f"--resume: {len(lost)} finished frames are gone from {out} ({shown}); --overwrite starts again"
         )
-    sums = {name: {key: _unpacked(v) for key, v in values.items()} for name, values in stored.pop("metrics").items()}
+    sums = {name: {key: unpack(v) for key, v in values.items()} for name, values in stored.pop("metrics").items()}
     return Checkpoint(metrics=sums, **stored), records
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ufmstar_torch.eval.packed_sums import unpack
+
 METRICS = "metrics"
 BY_ERROR = "nll_by_error:"
 Sums = Mapping[str, Mapping[str, Tensor]]
@@ -58,7 +60,7 @@ def read_sums(path: Path) -> Sums:
         raise SumsError(f"{path} does not hold the sums of metrics: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(sums, dict) or METRICS not in sums or not all(isinstance(s, Mapping) for s in sums.values()):
         raise SumsError(f"{path} does not hold the sums of metrics by name")
-    return sums
+    return {name: {key: unpack(value) for key, value in states.items()} for name, states in sums.items()}
 
 
 def _add(total: dict[str, dict[str, Tensor]], more: Sums, path: Path) -> None:
