@@ -1,7 +1,13 @@
-"""Many rows on one sequence in one pass."""
+"""Many rows on one sequence in one pass: every network sees a frame once, and every row sees the same frames.
+
+A frame that one row cannot use (its file is broken, its pose is no pose, a network has nothing to predict from) is
+left out by all rows, whose tables could not be compared otherwise. Pixels are each row's own: those with ground truth
+where it predicts something. How many it leaves out is among its figures (``left_out_share``).
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
@@ -12,9 +18,11 @@ from torch import Tensor
 
 from ufmstar_torch.eval.sequences.frame import Sequence
 from ufmstar_torch.eval.suite.cache import PredictionCache
-from ufmstar_torch.eval.suite.examples import Examples
+from ufmstar_torch.eval.suite.examples import Examples, ExampleWriter
+from ufmstar_torch.eval.suite.frame_pass import FramePass
 from ufmstar_torch.eval.suite.networks import BaseNetwork
 from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.row_run import RowRun
 
 
 class SequenceError(Exception):
@@ -71,7 +79,7 @@ def evaluate_sequence(
     Args:
         sequence: posed frames with ground truth.
         rows: different ones.
-        networks: by base; on ``device``.
+        networks: by base.
         cache: of predictions.
         device: where UfM and UfM* run.
         limit: which frames, before a setting's skip.
@@ -88,4 +96,55 @@ def evaluate_sequence(
         Stopped: ``stop`` said so.
         ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know.
     """
-    raise SequenceError(f"{sequence.name}: nothing is judged yet")
+    _check(rows, networks, confident)
+    indices = range(len(sequence))[limit]
+    if not indices:
+        raise SequenceError(f"no frame is selected of {len(sequence)}")
+    if all(sequence.entries[index].load_depth is None for index in indices):
+        raise SequenceError("no frame has ground truth")
+    frames = FramePass(sequence, rows, networks, cache, device, confident)
+    writer = None if examples is None else ExampleWriter(examples, len(indices))
+    progress(0, len(indices))
+    for number, index in enumerate(indices):
+        if stop():
+            raise Stopped
+        finished = frames.take(number, index)
+        if writer is not None:
+            writer.after(number + 1, finished, frames.runs)
+        progress(number + 1, len(indices))
+    if writer is not None:
+        writer.end(frames.runs)
+    return [_result(run, sequence) for run in frames.runs]
+
+
+def _check(rows: SequenceOf[Row], networks: Mapping[str, BaseNetwork], confident: float) -> None:
+    """Raises ValueError for what ``evaluate_sequence`` cannot do, whatever the sequence."""
+    if not rows or len({row.slug for row in rows}) < len(rows):
+        raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
+    missing = sorted({row.method.base for row in rows} - networks.keys())
+    if missing:
+        raise ValueError(f"networks must hold one for each base of the rows, {', '.join(missing)} is missing")
+    if not 0 < confident <= 1:
+        raise ValueError(f"confident must be a share in (0, 1], got {confident}")
+
+
+def _result(run: RowRun, sequence: Sequence) -> RowResult:
+    """What a row leaves behind.
+
+    Raises:
+        SequenceError: it has judged nothing.
+    """
+    frames = run.frames()
+    if not frames["judged"]:
+        told = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
+        raise SequenceError(f"no frame could be judged: {told or 'none of those that were read has ground truth'}")
+    opened = Counter(skipped.reason for skipped in sequence.skipped)
+    return RowResult(
+        row=run.row,
+        frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
+        figures=run.figures(),
+        curves=run.curves(),
+        state=run.state(),
+        ms=run.ms(),
+        sums=run.sums(),
+    )

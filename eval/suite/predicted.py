@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -34,6 +34,10 @@ class Predicted:
     def size(self) -> tuple[int, int]:
         """(h, w)."""
         return self.depth.shape[0], self.depth.shape[1]
+
+    def to(self, device: torch.device) -> Predicted:
+        """With its maps on a device."""
+        return replace(self, **{name: value.to(device) for name, value in self.maps().items()})
 
     def maps(self) -> dict[str, Tensor]:
         """Those of depth, aleatoric and epistemic that are there."""
