@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from ufmstar_torch.eval.benchmark_machine import hardware, versions
-from ufmstar_torch.eval.output_folder import FolderError
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.suite.cache import PredictionCache
 from ufmstar_torch.eval.suite.confident import references
@@ -28,7 +27,7 @@ from ufmstar_torch.eval.suite.worklist import Shard, WorkItem, content_digest
 Evaluate = Callable[..., list[RowResult]]
 # What a sequence that cannot be used raises when it is opened or evaluated. A mistake in this program raises others,
 # and ends it.
-_BROKEN = (SequenceError, FrameError, FileNotFoundError, NotADirectoryError, RuntimeError, ValueError)
+_BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 _POLL_SECONDS = 0.2
 DIED = "the process that evaluated it was killed (for want of memory?)"
 
@@ -110,7 +109,7 @@ class Conduct:
         progress: called with a sequence's label, its frames that are done, and all of them.
     """
 
-    shard: Shard = Shard()
+    shard: Shard = field(default_factory=Shard)
     helps: bool = False
     waits: bool = False
     launch: str = ""
@@ -191,7 +190,7 @@ def _take(job: EvalJob, folder: EvalFolder, networks: Mapping[str, BaseNetwork],
     try:
         sequence = item.open()
         digest = content_digest(sequence)
-    except _BROKEN as error:
+    except (*_BROKEN, OSError) as error:
         _fail(folder, item, error, missing, turn)
         return
     folder.require_same_sequence(item, digest)
@@ -237,8 +236,6 @@ def failures(folder: EvalFolder, items: Iterable[WorkItem]) -> dict[str, str]:
 
 
 def _fail(folder: EvalFolder, item: WorkItem, error: Exception, rows: Sequence[Row], turn: _Turn) -> None:
-    if isinstance(error, FolderError):
-        raise error
     reason = " ".join(str(error).split()) or type(error).__name__
     folder.fail(item, reason, rows, turn.launch)
     turn.conduct.tell(f"{item.label}: failed: {reason}")
