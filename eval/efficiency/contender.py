@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.efficiency.memory import NetworkMemory, tensor_bytes
 from ufmstar_torch.eval.suite.method import BASES
+from ufmstar_torch.eval.suite.networks import BaseNetwork
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
@@ -87,6 +87,13 @@ class Contender:
     def _run(self, network: DepthNetwork, x: Tensor) -> DepthPrediction:
         with torch.inference_mode():
             return network(x)
+
+
+def contenders(networks: Mapping[str, BaseNetwork]) -> dict[str, Contender]:
+    """The networks of an evaluation by base; ground truth is none, since nothing runs."""
+    return {
+        base: Contender(base, one.networks, one.label, one.passes) for base, one in networks.items() if one.networks
+    }
 
 
 def depth_alone(network: DepthNetwork) -> DepthNetwork:

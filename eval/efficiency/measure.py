@@ -16,20 +16,19 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.benchmark_machine import available_cores, hardware, load_average, versions
-from ufmstar_torch.eval.benchmark_timing import paired_ratio, pinned_threads, spread
+from ufmstar_torch.eval.benchmark_timing import pinned_threads
 from ufmstar_torch.eval.efficiency.contender import Contender
-from ufmstar_torch.eval.efficiency.memory import overhead_percent
+from ufmstar_torch.eval.efficiency.lines import NETWORK, network_line, row_line
 from ufmstar_torch.eval.efficiency.multiview import Multiview, synchronize
 from ufmstar_torch.eval.efficiency.power import CPU, GPU, PowerMeter
-from ufmstar_torch.eval.efficiency.race import DEPTH, EVERY, MULTIVIEW, ONCE, Race, parts_of, run_race
-from ufmstar_torch.eval.efficiency.windows import PartEnergy, Work, repeated, run_windows
+from ufmstar_torch.eval.efficiency.race import DEPTH, EVERY, MULTIVIEW, Race, inference_of, parts_of, run_race
+from ufmstar_torch.eval.efficiency.windows import Work, repeated, run_windows
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.eval.sequences.frame import Sequence as PosedSequence
-from ufmstar_torch.eval.suite.method import ALONE, Method
+from ufmstar_torch.eval.suite.method import ALONE
+from ufmstar_torch.eval.suite.row import Row
 
 FORMAT = 1
-NOT_NEEDED = "the method asks nothing of the network but depth"
-NETWORK = "network_uncertainty"
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ class Plan:
 
 
 def measure(
-    rows: Sequence[Method],
+    rows: Sequence[Row],
     networks: Mapping[str, Contender],
     sequence: PosedSequence,
     *,
@@ -96,8 +95,8 @@ def measure(
     """
     plan = plan or Plan()
     device, multiview_device = torch.device(device), torch.device(multiview_device)
-    left_out = {row.name: why for row in rows if (why := _obstacle(row, networks)) is not None}
-    chosen = [row for row in rows if row.name not in left_out]
+    left_out = {row.label: why for row in rows if (why := _obstacle(row, networks)) is not None}
+    chosen = [row for row in rows if row.label not in left_out]
     if not chosen:
         raise ValueError(f"rows must hold one that can be measured: {left_out or 'none was given'}")
     frames, unreadable = _frames(sequence, plan)
@@ -111,7 +110,7 @@ def measure(
         units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
         work = _work(chosen, networks, race, device, multiview_device)
         energy = run_windows(meter, work, idle, seconds=plan.seconds, windows=plan.windows)
-    used = [base for base in networks if any(row.base == base for row in chosen)]
+    used = [base for base in networks if any(row.method.base == base for row in chosen)]
     return {
         "format": FORMAT,
         "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": _gpu(on_gpu)},
@@ -119,18 +118,21 @@ def measure(
         "plan": {**asdict(plan), "threads": plan.threads or available_cores()},
         "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": unreadable},
         "power": {"rails": [asdict(rail) for rail in meter.rails], "missing": meter.missing, "idle_watts": idle},
-        "networks": {base: _network(networks[base], race, energy) for base in used},
-        "rows": [_row(row, networks[row.base], race, energy) for row in chosen],
+        "networks": {base: network_line(networks[base], race, energy) for base in used},
+        "rows": [row_line(row, networks[row.method.base], race, energy) for row in chosen],
         "left_out": left_out,
     }
 
 
-def _obstacle(row: Method, networks: Mapping[str, Contender]) -> str | None:
+def _obstacle(row: Row, networks: Mapping[str, Contender]) -> str | None:
     """Why a row cannot be measured."""
-    if row.base not in networks:
-        return f"no network for {row.base}"
-    if row.every_member and not networks[row.base].several:
-        return f"it runs several members, {networks[row.base].label} has one"
+    base, setting = row.method.base, row.setting
+    if base not in networks:
+        return f"no network for {base}"
+    if row.method.every_member and not networks[base].several:
+        return f"it runs several members, {networks[base].label} has one"
+    if setting.skip or setting.rotation_noise or setting.translation_noise:
+        return "left out frames and noise on poses are no matter of efficiency"
     return None
 
 
@@ -160,7 +162,7 @@ def _gpu(device: torch.device | None) -> str | None:
 
 
 def _work(
-    rows: Sequence[Method],
+    rows: Sequence[Row],
     networks: Mapping[str, Contender],
     race: Race,
     device: torch.device,
@@ -174,11 +176,11 @@ def _work(
             calls = [partial(_infer, one, part, p.x, n) for n, p in enumerate(prepared)]
             work[base, part] = (_unit(device), repeated(calls, partial(synchronize, device)))
     for row in rows:
-        if row.fusion != ALONE:
-            inputs = race.inputs[row.base, EVERY if row.every_member else ONCE]
-            one_row = Multiview(row, multiview_device)
-            steps = [partial(_advance, one_row, n, given) for n, given in enumerate(inputs)]
-            work[row.name, MULTIVIEW] = (_unit(multiview_device), repeated(steps, partial(synchronize, multiview_device)))
+        if row.method.fusion != ALONE:
+            inputs, judge = race.inputs[row.method.base, inference_of(row)], Multiview(row, multiview_device)
+            steps = [partial(_advance, judge, n, given) for n, given in enumerate(inputs)]
+            repeat = repeated(steps, partial(synchronize, multiview_device))
+            work[row.label, MULTIVIEW] = (_unit(multiview_device), repeat)
     return work
 
 
@@ -196,91 +198,3 @@ def _advance(row: Multiview, number: int, given: Any) -> None:
     if number == 0:
         row.module.reset()
     row(given)
-
-
-# ---- what is told ----
-
-Energies = Mapping[tuple[str, str], PartEnergy]
-
-
-def _network(network: Contender, race: Race, energy: Energies) -> dict[str, Any]:
-    """A base's networks: what they are, and what depth alone and each form of inference take."""
-    memory = network.memory()
-    parts = [part for part in (DEPTH, ONCE, EVERY) if race.ms(network.base, part)]
-    return {
-        "label": network.label,
-        "members": len(network.members),
-        "passes": network.passes,
-        "whole": network.why_whole,
-        "memory": None if memory is None else asdict(memory),
-        "latency": {part: spread(race.ms(network.base, part)) for part in parts},
-        "energy": {part: energy[network.base, part].to_dict() for part in parts},
-    }
-
-
-def _row(row: Method, network: Contender, race: Race, energy: Energies) -> dict[str, Any]:
-    """One line of the table."""
-    part = EVERY if row.every_member else ONCE
-    depth_ms, name = race.ms(row.base, DEPTH), row.name
-    missing = _no_network_part(row, network)
-    latency: dict[str, Any] = {DEPTH: spread(depth_ms)}
-    ratios: dict[str, Any] = {}
-    spent: dict[str, PartEnergy] = {DEPTH: energy[row.base, DEPTH]}
-    if missing is None:
-        added = race.added_ms(row.base, part)
-        latency[NETWORK], ratios[NETWORK] = spread(added), paired_ratio(added, depth_ms)
-        spent[NETWORK] = energy[row.base, part].minus(energy[row.base, DEPTH])
-    else:
-        latency[NETWORK] = missing
-    if row.fusion != ALONE:
-        own = race.ms(name, MULTIVIEW)
-        latency[MULTIVIEW], ratios[MULTIVIEW] = spread(own), paired_ratio(own, depth_ms)
-        spent[MULTIVIEW] = energy[name, MULTIVIEW]
-    return {
-        "method": name,
-        "base": row.base,
-        "label": network.label,
-        "latency": latency,
-        "ratios_to_depth": ratios,
-        "stages": race.staged[name].clock.summary() if name in race.staged else None,
-        "energy": {key: value.to_dict() for key, value in spent.items()} | ({} if missing is None else {NETWORK: missing}),
-        "energy_overhead_percent": _energy_overhead(spent, missing),
-        "memory": _memory(row, network, race),
-    }
-
-
-def _no_network_part(row: Method, network: Contender) -> dict[str, str] | None:
-    """None, or why the network's share for uncertainty is nothing or unknown."""
-    if row.base == "depth_only":
-        return {"none": NOT_NEEDED}
-    if network.why_whole is not None and not row.every_member:
-        return {"not_separable": network.why_whole}
-    return None
-
-
-def _energy_overhead(spent: Mapping[str, PartEnergy], missing: Mapping[str, str] | None) -> dict[str, float] | None:
-    """Share of uncertainty in all energy [%], gross and net; None unless all of it was measured."""
-    if any(part.reason is not None for part in spent.values()) or (missing is not None and "none" not in missing):
-        return None
-    overhead: dict[str, float] = {}
-    for kind, field in (("gross", "joules"), ("net", "net")):
-        middle = {key: float(torch.tensor(getattr(part, field)).double().median()) for key, part in spent.items()}
-        depth = middle.pop(DEPTH)
-        if depth > 0 and sum(middle.values()) >= 0:
-            overhead[kind] = overhead_percent(sum(middle.values()), depth)
-    return overhead or None
-
-
-def _memory(row: Method, network: Contender, race: Race) -> dict[str, Any]:
-    """Bytes of the network for depth, of what uncertainty adds to it, and of the multiview state; the share."""
-    memory = network.memory()
-    state = race.multiview[row.name].memory() if row.fusion != ALONE else None
-    if memory is None:
-        return {"multiview": state, "not_measurable": "the weights are not torch's tensors"}
-    uncertainty = memory.uncertainty + (0 if state is None else state["bytes_end"])
-    return {
-        "depth_bytes": memory.depth,
-        "network_uncertainty_bytes": memory.uncertainty,
-        "multiview": state,
-        "overhead_percent": overhead_percent(uncertainty, memory.depth),
-    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,11 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import UfMStar
 from ufmstar_torch.backend import Backend, select
-from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.eval.benchmark_timing import StageClock
-from ufmstar_torch.eval.suite.method import UFM, UFM_STAR, Method
+from ufmstar_torch.eval.suite.estimator import ufm_star_config
+from ufmstar_torch.eval.suite.method import ALONE, UFM, Method
+from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.ufm import UfM, UfMConfig
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.prediction import DepthPrediction
@@ -37,9 +37,7 @@ class Inputs:
     T_world_cam: Tensor
     intrinsics: Tensor
 
-    def maps(
-        self, method: Method, device: torch.device
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
+    def maps(self, method: Method, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor | None]:
         """Depth, pose, intrinsics, A and E as the method takes them, on its device."""
         p = self.prediction
         own = (p.aleatoric_variance, p.epistemic_variance) if method.uses_aleatoric else (None, None)
@@ -51,18 +49,16 @@ class Multiview:
     """The multiview part of a row, with a state of its own.
 
     Args:
-        method: behind UfM or UfM*.
+        row: behind UfM or UfM*.
         device: where it runs.
 
     Raises:
-        ValueError: a method without a multiview part.
+        ValueError: a row without a multiview part.
     """
 
-    def __init__(self, method: Method, device: torch.device) -> None:
-        if method.fusion not in (UFM, UFM_STAR):
-            raise ValueError(f"{method.name} has no multiview part")
-        self.method, self.device = method, device
-        self.module = build(method).to(device)
+    def __init__(self, row: Row, device: torch.device) -> None:
+        self.method, self.device = row.method, device
+        self.module = build(row).to(device)
         self.bytes: list[int] = []
         self.count: list[int] = []
 
@@ -94,18 +90,18 @@ class StagedUfMStar:
     """UfM* on a state of its own, with a clock at every stage; on an accelerator each stage is waited for.
 
     Args:
-        method: behind UfM*.
+        row: behind UfM*.
         device: where it runs.
 
     Raises:
-        ValueError: a method that is not behind UfM*.
+        ValueError: a row that is not behind UfM*.
     """
 
-    def __init__(self, method: Method, device: torch.device) -> None:
-        module = build(method)
+    def __init__(self, row: Row, device: torch.device) -> None:
+        module = build(row)
         if not isinstance(module, UfMStar):
-            raise ValueError(f"{method.name} is not behind UfM*, whose stages are known")
-        self.method, self.device, self.config = method, device, module.config
+            raise ValueError(f"{row.label} is not behind UfM*, whose stages are known")
+        self.method, self.device, self.config = row.method, device, module.config
         self.clock = StageClock()
         self.backend = self.clock.wrap(_waited_for(select(self.config.backend, device.type), device))
         self.state = UfMStarState.initial(1, self.config, torch.float32, device)
@@ -126,11 +122,17 @@ class StagedUfMStar:
             self.clock.stop()
 
 
-def build(method: Method) -> UfM | UfMStar:
-    """The module behind a row, with the paper's settings."""
-    if method.fusion == UFM:
-        return UfM(UfMConfig(max_points=method.max_points))
-    return UfMStar(UfMStarConfig(segment=SPGFConfig(scale_with_image=not method.fixed_param)))
+def build(row: Row) -> UfM | UfMStar:
+    """The module behind a row, as the evaluation builds it.
+
+    Raises:
+        ValueError: a row without a multiview part.
+    """
+    if row.method.fusion == ALONE:
+        raise ValueError(f"{row.label} has no multiview part")
+    if row.method.fusion == UFM:
+        return UfM(UfMConfig(max_points=row.method.max_points, on_bad_frame="skip"))
+    return UfMStar(ufm_star_config(row))
 
 
 def state_bytes(module: UfM | UfMStar) -> tuple[int, int]:
@@ -165,5 +167,3 @@ def _waited_for(backend: Backend, device: torch.device) -> Backend:
         return backend
     kernels: dict[str, Any] = {name: waited(getattr(backend, name), device) for name in _KERNELS}
     return replace(backend, **kernels)
-
-

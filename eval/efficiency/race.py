@@ -17,7 +17,8 @@ from ufmstar_torch.eval.benchmark_timing import Stopwatch
 from ufmstar_torch.eval.efficiency.contender import Contender
 from ufmstar_torch.eval.efficiency.multiview import Inputs, Multiview, StagedUfMStar, synchronize, waited
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
-from ufmstar_torch.eval.suite.method import ALONE, UFM_STAR, Method
+from ufmstar_torch.eval.suite.method import ALONE, UFM_STAR
+from ufmstar_torch.eval.suite.row import Row
 
 DEPTH, ONCE, EVERY, MULTIVIEW = "depth", "once", "every", "multiview"
 
@@ -45,7 +46,7 @@ class Race:
         watch: wall-clock times by (base or row, part), of the frames after the warm-up.
         prepared: by base, every frame.
         inputs: by base and part ("once" or "every"), what the multiview methods were given.
-        multiview: by row's name, the state after the last frame.
+        multiview: by row's label, the state after the last frame.
         staged: likewise, the stages of UfM*.
     """
 
@@ -64,15 +65,19 @@ class Race:
         return [a - b for a, b in zip(self.ms(base, part), self.ms(base, DEPTH), strict=True)]
 
 
-def parts_of(base: str, rows: Iterable[Method]) -> tuple[str, ...]:
+def parts_of(base: str, rows: Iterable[Row]) -> tuple[str, ...]:
     """What has to be run of a base's networks for the rows on it; depth alone always."""
-    own = [row for row in rows if row.base == base]
-    needed = {EVERY if row.every_member else ONCE for row in own}
+    needed = {inference_of(row) for row in rows if row.method.base == base}
     return (DEPTH, *(part for part in (ONCE, EVERY) if part in needed))
 
 
+def inference_of(row: Row) -> str:
+    """The form of inference that a row gets its prediction from."""
+    return EVERY if row.method.every_member else ONCE
+
+
 def run_race(
-    rows: Sequence[Method],
+    rows: Sequence[Row],
     contenders: Mapping[str, Contender],
     frames: Sequence[Frame],
     *,
@@ -94,21 +99,21 @@ def run_race(
         FrameError: a frame has no image.
     """
     race = Race()
-    bases = [base for base in contenders if any(row.base == base for row in rows)]
-    judged = [row for row in rows if row.fusion != ALONE]
-    race.multiview = {row.name: Multiview(row, multiview_device) for row in judged}
-    race.staged = {row.name: StagedUfMStar(row, multiview_device) for row in judged if row.fusion == UFM_STAR}
+    bases = [base for base in contenders if any(row.method.base == base for row in rows)]
+    judged = [row for row in rows if row.method.fusion != ALONE]
+    gaussians = [row for row in judged if row.method.fusion == UFM_STAR]
+    race.multiview = {row.label: Multiview(row, multiview_device) for row in judged}
+    race.staged = {row.label: StagedUfMStar(row, multiview_device) for row in gaussians}
     for number, frame in enumerate(frames):
         for base in _turned(bases, number):
             _run_networks(race, contenders[base], parts_of(base, rows), frame, number, device)
         for row in _turned(judged, number):
-            given = race.inputs[row.base, EVERY if row.every_member else ONCE][-1]
-            synchronize(device)
-            one = race.multiview[row.name]
-            race.watch.time(f"{row.name}/{MULTIVIEW}", waited(one, multiview_device), given)
+            given = race.inputs[row.method.base, inference_of(row)][-1]
+            one = race.multiview[row.label]
+            race.watch.time(f"{row.label}/{MULTIVIEW}", waited(one, multiview_device), given)
             one.note()
-            if row.name in race.staged:
-                race.staged[row.name](given)
+            if row.label in race.staged:
+                race.staged[row.label](given)
     race.watch.drop(warm_up)
     for staged in race.staged.values():
         staged.clock.drop(warm_up)

@@ -7,7 +7,6 @@ for its wrapping, every second; a difference modulo the counter's range needs no
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -55,7 +54,9 @@ def find_sources(gpu: int | None) -> tuple[list[Source], dict[str, str]]:
 
 
 def _both(reason: str | None, chip: str | None) -> str:
-    return "; ".join(text for text in (reason, chip) if text)
+    """What zeus says, as one reason."""
+    told = ", ".join(f'"{text}"' for text in (reason, chip) if text)
+    return f"there is no counter of it that zeus can read ({told})"
 
 
 def _try(open_: Callable[[], Source]) -> tuple[Source | None, str | None]:
@@ -191,9 +192,3 @@ def _without(source: Source, part: str) -> Source:
     """A source whose rails of a part count in no column."""
     rails = tuple(Rail(r.name, OTHER if r.part == part else r.part, r.wraps_at) for r in source.rails)
     return Source(rails, source.read, source.period)
-
-
-def describe_limits() -> str:
-    """Whether this process may read RAPL at all, in words, for a report."""
-    root = hasattr(os, "geteuid") and os.geteuid() == 0
-    return "runs as root" if root else "does not run as root, which RAPL asks for"

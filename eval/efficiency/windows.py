@@ -45,13 +45,17 @@ class PartEnergy:
         return PartEnergy(joules, net, seconds)
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: medians and quartiles per frame [mJ], and power while the part runs [W]; or the reason."""
+        """For JSON: medians and quartiles per frame [mJ], the time that goes with them [s], and power while the part
+        runs [W]; or the reason."""
         if self.reason is not None:
             return {"not_measurable": self.reason}
         told: dict[str, Any] = {}
         for name, values in (("gross", self.joules), ("net", self.net)):
             low, middle, high = (1e3 * float(v) for v in np.percentile(values, (25, 50, 75)))
-            told[name] = {"millijoules": middle, "q1": low, "q3": high, "watts": _power(values, self.seconds)}
+            told[name] = {
+                "millijoules": middle, "q1": low, "q3": high,
+                "seconds": float(np.median(self.seconds)), "watts": _power(values, self.seconds),
+            }  # fmt: skip
         return {**told, "windows": len(self.joules)}
 
 
@@ -91,7 +95,9 @@ def run_windows(
                 results[key].append(value)
     energies = {}
     for key, values in results.items():
-        energies[key] = PartEnergy(reason=reasons[key]) if key in reasons else PartEnergy(*map(tuple, zip(*values)))
+        energies[key] = (
+            PartEnergy(reason=reasons[key]) if key in reasons else PartEnergy(*map(tuple, zip(*values, strict=True)))
+        )
     return energies
 
 

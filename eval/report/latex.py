@@ -66,6 +66,8 @@ def _line(line: Line) -> str:
 def _cell(cell: Cell) -> str:
     if not cell.value:
         return "--"
+    if cell.value[0].isalpha():  # words instead of a number
+        return escape(cell.value)
     value = rf"\mathbf{{{cell.value}}}" if cell.bold else cell.value
     text = f"${value} \\pm {cell.half}$" if cell.half else f"${value}$"
     return f"{text} ({escape(cell.remark)})" if cell.remark else text
