@@ -7,20 +7,17 @@ hundred Gaussians, UfM keeps every pixel it has ever seen as a point: 40 bytes e
 
 from __future__ import annotations
 
-import json
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ufmstar_torch.camera import relative_pose
 from ufmstar_torch.eval.ufm_cloud import MOMENTS, Cloud, Taken, View, take_in
 from ufmstar_torch.eval.ufm_config import UfMConfig as UfMConfig
 from ufmstar_torch.frame import FrameInput, check_frame
+from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import raise_faults
 
 _STATE = ("moments", "count", "points", "T_world_first", "started", "frames", "skipped")
@@ -76,7 +73,7 @@ class UfMOutput:
         return self.variance.sqrt()
 
 
-class UfM(nn.Module):
+class UfM(StatefulModule):
     """Uncertainty from Motion: feed it one predicted depth map per image, read a variance per pixel.
 
     The points of all streams lie behind each other in buffers, which ``.to()``, ``deepcopy`` and ``state_dict``
@@ -92,6 +89,8 @@ class UfM(nn.Module):
         ValueError: another dtype.
     """
 
+    STATE = _STATE
+    config: UfMConfig
     moments: Tensor
     count: Tensor
     points: Tensor
@@ -146,7 +145,7 @@ class UfM(nn.Module):
             depth, pose, intrinsics, aleatoric, epistemic, valid, None,
             feature_count=0, rotation_tolerance=self.config.rotation_tolerance,
         )  # fmt: skip
-        with torch.inference_mode(False), torch.no_grad(), _full_precision(frame.depth.device):
+        with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame.fault.tolist())
             variance, statistics = self._advance(frame)
@@ -246,43 +245,6 @@ class UfM(nn.Module):
             raise ValueError(f"depth lies on {device} but the state on {self.moments.device}: move one with .to()")
         return self.clouds(), {name: getattr(self, name) for name in _STATE}
 
-    def _store(self, state: Mapping[str, Tensor]) -> None:
-        for name in _STATE:
-            setattr(self, name, state[name])
-
-    # ---- nn.Module plumbing, as in UfMStar ----
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> UfM:
-        """``.to()`` and friends; half precision is refused for the state, and the first pose stays float64."""
-        before = {name: getattr(self, name) for name in _STATE}
-        super()._apply(fn, recurse)
-        for name, old in before.items():
-            moved = getattr(self, name)
-            narrowed = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
-            if (narrowed or name == "T_world_first") and moved.dtype != old.dtype:
-                setattr(self, name, old.to(moved.device))
-        return self
-
-    def get_extra_state(self) -> Tensor:
-        """The config as bytes, so that a checkpoint says what it was made with."""
-        return torch.tensor(list(json.dumps(self.config.to_dict()).encode()), dtype=torch.uint8)
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Warn where the config of a loaded state differs from this module's."""
-        saved = json.loads(bytes(state.tolist()).decode())
-        ours = self.config.to_dict()
-        changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
-        if changed:
-            warnings.warn(f"the loaded state was made with another config: {', '.join(changed)} differ", stacklevel=2)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Take the shapes of a saved state (streams, points) before its values are copied."""
-        for name in _STATE:
-            saved, own = state_dict.get(prefix + name), getattr(self, name)
-            if isinstance(saved, Tensor) and saved.shape != own.shape:
-                setattr(self, name, torch.empty(saved.shape, dtype=own.dtype, device=own.device))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
     def extra_repr(self) -> str:
         """Streams and points."""
         return f"streams={len(self.points)}, points={self.points.tolist()}, max_points={self.config.max_points}"
@@ -323,10 +285,3 @@ def _statistics(taken: Sequence[Taken], points: Tensor, frame: FrameInput) -> Uf
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
     )
-
-
-def _full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Autocast off, where the device has it."""
-    if not torch.amp.is_autocast_available(device.type):
-        return nullcontext()
-    return torch.autocast(device.type, enabled=False)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import warnings
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ufmstar_torch.backend import select
 from ufmstar_torch.camera import invert_rigid
@@ -18,6 +14,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression, regress, sample_pixels
+from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import FrameStatistics, StepOutput, UfMStarState, step
 
 _MIXTURE = ("mean", "covariance", "weight", "disagreement", "count", "features")
@@ -76,7 +73,7 @@ class MeanUncertainty:
     statistics: FrameStatistics
 
 
-class UfMStar(nn.Module):
+class UfMStar(StatefulModule):
     """Uncertainty from Motion*: feed it one predicted depth map per image, read a variance per pixel.
 
     The state (the mixture of every stream) lives in buffers: ``.to()``, ``deepcopy`` and ``state_dict``
@@ -98,6 +95,8 @@ class UfMStar(nn.Module):
             trust = out.std                              # [m]
     """
 
+    STATE = _STATE
+    config: UfMStarConfig
     mean: Tensor
     covariance: Tensor
     weight: Tensor
@@ -249,7 +248,7 @@ class UfMStar(nn.Module):
             raise ValueError("query needs a mixture: call the module on a frame first")
         if points.dim() != 3 or points.shape[0] != streams or points.shape[2] != 3:
             raise ValueError(f"points must be [{streams}, N, 3], got {tuple(points.shape)}")
-        with torch.no_grad(), _full_precision(points.device):
+        with torch.no_grad(), full_precision(points.device):
             local = points.detach()
             if frame == "world":
                 T = invert_rigid(self.T_world_first)
@@ -286,7 +285,7 @@ class UfMStar(nn.Module):
     def _reset(self, streams: Sequence[int] | Tensor | None) -> None:
         dtype, device, b = self.mean.dtype, self.mean.device, self.mean.shape[0]
         if streams is None:
-            self._store(UfMStarState.initial(0, self.config, dtype, device))
+            self._store(_to_buffers(UfMStarState.initial(0, self.config, dtype, device)))
             return
         chosen = torch.as_tensor(streams, device=device)
         if chosen.dtype == torch.bool and chosen.shape != (b,):
@@ -309,11 +308,11 @@ class UfMStar(nn.Module):
         with (
             torch.inference_mode(False),
             torch.no_grad(),
-            _full_precision(frame.depth.device),
+            full_precision(frame.depth.device),
         ):
             backend = select(self.config.backend, frame.depth.device.type)
             state, out = step(self._state_for(frame), frame, self.config, backend, pixels=pixels, average=average)
-        self._store(state)
+        self._store(_to_buffers(state))
         return out
 
     def _state_for(self, frame: FrameInput) -> UfMStarState:
@@ -327,10 +326,6 @@ class UfMStar(nn.Module):
         if self.mean.device != device:
             raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
         return self.state
-
-    def _store(self, state: UfMStarState) -> None:
-        for name, value in _to_buffers(state).items():
-            setattr(self, name, value)
 
     def _check(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
@@ -348,50 +343,9 @@ class UfMStar(nn.Module):
             total = total + epistemic
         return total.clamp_min(self.config.variance_floor) if self.config.variance_floor else total
 
-    # ---- nn.Module plumbing ----
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> UfMStar:
-        """``.to()`` and friends, except that half precision is refused for the state and that the
-        pose of the first camera stays float64: a world coordinate of kilometres needs it."""
-        before = {name: getattr(self, name) for name in _STATE}
-        super()._apply(fn, recurse)
-        for name, old in before.items():
-            moved = getattr(self, name)
-            narrowed = moved.is_floating_point() and moved.dtype not in (torch.float32, torch.float64)
-            if (narrowed or name == "T_world_first") and moved.dtype != old.dtype:
-                setattr(self, name, old.to(moved.device))
-        return self
-
-    def get_extra_state(self) -> Tensor:
-        """The config as bytes, so that a checkpoint (safetensors too) says what it was made with."""
-        return torch.tensor(list(json.dumps(self.config.to_dict()).encode()), dtype=torch.uint8)
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Warn where the config of a loaded state differs from this module's."""
-        saved = json.loads(bytes(state.tolist()).decode())
-        ours = self.config.to_dict()
-        changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
-        if changed:
-            warnings.warn(f"the loaded state was made with another config: {', '.join(changed)} differ", stacklevel=2)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Take the shapes of a saved state (streams, capacity, image size) before its values are copied."""
-        for name in _STATE:
-            saved, own = state_dict.get(prefix + name), getattr(self, name)
-            if isinstance(saved, Tensor) and saved.shape != own.shape:
-                setattr(self, name, torch.empty(saved.shape, dtype=own.dtype, device=own.device))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
     def extra_repr(self) -> str:
         """Streams and components."""
         return f"streams={self.mean.shape[0]}, capacity={self.mean.shape[1]}, backend={self.config.backend!r}"
-
-
-def _full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Autocast off, where the device has it: it would turn the fusion's products into half precision."""
-    if device.type == "meta" or not torch.amp.is_autocast_available(device.type):
-        return nullcontext()
-    return torch.autocast(device.type, enabled=False)
 
 
 def _to_buffers(state: UfMStarState) -> dict[str, Tensor]:
