@@ -17,19 +17,15 @@ import torch
 
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.files import write_atomic
-from ufmstar_torch.eval.sequences.images import natural_key
+from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.nyu import INTRINSICS, NATIVE_SIZE, PARTS, part_files, read_h5
 from ufmstar_torch.train.samples import RawSample, SampleError
 
 if TYPE_CHECKING:
     import h5py
 
-# The colour camera's calibration in the dataset's toolbox [px], for images of 640 x 480.
-INTRINSICS = (518.857901, 519.469611, 325.582449, 253.736166)
-_SIZE = (480, 640)
 # [1] Files whose aspect ratio differs by more were cropped, so that the calibration does not hold for them.
 _ASPECT_TOLERANCE = 0.02
-# What h5py raises for files that are damaged in one way or another, and for datasets that are missing.
-_BROKEN = (OSError, KeyError, RuntimeError, ValueError)
 # Of scenes, taken in alphabetical order, every this many goes into the validation part where no split is given.
 _VALIDATION_EVERY = 4
 
@@ -47,10 +43,10 @@ class NyuFrames:
     """
 
     def __init__(self, root: str | Path, part: str) -> None:
-        if part not in ("train", "val"):
+        if part not in PARTS:
             raise ValueError(f"part must be 'train' or 'val', got {part!r}")
         folder = Path(root) / part
-        found = sorted(folder.glob("*/*.h5"), key=lambda path: (path.parent.name, natural_key(path)))
+        found = part_files(folder)
         if not found:
             raise FileNotFoundError(f"{folder} holds no <scene>/*.h5: expected FastDepth's layout of NYU Depth V2")
         self.files = tuple(found)
@@ -69,8 +65,10 @@ class NyuFrames:
             SampleError: it cannot be read, lacks ``rgb`` or ``depth``, or they have other types or shapes.
         """
         path = self.files[index]
-        rgb, depth = _read(path)
-        _check(path, rgb, depth)
+        try:
+            rgb, depth = read_h5(path)
+        except FrameError as error:
+            raise SampleError(str(path), error.reason) from error
         return RawSample(
             image=torch.from_numpy(rgb),
             depth=torch.from_numpy(depth.astype(np.float32)),
@@ -128,37 +126,13 @@ def convert_labelled(
     return {"train": len(scenes) - len(validation), "val": len(validation)}
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    import h5py
-
-    try:
-        with h5py.File(path, "r") as file:
-            return _array(file, "rgb"), _array(file, "depth")
-    except _BROKEN as error:
-        raise SampleError(str(path), f"cannot be read: {error}") from error
-
-
-def _array(file: h5py.File, key: str) -> np.ndarray:
-    if key not in file:
-        raise KeyError(f"no dataset {key!r}, only {sorted(file)}")
-    return np.asarray(file[key])
-
-
-def _check(path: Path, rgb: np.ndarray, depth: np.ndarray) -> None:
-    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3 or 0 in rgb.shape:
-        raise SampleError(str(path), f"rgb must be uint8 [3, H, W], got {rgb.dtype} {list(rgb.shape)}")
-    if not np.issubdtype(depth.dtype, np.floating) or depth.shape != rgb.shape[1:]:
-        expected = f"floating-point {list(rgb.shape[1:])}"
-        raise SampleError(str(path), f"depth must be {expected} as rgb is, got {depth.dtype} {list(depth.shape)}")
-
-
 def _intrinsics(path: Path, height: int, width: int) -> torch.Tensor:
     """[3, 3] of images of that size."""
-    if abs(width / height / (_SIZE[1] / _SIZE[0]) - 1) > _ASPECT_TOLERANCE:
+    if abs(width / height / (NATIVE_SIZE[1] / NATIVE_SIZE[0]) - 1) > _ASPECT_TOLERANCE:
         raise SampleError(str(path), f"is {width} x {height}, not a resized 640 x 480: its intrinsics are not known")
     fx, fy, cx, cy = INTRINSICS
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return resize_intrinsics(K, _SIZE, (height, width))
+    return resize_intrinsics(K, NATIVE_SIZE, (height, width))
 
 
 def _matlab_string(characters: h5py.Dataset) -> str:

@@ -75,6 +75,7 @@ def open_unposed(
         _intrinsics(path) if intrinsics is None else read_intrinsics(intrinsics),
         image_size=first_image_size(images),
         depth_size=common_size(frame.load_depth for frame in frames if isinstance(frame, Entry)),
+        posed=False,
     )
 
 

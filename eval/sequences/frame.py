@@ -102,6 +102,8 @@ class Sequence:
         depth_size: (H, W) of the depth maps, or None where there are none.
         skipped: the frames left out.
         names_on_disk: every frame's name in order, skipped ones included.
+        posed: whether poses are known. Without, they are all the identity and mean nothing: single images, on which
+            a network can be judged but nothing that compares views.
     """
 
     name: str
@@ -113,6 +115,7 @@ class Sequence:
     depth_size: Size | None = None
     skipped: tuple[Skipped, ...] = ()
     names_on_disk: tuple[str, ...] = ()
+    posed: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -170,8 +173,9 @@ def make_sequence(
     image_size: Size | None,
     depth_intrinsics: np.ndarray | None = None,
     depth_size: Size | None = None,
+    posed: bool = True,
 ) -> Sequence:
-    """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W).
+    """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W); ``posed`` as there.
 
     Raises:
         ValueError: no frame is usable (the reasons are counted in the message); two frames share a name;
@@ -191,7 +195,7 @@ def make_sequence(
     check_intrinsics("intrinsics", intrinsics, image_size)
     if depth_intrinsics is not None:
         check_intrinsics("depth_intrinsics", depth_intrinsics, depth_size)
-    return Sequence(name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names)
+    return Sequence(name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed)
 
 
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:

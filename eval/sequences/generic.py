@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import attach, no_pose, stem_times
 from ufmstar_torch.eval.sequences.frame import Entry, Loader, Sequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
@@ -23,9 +24,9 @@ from ufmstar_torch.eval.sequences.images import (
     read_color,
 )
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics, scale_intrinsics
-from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.pairing import pair_by_name
-from ufmstar_torch.eval.sequences.poses import Trajectory, associate, interpolate, read_trajectory
+from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 from ufmstar_torch.eval.sequences.tum import read_file_list
 from ufmstar_torch.eval.sequences.video import VIDEO_SUFFIXES, Video
 
@@ -43,8 +44,6 @@ TRAJECTORIES = (
 )
 INTRINSICS = ("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt")
 LOOKED_FOR = f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}), {INTRINSICS[0]}"
-# Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
-_NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14
 
 
 def detect(path: Path) -> bool:
@@ -73,12 +72,12 @@ def open_generic(path: Path, options: Options) -> Sequence:
     root = path if path.is_dir() else path.parent
     names, loaders, size, times = _images(path, options)
     trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
-    poses = _poses(names, times, trajectory, options)
+    poses = attach(names, times, trajectory, options)
     depth_files = _depth_files(root, names, times, options)
     frames: list[Entry | Skipped] = []
     for i, (name, T) in enumerate(zip(names, poses, strict=True)):
         if T is None:
-            frames.append(Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image"))
+            frames.append(Skipped(name, no_pose(options)))
             continue
         load_depth = depth_loader(depth_files.get(name), options.depth_scale)
         frames.append(Entry(name, T, loaders[i], load_depth, None if times is None else float(times[i])))
@@ -101,7 +100,7 @@ def _images(path: Path, options: Options) -> tuple[list[str], list[Loader], Size
     """Names, loaders, (H, W) and timestamps (None where nothing tells them) of the images."""
     source = path
     if options.images is not None:
-        source = _resolve(path, options.images)
+        source = resolve(path, options.images)
     elif path.is_dir():
         found = _image_sources(path)
         if len(found) != 1:
@@ -141,60 +140,22 @@ def _image_times(folder: Path, files: list[Path], options: Options) -> np.ndarra
     elif options.fps is not None:
         times = np.arange(len(files)) / options.fps
     else:
-        stamps = _stem_times(files)
+        stamps = stem_times([file.stem for file in files])
         if stamps is None:
             return None
         times = stamps
     return times + options.time_offset
 
 
-def _stem_times(files: list[Path]) -> np.ndarray | None:
-    """File names as timestamps [s]; None where one is no number."""
-    try:
-        times = np.array([float(file.stem) for file in files])
-    except ValueError:
-        return None
-    if times.max() > _MICROSECONDS_ABOVE:
-        times = times / (1e9 if times.max() > _NANOSECONDS_ABOVE else 1e6)
-    return times
-
-
-def _poses(
-    names: list[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
-) -> list[np.ndarray | None]:
-    """The pose of each image, None where the trajectory has none at its time."""
-    if trajectory.timestamps is None:
-        if len(trajectory) != len(names):
-            raise ValueError(
-                f"trajectory has {len(trajectory)} poses for {len(names)} images: without timestamps, there "
-                "must be one for each"
-            )
-        return list(trajectory.T_world_cam)
-    if times is None:
-        raise ValueError(
-            f"images: the name {names[0]!r} is no timestamp, and there is no rgb.txt; the trajectory has "
-            "timestamps, so pass fps (and time_offset)"
-        )
-    poses = [interpolate(trajectory, float(time), options.max_pose_gap) for time in times]
-    if all(T is None for T in poses):
-        known = trajectory.timestamps
-        raise ValueError(
-            f"no image has a pose: images lie at {times[0]:.3f} to {times[-1]:.3f} s, the trajectory's "
-            f"{len(known)} poses at {known[0]:.3f} to {known[-1]:.3f} s, used where they lie at most "
-            f"{options.max_pose_gap:g} s apart; see fps, time_offset and max_pose_gap"
-        )
-    return poses
-
-
 def _depth_files(root: Path, names: list[str], times: np.ndarray | None, options: Options) -> dict[str, Path]:
     folder = next((root / name for name in DEPTHS if (root / name).is_dir()), None)
     if options.depth is not None:
-        folder = _resolve(root, options.depth)
+        folder = resolve(root, options.depth)
     if folder is None:
         return {}
     files = list_files(folder, DEPTH_SUFFIXES)
     pairs = pair_by_name(names, files)
-    depth_times = _stem_times(files) if files and not pairs else None
+    depth_times = stem_times([file.stem for file in files]) if files and not pairs else None
     if depth_times is not None and times is not None:
         near = associate(times, depth_times + options.time_offset, options.max_time_difference)
         pairs = {names[i]: files[j] for i, j in near.items()}
@@ -214,17 +175,9 @@ def _depth_intrinsics(options: Options, K: np.ndarray, size: Size | None, depth_
 
 def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...], option: str) -> Path:
     if given is not None:
-        return _resolve(root, given)
+        return resolve(root, given)
     found = [root / name for name in names if (root / name).is_file()]
     if len(found) != 1:
         told = f"found {[file.name for file in found]}" if found else f"looked for {', '.join(names)}"
         raise ValueError(f"{root}: pass {option}, exactly one file must be it ({told})")
     return found[0]
-
-
-def _resolve(root: Path, given: str | Path) -> Path:
-    """A path as the user gave it: inside the sequence's folder, or else from the working folder."""
-    for path in (root / given, Path(given)):
-        if path.exists():
-            return path
-    raise FileNotFoundError(f"no such file or folder: {given} (neither in {root} nor in the working folder)")

@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from PIL import Image
@@ -33,8 +34,13 @@ def read_color(path: str | Path) -> np.ndarray:
     Raises:
         FrameError: missing, truncated, corrupt, or not an 8-bit image.
     """
+    return decode_color(path, path)
+
+
+def decode_color(source: str | Path | BinaryIO, path: str | Path) -> np.ndarray:
+    """As :func:`read_color`, of an image that lies in a file or in memory; errors name ``path``."""
     try:
-        with Image.open(path) as image:
+        with Image.open(source) as image:
             if image.mode[0] in "IF":  # Pillow would clip these at 255 without a word
                 raise FrameError(path, f"expected an 8-bit colour or grey image, got mode {image.mode}")
             return np.array(image.convert("RGB"))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences import generic, scannet, seven_scenes, tartanair, tum
+from ufmstar_torch.eval.sequences import generic, kitti360, nyu, scannet, sens, seven_scenes, tartanair, tum
 from ufmstar_torch.eval.sequences.frame import Sequence
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike
 from ufmstar_torch.eval.sequences.options import Options
@@ -17,7 +17,10 @@ _READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, Options], Sequ
     "tum": (tum.detect, tum.open_tum, tum.LOOKED_FOR),
     "7scenes": (seven_scenes.detect, seven_scenes.open_seven_scenes, seven_scenes.LOOKED_FOR),
     "scannet": (scannet.detect, scannet.open_scannet, scannet.LOOKED_FOR),
+    "sens": (sens.detect, sens.open_sens, sens.LOOKED_FOR),
     "tartanair": (tartanair.detect, tartanair.open_tartanair, tartanair.LOOKED_FOR),
+    "kitti360": (kitti360.detect, kitti360.open_kitti360, kitti360.LOOKED_FOR),
+    "nyu": (nyu.detect, nyu.open_nyu, nyu.LOOKED_FOR),
     "generic": (generic.detect, generic.open_generic, generic.LOOKED_FOR),
 }
 LAYOUTS = ("auto", *_READERS)
@@ -40,26 +43,34 @@ def open_sequence(
     time_offset: float = 0.0,
     register: bool = True,
     T_color_depth: np.ndarray | None = None,
+    drive: str | int | None = None,
+    scans: int | None = None,
 ) -> Sequence:
     """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
 
     Args:
         path: the sequence's folder, or a video file; or ``tour:SEED``, rooms rendered from a seed, with the options
             of ``ufmstar_torch.eval.tour.name.open_tour``.
-        layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``tartanair`` or ``generic``.
+        layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu`` or
+            ``generic``.
         intrinsics: instead of the layout's own [px]: a file, a 3x3 matrix, or fx, fy, cx, cy.
         depth_intrinsics: the same of the depth maps (7-Scenes, ScanNet, generic).
-        trajectory: another trajectory file (TUM, generic).
+        trajectory: file in TUM or KITTI format whose camera-to-world poses, with our axes, replace the layout's own:
+            those of ORB-SLAM3, BundleFusion, ... Inside the sequence's folder, or else from the working folder.
         images: folder of images or video file (generic).
-        depth: folder of depth maps (generic).
+        depth: folder of depth maps (generic, KITTI-360).
         depth_scale: metres per unit of the depth files, instead of the layout's own.
         max_time_difference: between paired colour and depth images [s] (TUM, generic).
         max_pose_gap: poses are interpolated between samples at most this far apart [s]; at 0.1 s a hand
             that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
-        fps: frames per second of images without timestamps, or instead of the video's own (generic).
-        time_offset: added to the images' times [s] (TUM, generic).
+        fps: frames per second of images without timestamps, or instead of the video's own, where a trajectory has
+            timestamps. Images of a layout that numbers them are counted by that number.
+        time_offset: added to the images' times [s].
         register: warp 7-Scenes' depth into the colour camera.
         T_color_depth: [4, 4] depth to colour camera [m] (7-Scenes).
+        drive: name or number of the drive, where ``path`` is KITTI-360's root.
+        scans: laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving
+            things smear.
 
     Returns:
         The frames with a usable pose; ``skipped`` tells the others.
@@ -85,6 +96,8 @@ def open_sequence(
         time_offset=time_offset,
         register=register,
         T_color_depth=T_color_depth,
+        drive=drive,
+        scans=scans,
     )
     if is_tour:
         return _open_tour(str(path), layout, options)
@@ -95,6 +108,8 @@ def open_sequence(
     detect, open_reader, looked_for = _READERS[layout]
     if layout != "generic" and not detect(path):
         raise ValueError(f"{path} has not the layout {layout!r}: looked for {looked_for}")
+    if layout != "kitti360":
+        options.reject(layout, "drive", "scans")
     return open_reader(path, options)
 
 
@@ -147,4 +162,5 @@ def layouts_of(path: Path) -> list[str]:
 
 def parts_of(path: Path, layout: str) -> list[Path]:
     """The single sequences of a path that has this layout: itself, or folders in it that hold one each."""
-    return tartanair.trajectory_folders(path) if layout == "tartanair" else [path]
+    holding = {"tartanair": tartanair.trajectory_folders, "kitti360": kitti360.drives, "nyu": nyu.parts}
+    return holding[layout](path) if layout in holding else [path]

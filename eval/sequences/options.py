@@ -31,6 +31,8 @@ class Options:
     time_offset: float = 0.0
     register: bool = True
     T_color_depth: np.ndarray | None = None
+    drive: str | int | None = None
+    scans: int | None = None
 
     def __post_init__(self) -> None:
         check_scale(self.depth_scale)
@@ -39,6 +41,13 @@ class Options:
                 raise ValueError(f"{name} must be a time of at least 0 s, got {getattr(self, name)}")
         if self.fps is not None and not self.fps > 0:
             raise ValueError(f"fps must be positive frames per second, got {self.fps}")
+        if self.scans is not None and (self.scans < 0 or self.scans != int(self.scans)):
+            raise ValueError(f"scans must be a number of laser scans on either side, at least 0, got {self.scans}")
+
+    def only_attached(self, layout: str) -> None:
+        """Raises ValueError where ``fps`` was given and no trajectory, to which it would belong."""
+        if self.trajectory is None:
+            self.reject(layout, "fps")
 
     def reject(self, layout: str, *names: str) -> None:
         """Raises ValueError where an option was given that the layout has no use for."""
@@ -48,3 +57,15 @@ class Options:
                     f"layout {layout!r} takes no {name}: its files hold that; use layout='generic' to combine "
                     "images, depth and a trajectory freely"
                 )
+
+
+def resolve(root: Path, given: str | Path) -> Path:
+    """A path as the user gave it: inside the sequence's folder, or else from the working folder.
+
+    Raises:
+        FileNotFoundError: it is in neither.
+    """
+    for path in (root / given, Path(given)):
+        if path.exists():
+            return path
+    raise FileNotFoundError(f"no such file or folder: {given} (neither in {root} nor in the working folder)")

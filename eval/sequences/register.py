@@ -1,4 +1,4 @@
-"""Registration of a depth map to the colour camera beside it."""
+"""Points as a camera sees them: registration of a depth map to the colour camera beside it."""
 
 from __future__ import annotations
 
@@ -28,13 +28,24 @@ def register_depth(
     v, u = np.nonzero(depth > 0)
     z = depth[v, u].astype(np.float64)
     points = np.linalg.inv(K_depth) @ np.stack([u * z, v * z, z])
-    x, y, z = T_color_depth[:3, :3] @ points + T_color_depth[:3, 3:]
-    front = z > 0
-    x, y, z = x[front], y[front], z[front]
-    column = np.rint((K_color[0, 0] * x + K_color[0, 1] * y) / z + K_color[0, 2])
-    row = np.rint(K_color[1, 1] * y / z + K_color[1, 2])
+    return project(T_color_depth[:3, :3] @ points + T_color_depth[:3, 3:], K_color, size)
+
+
+def project(points: np.ndarray, K: np.ndarray, size: Size) -> np.ndarray:
+    """The depth map of points: each pixel takes the nearest one that falls on it.
+
+    Args:
+        points: [3, N] in the camera's frame [m].
+        K: [3, 3] of the camera [px].
+        size: (H, W) of its images.
+
+    Returns:
+        ``size`` float32 depth along z [m], 0 where there is none.
+    """
+    x, y, z = points[:, points[2] > 0]
+    column = np.rint((K[0, 0] * x + K[0, 1] * y) / z + K[0, 2])
+    row = np.rint(K[1, 1] * y / z + K[1, 2])
     inside = (column >= 0) & (column < size[1]) & (row >= 0) & (row < size[0])
-    out = np.full(size, np.inf)
-    pixels = (row[inside].astype(np.intp), column[inside].astype(np.intp))
-    np.minimum.at(out, pixels, z[inside])
-    return np.where(np.isfinite(out), out, 0).astype(np.float32)
+    depth = np.full(size, np.inf)
+    np.minimum.at(depth, (row[inside].astype(np.intp), column[inside].astype(np.intp)), z[inside])
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Size, Skipped, fits, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
@@ -43,11 +44,13 @@ def open_scannet(path: Path, options: Options) -> Sequence:
         ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file.
         FileNotFoundError: no ``intrinsic_color.txt`` and ``intrinsics`` is not given.
     """
-    options.reject("scannet", "trajectory", "images", "depth", "fps", "T_color_depth")
+    options.reject("scannet", "images", "depth", "T_color_depth")
+    options.only_attached("scannet")
     images = list_files(path / "color", IMAGE_SUFFIXES)
-    frames = [_frame(path, image, options.depth_scale) for image in images]
+    frames = [_frame(path, image, options) for image in images]
     if not images:
         raise ValueError(f"scannet sequence {path.name!r}: the folder color/ holds no image")
+    frames = attach_given(frames, path, options)
     color_size = first_image_size(images) or _NATIVE_COLOR
     depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
     K = _intrinsics(options.intrinsics, path / "intrinsic" / "intrinsic_color.txt", _NATIVE_COLOR, color_size)
@@ -66,13 +69,14 @@ def open_scannet(path: Path, options: Options) -> Sequence:
     )
 
 
-def _frame(path: Path, image: Path, depth_scale: float | None) -> Entry | Skipped:
+def _frame(path: Path, image: Path, options: Options) -> Entry | Skipped:
     pose = path / "pose" / f"{image.stem}.txt"
-    if not pose.is_file():
+    if options.trajectory is None and not pose.is_file():
         return Skipped(image.stem, "missing pose file")
+    T = read_pose(pose) if options.trajectory is None else UNKNOWN
     depth = path / "depth" / f"{image.stem}.png"
-    load_depth = depth_loader(depth if depth.is_file() else None, depth_scale)
-    return Entry(image.stem, read_pose(pose), partial(read_color, image), load_depth)
+    load_depth = depth_loader(depth if depth.is_file() else None, options.depth_scale)
+    return Entry(image.stem, T, partial(read_color, image), load_depth)
 
 
 def _intrinsics(given: IntrinsicsLike | None, file: Path, native: Size, size: Size) -> np.ndarray:

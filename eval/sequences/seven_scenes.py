@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, Loader, Sequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import common_size, first_image_size, natural_key, read_color, read_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, pinhole, read_intrinsics, scale_intrinsics
@@ -50,12 +51,13 @@ def open_seven_scenes(path: Path, options: Options) -> Sequence:
     With ``register`` (the default) depth is warped into the colour camera, and ``T_world_cam`` is the
     colour camera's: the file's pose, which is the depth camera's, times ``T_color_depth``'s inverse.
     Without it, depth and pose are the depth camera's as on disk, with ``depth_intrinsics``, and the
-    2.5 cm to the colour camera are ignored.
+    2.5 cm to the colour camera are ignored. A given ``trajectory`` is the colour camera's in any case.
 
     Raises:
         ValueError: no usable frame, or a malformed pose file.
     """
-    options.reject("7scenes", "trajectory", "images", "depth", "fps")
+    options.reject("7scenes", "images", "depth")
+    options.only_attached("7scenes")
     files: dict[str, dict[str, Path]] = {}
     for file in sorted(path.iterdir(), key=natural_key):
         found = _FRAME.fullmatch(file.name)
@@ -67,12 +69,10 @@ def open_seven_scenes(path: Path, options: Options) -> Sequence:
     K_depth = _intrinsics(options.depth_intrinsics, _K_DEPTH, depth_size or _NATIVE_SIZE)
     T_color_depth = approximate_T_color_depth() if options.T_color_depth is None else options.T_color_depth
     scale = options.depth_scale or _MILLIMETRE
-    frames = []
-    for name, kinds in files.items():
-        frame = _frame(name, kinds, scale)
-        if isinstance(frame, Entry) and options.register:
-            frame = _registered(frame, K_depth, K_color, T_color_depth, color_size)
-        frames.append(frame)
+    frames = [_frame(name, kinds, scale, options) for name, kinds in files.items()]
+    if options.register:
+        frames = [_registered(frame, K_depth, K_color, T_color_depth, color_size) for frame in frames]
+    frames = attach_given(frames, path, options)
     return make_sequence(
         path.resolve().name,
         "7scenes",
@@ -92,21 +92,26 @@ def read_kinect(path: Path, scale: float = _MILLIMETRE) -> np.ndarray:
     return np.where(values == _NO_DEPTH, 0, values * scale).astype(np.float32)
 
 
-def _frame(name: str, kinds: dict[str, Path], scale: float) -> Entry | Skipped:
-    if "pose" not in kinds:
+def _frame(name: str, kinds: dict[str, Path], scale: float, options: Options) -> Entry | Skipped:
+    if options.trajectory is None and "pose" not in kinds:
         return Skipped(name, "missing pose file")
     if "color" not in kinds:
         return Skipped(name, "missing image file")
+    T = read_pose(kinds["pose"]) if options.trajectory is None else UNKNOWN
     load_depth = partial(read_kinect, kinds["depth"], scale) if "depth" in kinds else None
-    return Entry(name, read_pose(kinds["pose"]), partial(read_color, kinds["color"]), load_depth)
+    return Entry(name, T, partial(read_color, kinds["color"]), load_depth)
 
 
-def _registered(entry: Entry, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size) -> Entry:
-    T_world_color = entry.T_world_cam @ np.linalg.inv(T_color_depth)
-    load = entry.load_depth
+def _registered(
+    frame: Entry | Skipped, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size
+) -> Entry | Skipped:
+    if isinstance(frame, Skipped):
+        return frame
+    T_world_color = frame.T_world_cam @ np.linalg.inv(T_color_depth)
+    load = frame.load_depth
     if load is not None:
         load = partial(_load_registered, load, K_depth, K_color, T_color_depth, size)
-    return Entry(entry.name, T_world_color, entry.load_image, load)
+    return Entry(frame.name, T_world_color, frame.load_image, load)
 
 
 def _load_registered(

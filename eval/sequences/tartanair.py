@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
@@ -37,13 +38,14 @@ def detect(path: Path) -> bool:
 
 
 def open_tartanair(path: Path, options: Options) -> Sequence:
-    """Opens a TartanAir trajectory (left camera).
+    """Opens a TartanAir trajectory (left camera). A given ``trajectory`` has our axes already.
 
     Raises:
         ValueError: no usable frame; several trajectories below ``path``; another number of poses than of
             images; a malformed pose line.
     """
-    options.reject("tartanair", "trajectory", "images", "depth", "fps", "depth_intrinsics", "T_color_depth")
+    options.reject("tartanair", "images", "depth", "depth_intrinsics", "T_color_depth")
+    options.only_attached("tartanair")
     folders = trajectory_folders(path)
     if len(folders) > 1:
         raise ValueError(f"{path} holds the trajectories {[folder.name for folder in folders]}: open one of them")
@@ -53,6 +55,7 @@ def open_tartanair(path: Path, options: Options) -> Sequence:
         raise ValueError(f"{folder / 'pose_left.txt'}: expected 7 numbers in a line, tx ty tz qx qy qz qw")
     images = list_files(folder / "image_left", IMAGE_SUFFIXES)
     frames = _frames(folder, images, trajectory.T_world_cam @ _NED_FROM_CAMERA, options.depth_scale)
+    frames = attach_given(frames, folder, options)
     size = first_image_size(images) or _NATIVE_SIZE
     if options.intrinsics is None:
         K = scale_intrinsics(pinhole(*_K), _NATIVE_SIZE, size)

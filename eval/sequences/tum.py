@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import Entry, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.attach import attach, no_pose
+from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import common_size, depth_loader, first_image_size, read_color
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
-from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import Trajectory, associate, interpolate, read_trajectory
+from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt"
 _SCALE = 1 / 5000
@@ -45,14 +46,23 @@ def open_tum(path: Path, options: Options) -> Sequence:
         ValueError: no usable frame; the camera is not named by the folder or the files (``freiburgN``) and
             ``intrinsics`` is not given; a malformed line (named by file and number).
     """
+    given = options.trajectory
     options.reject("tum", "images", "depth", "depth_intrinsics", "fps", "T_color_depth")
     color_times, color_files = read_file_list(path / "rgb.txt")
-    trajectory = read_trajectory(options.trajectory or path / "groundtruth.txt")
+    trajectory = read_trajectory(path / "groundtruth.txt" if given is None else resolve(path, given))
+    times = color_times + options.time_offset
+    poses = attach([Path(file).stem for file in color_files], times, trajectory, options)
     depth_files = _paired_depth(path, color_times, options.max_time_difference)
     frames: list[Entry | Skipped] = []
-    for i, (time, file) in enumerate(zip(color_times, color_files, strict=True)):
-        load_depth = depth_loader(depth_files.get(i), options.depth_scale, _SCALE)
-        frames.append(_frame(path / file, float(time) + options.time_offset, trajectory, load_depth, options))
+    for i, (T, file) in enumerate(zip(poses, color_files, strict=True)):
+        name = Path(file).stem
+        if not (path / file).is_file():
+            frames.append(Skipped(name, "missing image file"))
+        elif T is None:
+            frames.append(Skipped(name, no_pose(options)))
+        else:
+            load_depth = depth_loader(depth_files.get(i), options.depth_scale, _SCALE)
+            frames.append(Entry(name, T, partial(read_color, path / file), load_depth, float(times[i])))
     size = first_image_size(path / file for file in color_files)
     K = _default_intrinsics(path, size) if options.intrinsics is None else read_intrinsics(options.intrinsics)
     depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
@@ -76,19 +86,6 @@ def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
         except (ValueError, IndexError):
             raise ValueError(f"{path}:{number}: expected 'timestamp filename', got {text!r}") from None
     return np.array(times, dtype=np.float64), files
-
-
-def _frame(
-    file: Path, time: float, trajectory: Trajectory, load_depth: Loader | None, options: Options
-) -> Entry | Skipped:
-    if not file.is_file():
-        return Skipped(file.stem, "missing image file")
-    if trajectory.timestamps is None:
-        raise ValueError("trajectory must have timestamps for layout 'tum' (8 numbers in a line)")
-    T = interpolate(trajectory, time, options.max_pose_gap)
-    if T is None:
-        return Skipped(file.stem, f"no pose within {options.max_pose_gap:g} s around the image")
-    return Entry(file.stem, T, partial(read_color, file), load_depth, time)
 
 
 def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) -> dict[int, Path]:

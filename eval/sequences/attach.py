@@ -1,0 +1,183 @@
+"""Poses of another program attached to images: ORB-SLAM3, BundleFusion, COLMAP, in TUM or KITTI format.
+
+A pose belongs to an image by its time, or by its frame number, or, where the file has neither, by its place. What has
+no partner is skipped and counted; nothing is moved to the next image.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence as Items
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import Entry, Skipped
+from ufmstar_torch.eval.sequences.options import Options, resolve
+from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate, read_trajectory
+
+# Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
+_NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14
+# [units/s] What a trajectory's times may be in, beside seconds, where only then they meet the images'.
+_UNITS = (1e9, 1e6, 1e3)
+# [s] No trajectory has its poses closer together.
+_MIN_STEP = 1e-3
+# [1] Share of images (or poses) with a partner from which on whole numbers are taken for frame numbers.
+_MOST = 0.5
+
+Poses = list[np.ndarray | None]
+# [4, 4] of a frame that gets its pose from a trajectory.
+UNKNOWN = np.full((4, 4), np.nan)
+
+
+def attach(names: Items[str], times: np.ndarray | None, trajectory: Trajectory, options: Options) -> Poses:
+    """The pose of each image, None where the trajectory has none.
+
+    Without timestamps in the trajectory, pose i belongs to the i-th image. With them, the pose is interpolated at the
+    image's time. Whole numbers that are those in the images' names (``frame-000012``) are frame numbers, unless ``fps``
+    says otherwise. Timestamps in nanoseconds (ORB-SLAM3), microseconds or milliseconds are recognised by meeting the
+    images' times only then.
+
+    Args:
+        names: of all images on disk, in order.
+        times: [N] of the images [s], or None where nothing but the names tells them.
+        trajectory: the poses.
+        options: ``max_pose_gap``, ``fps`` and ``time_offset``.
+
+    Returns:
+        [4, 4] camera-to-world or None, for each name.
+
+    Raises:
+        ValueError: more or fewer poses than images; the images' times are not known; no image has a pose (both time
+            ranges are given).
+    """
+    if trajectory.timestamps is None:
+        if len(trajectory) != len(names):
+            raise ValueError(
+                f"trajectory has {len(trajectory)} poses for {len(names)} images: without timestamps, there "
+                "must be one for each"
+            )
+        return list(trajectory.T_world_cam)
+    times, trajectory = _comparable(names, times, trajectory, options)
+    poses = [interpolate(trajectory, float(time), options.max_pose_gap) for time in times]
+    if all(T is None for T in poses):
+        known = trajectory.timestamps
+        assert known is not None
+        raise ValueError(
+            f"no image has a pose: images lie at {times[0]:.3f} to {times[-1]:.3f} s, the trajectory's "
+            f"{len(known)} poses at {known[0]:.3f} to {known[-1]:.3f} s, used where they lie at most "
+            f"{options.max_pose_gap:g} s apart; see fps, time_offset and max_pose_gap"
+        )
+    return poses
+
+
+def _comparable(
+    names: Items[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
+) -> tuple[np.ndarray, Trajectory]:
+    """Times of images and poses in the same unit: seconds or frame numbers.
+
+    Raises:
+        ValueError: the images' times are not known.
+    """
+    stamps = trajectory.timestamps
+    assert stamps is not None
+    numbers = None if options.fps is not None else _as_frame_numbers(names, stamps, times is not None)
+    if numbers is not None:
+        return numbers, trajectory
+    if times is None:
+        raise ValueError(
+            f"images: the name {names[0]!r} is no timestamp, there is no rgb.txt, and the trajectory's timestamps "
+            f"({stamps[0]:g}, ...) are no frame numbers of the images: pass fps (and time_offset)"
+        )
+    trajectory = in_seconds(trajectory, times)
+    if trajectory.timestamps is not None and not _meet(trajectory.timestamps, times):
+        numbers = None if options.fps is not None else _as_frame_numbers(names, stamps, False)
+    return (times if numbers is None else numbers), trajectory
+
+
+def _as_frame_numbers(names: Items[str], stamps: np.ndarray, timed: bool) -> np.ndarray | None:
+    """[N] the images' numbers, if the trajectory's timestamps are frame numbers.
+
+    ``timed`` images must have a pose each, most of them, since 0, 1, 2, ... could be seconds as well.
+    """
+    numbers = frame_numbers(names)
+    if numbers is None or not bool((stamps == np.floor(stamps)).all()):
+        return None
+    shares = [np.isin(numbers, stamps).mean(), np.isin(stamps, numbers).mean()]
+    return numbers if (shares[0] if timed else max(shares)) >= _MOST else None
+
+
+def attach_given(
+    frames: Items[Entry | Skipped], root: Path, options: Options, times: np.ndarray | None = None
+) -> list[Entry | Skipped]:
+    """A layout's frames with the poses of ``options.trajectory`` instead of their own; as they are without one.
+
+    Args:
+        frames: all frames on disk, in order; their own poses are not looked at (``UNKNOWN``).
+        root: the sequence's folder.
+        options: see :func:`attach`.
+        times: [N] of the frames [s]. With ``fps``, or without ``times``: frame number / fps.
+
+    Raises:
+        FileNotFoundError: no such trajectory.
+        ValueError: see :func:`attach`.
+    """
+    if options.trajectory is None:
+        return list(frames)
+    names = [frame.name for frame in frames]
+    if options.fps is not None:
+        numbers = frame_numbers(names)
+        times = (np.arange(len(names)) if numbers is None else numbers) / options.fps
+    if times is not None:
+        times = times + options.time_offset
+    trajectory = read_trajectory(resolve(root, options.trajectory))
+    poses = attach(names, times, trajectory, options)
+    out: list[Entry | Skipped] = []
+    for i, (frame, T) in enumerate(zip(frames, poses, strict=True)):
+        if isinstance(frame, Skipped):
+            out.append(frame)
+        elif T is None:
+            out.append(Skipped(frame.name, no_pose(options)))
+        else:
+            time = frame.timestamp if times is None else float(times[i])
+            out.append(replace(frame, T_world_cam=T, timestamp=time))
+    return out
+
+
+def no_pose(options: Options) -> str:
+    """Why an image without a pose is skipped."""
+    return f"no pose within {options.max_pose_gap:g} s around the image"
+
+
+def frame_numbers(names: Items[str]) -> np.ndarray | None:
+    """[N] the one whole number in each name, ``frame-000012`` being 12; None where a name has none or several."""
+    found = [re.findall(r"\d+", name) for name in names]
+    if not found or any(len(groups) != 1 for groups in found):
+        return None
+    return np.array([float(groups[0]) for groups in found])
+
+
+def stem_times(names: Items[str]) -> np.ndarray | None:
+    """[N] names as timestamps [s], also those in nanoseconds or microseconds; None where one is no number."""
+    try:
+        times = np.array([float(name) for name in names])
+    except ValueError:
+        return None
+    if times.size and times.max() > _MICROSECONDS_ABOVE:
+        times = times / (1e9 if times.max() > _NANOSECONDS_ABOVE else 1e6)
+    return times
+
+
+def in_seconds(trajectory: Trajectory, times: np.ndarray) -> Trajectory:
+    """The trajectory with timestamps in seconds, as ``times`` are, if another unit than its own makes the two meet."""
+    known = trajectory.timestamps
+    if known is None or len(known) < 2 or _meet(known, times):
+        return trajectory
+    step = float(np.median(np.diff(known)))
+    units = [unit for unit in _UNITS if _meet(known / unit, times) and step / unit >= _MIN_STEP]
+    return replace(trajectory, timestamps=known / units[0]) if units else trajectory
+
+
+def _meet(first: np.ndarray, second: np.ndarray) -> bool:
+    return bool(first.min() <= second.max() and second.min() <= first.max())

@@ -1,0 +1,127 @@
+"""NYU Depth V2 in FastDepth's layout as an evaluation set: ``train|val/<scene>/*.h5`` with ``rgb`` and ``depth``.
+
+``rgb`` is uint8 [3, H, W], ``depth`` floating-point [H, W] in metres along the optical axis, registered to ``rgb``;
+0 or not finite = none. The images are single ones: the sequence has ``posed`` False, and its poses, the identity, mean
+nothing. A network's own variance can be judged on it; rows that compare views (UfM, UfM*) must be refused, by looking
+at ``Sequence.posed`` and not at the poses. What networks see of an image is ``Preprocess.nyu()``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, Sequence, Size, make_sequence
+from ufmstar_torch.eval.sequences.images import natural_key
+from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.options import Options
+
+if TYPE_CHECKING:
+    import h5py
+
+LOOKED_FOR = "val/SCENE/*.h5 or train/SCENE/*.h5 (the root, meaning val, the part's folder or the scene's)"
+PARTS = ("train", "val")
+# The colour camera's calibration in the dataset's toolbox [px], for images of 640 x 480.
+INTRINSICS = (518.857901, 519.469611, 325.582449, 253.736166)
+NATIVE_SIZE = (480, 640)
+# What h5py raises for files that are damaged in one way or another, and for datasets that are missing.
+_BROKEN = (OSError, KeyError, RuntimeError, ValueError)
+
+
+def detect(path: Path) -> bool:
+    """Whether the path is the root, a part or a scene."""
+    return bool(part_files(path / "val")) or bool(_files(path))
+
+
+def parts(path: Path) -> list[Path]:
+    """The part of a root that is for evaluation; a part or scene itself."""
+    return [path / "val"] if part_files(path / "val") else [path]
+
+
+def part_files(folder: Path) -> list[Path]:
+    """The h5 files of a part, in the order of scenes and numbers."""
+    return sorted(folder.glob("*/*.h5"), key=lambda path: (path.parent.name, natural_key(path)))
+
+
+def open_nyu(path: Path, options: Options) -> Sequence:
+    """Opens a part, or a scene of it, as a sequence without poses; names are ``SCENE__NUMBER``.
+
+    Raises:
+        ImportError: h5py is not installed.
+        ValueError: the images were cropped and ``intrinsics`` are not given; an option that files without poses have no
+            use for; no file can be read.
+    """
+    options.reject("nyu", "trajectory", "images", "depth", "depth_intrinsics", "fps", "T_color_depth")
+    folder = parts(path)[0]
+    files = _files(folder)
+    scale = 1.0 if options.depth_scale is None else options.depth_scale
+    entries = [
+        Entry(f"{file.parent.name}__{file.stem}", np.eye(4), partial(_image, file), partial(_depth, file, scale))
+        for file in files
+    ]
+    size = _first_size(files)
+    if options.intrinsics is None:
+        K = scale_intrinsics(pinhole(*INTRINSICS), NATIVE_SIZE, size or NATIVE_SIZE)
+    else:
+        K = read_intrinsics(options.intrinsics)
+    name = "_".join(["nyu", *folder.resolve().parts[-1 if folder.name in PARTS else -2 :]])
+    return make_sequence(name, "nyu", entries, K, image_size=size, depth_size=size, posed=False)
+
+
+def read_h5(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """``rgb`` [3, H, W] uint8 and ``depth`` [H, W] floating-point [m] as they are; nothing stays open.
+
+    Raises:
+        FrameError: it cannot be read, lacks one of them, or they have other types or shapes.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            rgb, depth = _array(file, "rgb"), _array(file, "depth")
+    except _BROKEN as error:
+        raise FrameError(path, f"cannot be read: {error}") from error
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[0] != 3 or 0 in rgb.shape:
+        raise FrameError(path, f"rgb must be uint8 [3, H, W], got {rgb.dtype} {list(rgb.shape)}")
+    if not np.issubdtype(depth.dtype, np.floating) or depth.shape != rgb.shape[1:]:
+        expected = f"floating-point {list(rgb.shape[1:])}"
+        raise FrameError(path, f"depth must be {expected} as rgb is, got {depth.dtype} {list(depth.shape)}")
+    return rgb, depth
+
+
+def _array(file: h5py.File, key: str) -> np.ndarray:
+    if key not in file:
+        raise KeyError(f"no dataset {key!r}, only {sorted(file)}")
+    return np.asarray(file[key])
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a part or of a scene of one; none of anything else."""
+    if path.resolve().name in PARTS:
+        return part_files(path)
+    if path.is_dir() and path.resolve().parent.name in PARTS:
+        return sorted(path.resolve().glob("*.h5"), key=natural_key)
+    return []
+
+
+def _image(path: Path) -> np.ndarray:
+    return np.ascontiguousarray(read_h5(path)[0].transpose(1, 2, 0))
+
+
+def _depth(path: Path, scale: float) -> np.ndarray:
+    depth = (read_h5(path)[1] * np.float64(scale)).astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def _first_size(files: list[Path]) -> Size | None:
+    """(H, W) of the first file that can be read."""
+    for file in files:
+        try:
+            rgb, _ = read_h5(file)
+        except FrameError:  # raised again, and counted, when that frame is asked for
+            continue
+        return rgb.shape[1], rgb.shape[2]
+    return None
