@@ -129,6 +129,39 @@ def train(arguments: Sequence[str]) -> int:
     return _told(f"ufmstar train: {summary['stopped']}; --resume goes on", INTERRUPTED)
 
 
+def evaluate(arguments: Sequence[str]) -> int:
+    """the rows of a table or figure of the paper, on your own sequences"""
+    from jsonargparse import ArgumentError
+
+    from ufmstar_torch.eval.suite.options import check_options, eval_parser, parse_eval
+
+    try:
+        options = parse_eval(eval_parser(), arguments)
+        if options["list"]:
+            from ufmstar_torch.eval.suite.suites import listing
+
+            print(listing())
+            return OK
+        check_options(options)
+    except (ArgumentError, ValueError) as error:
+        raise UsageError(_one_line(error)) from error
+    from ufmstar_torch.eval.suite.cache import CacheError
+
+    try:
+        _set_threads(options["threads"])
+        if options["dry_run"]:
+            return _dry_run(options)
+        return _evaluate(options)
+    except (FileNotFoundError, ValueError) as error:
+        if options["debug"]:
+            traceback.print_exc()
+        raise UsageError(_one_line(error)) from error
+    except (CacheError, ImportError, OSError, RuntimeError) as error:
+        if options["debug"]:
+            traceback.print_exc()
+        return _told(f"ufmstar eval: failed: {_one_line(error)}", FAILED)
+
+
 def report(arguments: Sequence[str]) -> int:
     """tables, figures and a page from what eval has left"""
     from ufmstar_torch.eval.report.options import parse_report
@@ -170,6 +203,7 @@ def demo(arguments: Sequence[str]) -> int:
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "demo": demo,
     "run": run,
+    "eval": evaluate,
     "report": report,
     "bench": bench,
     "train": train,
@@ -205,6 +239,53 @@ def _run(options: Mapping[str, Any]) -> dict[str, Any]:
             )
     except FolderError as error:
         raise UsageError(str(error)) from error
+
+
+def _evaluate(options: Mapping[str, Any]) -> int:
+    """Evaluate, tell the results, and draw them; the exit code.
+
+    Raises:
+        FileNotFoundError, ValueError: it cannot be begun.
+        CacheError, ImportError, OSError, RuntimeError: it cannot be finished.
+    """
+    from ufmstar_torch.eval.report.load import ResultsError
+    from ufmstar_torch.eval.suite.launch import evaluate_suite
+    from ufmstar_torch.eval.suite.outcome import draw, table
+
+    with _Bars() as bars, _stop_signals(bars.say) as stop:
+        ended = evaluate_suite(options, stop=stop, tell=bars.say, progress=bars.frames)
+    if not ended.tells:
+        return OK if ended.finished else INTERRUPTED
+    print(table(ended))
+    if ended.finished and not options["no_report"]:
+        try:
+            print(draw(ended))
+        except (ImportError, ResultsError) as error:
+            print(f"no report: {_one_line(error)}", file=sys.stderr)
+    for label, reason in ended.failed.items():
+        print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
+    if ended.stopped:
+        return _told("ufmstar eval: stopped; --resume goes on", INTERRUPTED)
+    if ended.failed or not ended.finished:
+        return _told("ufmstar eval: not all is there; --resume tries the rest again", FAILED)
+    return OK
+
+
+def _dry_run(options: Mapping[str, Any]) -> int:
+    """Show what the options would do.
+
+    Raises:
+        FileNotFoundError, ImportError, ValueError: it could not be begun.
+    """
+    import torch
+
+    from ufmstar_torch.eval.suite.dry_run import dry_run
+    from ufmstar_torch.eval.suite.options import job_from
+    from ufmstar_torch.eval.suite.worklist import Shard
+
+    job = job_from(options)
+    print(dry_run(job, job.load(torch.device("cpu")), Shard.parse(options["shard"] or "1/1")))
+    return OK
 
 
 def _demo(options: Any) -> dict[str, Any]:
@@ -289,6 +370,19 @@ class _Bars:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
             self._bar.set_postfix(K=progress.components, refresh=False, **skipped)
         self._bar.update(progress.done - self._bar.n)
+
+    def frames(self, label: str, done: int, total: int) -> None:
+        """Bring the bar of a sequence's frames up to date; it goes when they are done."""
+        from tqdm import tqdm
+
+        if label != self._stage:
+            self._close()
+            self._bar = tqdm(total=total, desc=label, unit="frame", dynamic_ncols=True, leave=False, disable=None)
+            self._stage = label
+        self._bar.update(done - self._bar.n)
+        if done == total:
+            self._close()
+            self._stage = ""
 
     def say(self, text: str) -> None:
         """Print a line without breaking the bar."""

@@ -26,6 +26,7 @@ class Ended:
     Attributes:
         job: what was evaluated.
         finished: False: it was stopped, or a process ended early.
+        stopped: by the caller.
         failed: why a sequence is broken, by its label.
         left: sequences without all of their rows, broken ones left out.
         tells: whether this process is the one that tells the results; further ones of torchrun are silent.
@@ -33,6 +34,7 @@ class Ended:
 
     job: EvalJob
     finished: bool
+    stopped: bool
     failed: Mapping[str, str]
     left: int
     tells: bool = True
@@ -89,7 +91,7 @@ def evaluate_suite(
     place = Place.of(os.environ)
     if place is not None:
         finished = _as_torchruns(options, place, stop, tell, evaluate)
-        return _ended(job, finished, tells=place.rank == 0)
+        return _ended(job, finished, stop(), tells=place.rank == 0)
     if options["slurm"] or options["processes"] > 1:
         from ufmstar_torch.eval.suite.pool import run_pool
         from ufmstar_torch.eval.suite.slurm import Slurm, run_slurm
@@ -97,7 +99,7 @@ def evaluate_suite(
         Slurm.parse(options["slurm"])
         prepare(job, resume=options["resume"], overwrite=options["overwrite"])
         run = run_slurm if options["slurm"] else run_pool
-        return _ended(job, run(options, stop=stop, tell=tell))
+        return _ended(job, run(options, stop=stop, tell=tell), stop())
     job = replace(job, device=device_of(job.device, 0))
     shard = Shard.parse(options["shard"] or "1/1")
     networks = job.load(torch.device(job.device))
@@ -105,7 +107,7 @@ def evaluate_suite(
     resume = options["resume"] or shard.count > 1
     folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=options["overwrite"])
     conduct = Conduct(shard=shard, stop=stop, tell=tell, progress=progress)
-    return _ended(job, run_job(job, folder, networks, conduct, evaluate))
+    return _ended(job, run_job(job, folder, networks, conduct, evaluate), stop())
 
 
 def _as_torchruns(
@@ -130,8 +132,8 @@ def _as_torchruns(
     return work(share, stop=stop, tell=tell, waits=place.rank == 0, evaluate=evaluate)
 
 
-def _ended(job: EvalJob, finished: bool, *, tells: bool = True) -> Ended:
+def _ended(job: EvalJob, finished: bool, stopped: bool, *, tells: bool = True) -> Ended:
     folder = EvalFolder(job.out, {})
     failed = failures(folder, job.items)
     open_items = [item for item in job.items if item.label not in failed and folder.missing(item, job.suite.rows)]
-    return Ended(job, finished, failed, len(open_items), tells)
+    return Ended(job, finished, stopped, failed, len(open_items), tells)

@@ -55,7 +55,7 @@ class EvalJob:
     items: tuple[WorkItem, ...]
     out: Path
     missing_bases: tuple[str, ...] = ()
-    frames: slice = slice(None)
+    frames: slice = field(default_factory=lambda: slice(None))
     cache: Path | None = None
     device: str = "cpu"
     confident: float = 0.5

@@ -32,7 +32,7 @@ PROGRAM = "ufmstar eval"
 MANIFEST, LOCK, CLAIM, FAILED, CACHE = "eval.json", "eval.lock", ".claim", "failed.json", "cache"
 _WAIT_SECONDS = 60.0  # for another process that is just making eval.json
 # What a report leaves; removed by --overwrite.
-_REPORT = ("efficiency.json", "results.json", "results.csv", "report.html")
+_REPORT = ("efficiency.json", "results.json", "results.csv", "table.csv", "report.html")
 _REPORT_PARTS = {"tables": (".md", ".tex"), "figures": (".png", ".svg")}
 
 

@@ -1,0 +1,32 @@
+"""What ``ufmstar eval`` says in the end: the table over sequences, and where everything lies."""
+
+from __future__ import annotations
+
+from ufmstar_torch.eval.report.load import ResultsError, load_results
+from ufmstar_torch.eval.report.write import summary, write_report
+from ufmstar_torch.eval.suite.launch import Ended
+
+
+def table(ended: Ended) -> str:
+    """The suite's table (mean and 95 % confidence interval over sequences), what was left out, and the folder."""
+    job = ended.job
+    try:
+        lines = [summary(load_results(job.out, with_sums=False))]
+    except ResultsError as error:
+        lines = [str(error)]
+    if job.missing_bases:
+        lines.append(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
+    lines.append(f"{job.out}: eval.json, work/DATASET/SEQUENCE/ with a record for every row")
+    return "\n".join(lines)
+
+
+def draw(ended: Ended) -> str:
+    """Draw tables and figures; a line that says where.
+
+    Raises:
+        ResultsError: nothing is finished.
+        ImportError: matplotlib is missing.
+        OSError: a file cannot be written.
+    """
+    files = write_report(ended.job.out)
+    return f"{ended.job.out}: {', '.join(str(file.relative_to(ended.job.out)) for file in files)}"
