@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.run import Progress
+    from ufmstar_torch.eval.suite.run_suite import EvalJob
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 _HELP = """usage: ufmstar COMMAND ...
@@ -257,6 +258,8 @@ def _evaluate(options: Mapping[str, Any]) -> int:
     if not ended.tells:
         return OK if ended.finished else INTERRUPTED
     print(table(ended))
+    if ended.finished and ended.job.suite.efficiency:
+        _measure(ended.job)
     if ended.finished and not options["no_report"]:
         try:
             print(draw(ended))
@@ -269,6 +272,18 @@ def _evaluate(options: Mapping[str, Any]) -> int:
     if ended.failed or not ended.finished:
         return _told("ufmstar eval: not all is there; --resume tries the rest again", FAILED)
     return OK
+
+
+def _measure(job: EvalJob) -> None:
+    """The measurements of a suite about efficiency, unless they are there or cannot be had."""
+    from ufmstar_torch.eval.suite.efficiency_step import EFFICIENCY, measure_job
+
+    if (job.out / EFFICIENCY).exists():
+        return
+    try:
+        measure_job(job)
+    except ValueError as error:
+        print(f"no {EFFICIENCY}: {_one_line(error)}", file=sys.stderr)
 
 
 def _dry_run(options: Mapping[str, Any]) -> int:
