@@ -57,7 +57,7 @@ def _device(name: str) -> str:
 
 
 def _sequence(options: Mapping[str, Any]) -> Sequence:
-    return open_sequence(
+    sequence = open_sequence(
         options["sequence"],
         options["layout"],
         intrinsics=parse_intrinsics(options["intrinsics"], "--intrinsics"),
@@ -70,6 +70,9 @@ def _sequence(options: Mapping[str, Any]) -> Sequence:
         fps=options["fps"],
         time_offset=options["time_offset"],
     )
+    if not sequence.posed:
+        raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
+    return sequence
 
 
 def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: Sequence, device: str) -> Source:

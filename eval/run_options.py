@@ -11,7 +11,7 @@ from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
 
-LAYOUTS = ("auto", "tum", "7scenes", "scannet", "tartanair", "generic")
+LAYOUTS = ("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "generic")
 PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
 OWN_DEPTH = ("self", "ground-truth")
 

@@ -1,4 +1,4 @@
-"""Dataset readers: posed frames from TUM RGB-D, 7-Scenes, ScanNet, TartanAir, or any images and poses."""
+"""Dataset readers: posed frames from the layouts that the field uses, or from any images and poses."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.check import SequenceCheck as SequenceCheck
     from ufmstar_torch.eval.sequences.check import check_sequence as check_sequence
+    from ufmstar_torch.eval.sequences.conventions import CONVENTIONS as CONVENTIONS
     from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder
     from ufmstar_torch.eval.sequences.find import Found as Found
     from ufmstar_torch.eval.sequences.find import find_sequences as find_sequences
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.layout import open_sequence as open_sequence
 
 _HOME = {
+    "CONVENTIONS": "conventions",
     "DepthFolder": "depth_folder",
     "Found": "find",
     "Frame": "frame",

@@ -7,27 +7,20 @@ also tries what people get wrong (inverse poses, other axes, another depth scale
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ufmstar_torch.eval.sequences.alignment import Alignment, alignment
+from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
 
-# How given poses become camera-to-world ones with our axes, T -> A(T).
-_NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-_OPENGL_FROM_CAMERA = np.diag([1.0, -1, -1, 1])
-AS_GIVEN = "camera-to-world, x right, y down, z forward"
-_READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    AS_GIVEN: lambda T: T,
-    "world-to-camera (inverted)": np.linalg.inv,
-    "camera-to-world with NED axes (x forward, y right, z down)": lambda T: T @ _NED_FROM_CAMERA,
-    "camera-to-world with OpenGL axes (x right, y up, z backward)": lambda T: T @ _OPENGL_FROM_CAMERA,
-}
+AS_GIVEN = CONVENTIONS[OURS].told
+_READINGS = {convention.told: convention.convert for convention in CONVENTIONS.values()}
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
 _MIN_OVERLAP = 0.3  # share of a frame's points that must land on valid depth, or a pair tells nothing
+_SPARSE = 0.3  # share of a map's pixels that are valid, below which (a laser's) accordingly fewer points must land
 _GAPS = (5, 3, 2, 1)
 # A reading is no better than another within this factor and this relative error (depth's own noise).
 _SAME_FACTOR, _SAME_ERROR = 1.5, 0.003
@@ -69,6 +62,11 @@ class SequenceCheck:
     undecided: tuple[str, ...]
 
     @property
+    def convention(self) -> str:
+        """The reading by the name that ``open_sequence`` takes as ``poses``."""
+        return next(name for name, convention in CONVENTIONS.items() if convention.told == self.reading)
+
+    @property
     def ok(self) -> bool:
         """Whether no problem was found (something may still be undecided)."""
         return not self.problems
@@ -88,8 +86,10 @@ class _Pair:
 def check_sequence(sequence: Sequence, pairs: int = 8) -> SequenceCheck:
     """Checks pose convention, depth scale and registration on evenly spaced pairs of frames.
 
+    Of a sequence without poses only the registration is checked; there are no pairs then, and ``error`` is NaN.
+
     Args:
-        sequence: at least two frames with depth.
+        sequence: at least two frames with depth (or one, without poses).
         pairs: how many pairs to compare, at least 1.
 
     Raises:
@@ -98,6 +98,8 @@ def check_sequence(sequence: Sequence, pairs: int = 8) -> SequenceCheck:
     if pairs < 1:
         raise ValueError(f"pairs must be at least 1, got {pairs}")
     unreadable: list[str] = []
+    if not sequence.posed:
+        return _without_poses(_registration(sequence, unreadable), unreadable)
     errors: dict[str, np.ndarray] = {}
     loaded: list[_Pair] = []
     gap = 0
@@ -110,6 +112,25 @@ def check_sequence(sequence: Sequence, pairs: int = 8) -> SequenceCheck:
         raise ValueError(f"sequence {sequence.name!r} has no two readable frames with depth to compare")
     registration = _registration(sequence, unreadable)
     return _judge(loaded, gap, errors, registration, tuple(dict.fromkeys(unreadable)))
+
+
+def _without_poses(registration: Alignment | None, unreadable: list[str]) -> SequenceCheck:
+    problems: list[str] = []
+    undecided = ["there are no poses: methods that compare views cannot be run"]
+    if registration is not None:
+        _registration_verdict(registration, problems, undecided)
+    return SequenceCheck(
+        pairs=0,
+        gap=0,
+        error=float("nan"),
+        reading=AS_GIVEN,
+        scale=1.0,
+        best_error=float("nan"),
+        registration=registration,
+        unreadable=tuple(dict.fromkeys(unreadable)),
+        problems=tuple(problems),
+        undecided=tuple(undecided),
+    )
 
 
 def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> float:
@@ -129,7 +150,8 @@ def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> floa
     inside = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     found = pair.depth_b[row[inside].astype(int), column[inside].astype(int)]
     valid = found > 0
-    if valid.sum() < _MIN_OVERLAP * pair.points.shape[1]:
+    filled = np.count_nonzero(pair.depth_b > 0) / pair.depth_b.size
+    if valid.sum() < max(1, _MIN_OVERLAP * min(1.0, filled / _SPARSE) * pair.points.shape[1]):
         return float("inf")
     return float(np.median(np.abs(np.log(z[inside][valid] / found[valid]))))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences import generic, kitti360, nyu, scannet, sens, seven_scenes, tartanair, tum
+from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS, convert_poses
 from ufmstar_torch.eval.sequences.frame import Sequence
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike
 from ufmstar_torch.eval.sequences.options import Options
@@ -45,6 +46,7 @@ def open_sequence(
     T_color_depth: np.ndarray | None = None,
     drive: str | int | None = None,
     scans: int | None = None,
+    poses: str = OURS,
 ) -> Sequence:
     """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
 
@@ -71,6 +73,9 @@ def open_sequence(
         drive: name or number of the drive, where ``path`` is KITTI-360's root.
         scans: laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving
             things smear.
+        poses: how they are written: ``camera-to-world`` (x right, y down, z forward), ``world-to-camera``, ``ned``
+            (camera-to-world, x forward, y right, z down) or ``opengl`` (x right, y up, z backward); what is
+            customary for a layout (TartanAir's NED) is known.
 
     Returns:
         The frames with a usable pose; ``skipped`` tells the others.
@@ -99,8 +104,10 @@ def open_sequence(
         drive=drive,
         scans=scans,
     )
+    if poses not in CONVENTIONS:
+        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
     if is_tour:
-        return _open_tour(str(path), layout, options)
+        return convert_poses(_open_tour(str(path), layout, options), poses)
     if layout == "auto":
         layout = detect_layout(path, explicit=images is not None or trajectory is not None)
     if layout not in _READERS:
@@ -110,7 +117,7 @@ def open_sequence(
         raise ValueError(f"{path} has not the layout {layout!r}: looked for {looked_for}")
     if layout != "kitti360":
         options.reject(layout, "drive", "scans")
-    return open_reader(path, options)
+    return convert_poses(open_reader(path, options), poses)
 
 
 def _open_tour(name: str, layout: str, options: Options) -> Sequence:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach_given
+from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
@@ -28,8 +29,6 @@ from ufmstar_torch.eval.sequences.poses import read_trajectory
 LOOKED_FOR = "pose_left.txt and image_left/ (also in a single sub-folder P000)"
 _NATIVE_SIZE = (480, 640)
 _K = (320.0, 320.0, 320.0, 240.0)
-# Columns are our camera axes in the NED camera frame: right = y, down = z, forward = x.
-_NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def detect(path: Path) -> bool:
@@ -54,7 +53,7 @@ def open_tartanair(path: Path, options: Options) -> Sequence:
     if trajectory.timestamps is not None:
         raise ValueError(f"{folder / 'pose_left.txt'}: expected 7 numbers in a line, tx ty tz qx qy qz qw")
     images = list_files(folder / "image_left", IMAGE_SUFFIXES)
-    frames = _frames(folder, images, trajectory.T_world_cam @ _NED_FROM_CAMERA, options.depth_scale)
+    frames = _frames(folder, images, CONVENTIONS["ned"].convert(trajectory.T_world_cam), options.depth_scale)
     frames = attach_given(frames, folder, options)
     size = first_image_size(images) or _NATIVE_SIZE
     if options.intrinsics is None:
