@@ -201,6 +201,20 @@ def demo(arguments: Sequence[str]) -> int:
     return OK
 
 
+def data(arguments: Sequence[str]) -> int:
+    """check: whether a sequence's poses, depth and images fit together"""
+    from ufmstar_torch.eval.data_command import check
+    from ufmstar_torch.eval.data_options import parse_data
+
+    try:
+        own, options = parse_data(arguments)
+        text, fine = check(own.path, own.pairs, own.json, options)
+    except (OSError, ValueError) as error:
+        raise UsageError(_one_line(error)) from error
+    print(text)
+    return OK if fine else FAILED
+
+
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "demo": demo,
     "run": run,
@@ -208,6 +222,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "report": report,
     "bench": bench,
     "train": train,
+    "data": data,
 }
 
 
