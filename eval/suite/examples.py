@@ -22,13 +22,15 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.files import write_atomic
 from ufmstar_torch.eval.ground_truth import resample_nearest
-from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.frame import Frame, Size
+from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
 from ufmstar_torch.eval.suite.estimator import Estimate, Gaussians
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.row_run import RowRun
 
 # Of the frames, after which the mixture is kept; and again at the end.
 ROOM_SHARES = (0.25, 0.5)
+_POINTS = 4  # along each side of a pixel, for the picture
 _MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement")
 
 
@@ -169,10 +171,16 @@ def _scene(finished: FinishedFrame, row: Row) -> dict[str, NDArray]:
     """What was to be seen, at the pixels of a row's maps."""
     frame, truth, K = finished.frame, finished.truths[row], finished.intrinsics[row]
     size = (truth.shape[0], truth.shape[1])
-    image = np.zeros((*size, 3), np.uint8)
-    if frame.image is not None:
-        image = resample_nearest(frame.image, frame.intrinsics, K, size)
+    image = np.zeros((*size, 3), np.uint8) if frame.image is None else _seen(frame.image, frame.intrinsics, K, size)
     return {"image": image, "truth": truth, "K": K}
+
+
+def _seen(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) -> NDArray[np.uint8]:
+    """[h, w, 3] an image as a camera K with ``size`` (h, w) sees it: in every pixel the mean of several points."""
+    fine = (_POINTS * size[0], _POINTS * size[1])
+    points = resample_nearest(image, K_image, scale_intrinsics(K, size, fine), fine)
+    blocks = points.reshape(size[0], _POINTS, size[1], _POINTS, 3)
+    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
 
 def _write(path: Path, arrays: Mapping[str, NDArray]) -> None:

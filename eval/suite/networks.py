@@ -54,7 +54,10 @@ class NetworkChoice:
         if self.model == TRUTH:
             if self.base != "depth_only" or len(self.files) > 1:
                 raise ValueError("ground-truth goes with depth_only, as in depth_only=ground-truth[:HxW]")
-            parse_size(self.files[0] if self.files else None)
+            try:
+                parse_size(self.files[0] if self.files else None)
+            except ValueError as error:
+                raise ValueError(f"ground-truth:HxW needs a size in pixels, got {self.files[0]!r}") from error
             return
         if self.model not in network_names():
             known = ", ".join((*network_names(), TRUTH))

@@ -1,0 +1,184 @@
+"""The cache of predictions: what is read is what was predicted, and nothing else is."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import torch
+from layouts import truncate, write_generic, write_image
+from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
+
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.suite.cache import (
+    CacheError,
+    PredictionCache,
+    PredictionKey,
+    frame_digest,
+    sequence_digest,
+)
+from ufmstar_torch.eval.suite.predicted import Predicted
+
+ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
+KEY = PredictionKey("a" * 64, "b" * 64, "frame-7", "all", "c" * 64)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return write_generic(tmp_path_factory.mktemp("cache"), frames=4)[0]
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory):
+    written = write_networks(tmp_path_factory.mktemp("networks"))
+    wanted = {one.method.base for one in ROWS}
+    return {base: base_network(text, samples=3) for base, text in written.items() if base in wanted}
+
+
+def maps(seed=0):
+    depth, a, e = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(seed)).unbind()
+    depth[0, 0], a[1, 1], e[2, 2] = torch.nan, torch.inf, -0.0
+    return Predicted(depth, a, e, torch.arange(9.0, dtype=torch.float64).reshape(3, 3) / 7)
+
+
+@pytest.mark.parametrize("left_out", [(), ("aleatoric",), ("aleatoric", "epistemic")])
+def test_what_is_stored_is_read_bit_for_bit(tmp_path, left_out):
+    cache, written = PredictionCache(tmp_path / "new" / "cache"), replace(maps(), **dict.fromkeys(left_out))
+    assert cache.load(KEY, CPU) is None
+    cache.store(KEY, written)
+    read = cache.load(KEY, CPU)
+    assert (cache.hits, cache.misses, cache.damaged) == (1, 1, 0)
+    assert read.maps().keys() == written.maps().keys()
+    for name, value in written.maps().items():
+        assert torch.equal(read.maps()[name].view(torch.int32), value.view(torch.int32))
+    assert torch.equal(read.intrinsics, written.intrinsics)
+    assert read.ms is None
+
+
+def test_every_part_of_the_key_matters(tmp_path):
+    cache = PredictionCache(tmp_path)
+    cache.store(KEY, maps())
+    for name in ("network", "sequence", "frame", "member", "content"):
+        assert cache.load(replace(KEY, **{name: "d" * 20}), CPU) is None
+    assert (cache.hits, cache.misses, cache.damaged) == (0, 5, 0)
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "empty", "short"])
+def test_a_damaged_file_is_noticed_and_replaced(tmp_path, damage):
+    cache = PredictionCache(tmp_path)
+    cache.store(KEY, maps())
+    file, content = tmp_path / KEY.path, (tmp_path / KEY.path).read_bytes()
+    if damage == "flip":
+        at = len(content) // 2
+        file.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    else:
+        truncate(file, {"cut": 0.9, "empty": 0.0, "short": 20 / len(content)}[damage])
+    assert cache.load(KEY, CPU) is None
+    assert cache.damaged == 1
+    cache.store(KEY, maps())
+    assert cache.load(KEY, CPU) is not None
+    assert file.read_bytes()[32:] == content[32:]
+
+
+def test_two_who_write_the_same_do_no_harm(tmp_path):
+    caches, written = [PredictionCache(tmp_path) for _ in range(4)], maps()
+
+    def work(cache):
+        for _ in range(25):
+            cache.store(KEY, written)
+            assert cache.load(KEY, CPU) is not None
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(work, caches))
+    assert [(cache.hits, cache.damaged) for cache in caches] == [(25, 0)] * 4
+    assert [file.name for file in tmp_path.rglob("*") if file.name.endswith(".tmp")] == []
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(CacheError, match="file"):
+        PredictionCache(tmp_path / "file")
+    cache = PredictionCache(tmp_path / "cache")
+    (tmp_path / "cache" / KEY.path.parts[0]).write_text("in the way")
+    with pytest.raises(CacheError, match="cannot be written"):
+        cache.store(KEY, maps())
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the administrator may write everywhere")
+def test_a_folder_without_permission_is_named(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(CacheError, match="cannot be written"):
+        PredictionCache(tmp_path)
+
+
+def test_from_the_cache_everything_is_as_from_the_networks(path, networks, tmp_path):
+    sequence, cache = open_sequence(path), PredictionCache(tmp_path)
+    without = evaluate(sequence, ROWS, networks)
+    first = evaluate(sequence, ROWS, networks, cache)
+    asked = 4 * 6  # frames, and predictions of each: ensemble all and one, MC-Dropout both, two networks
+    assert (cache.hits, cache.misses) == (0, asked)
+    again = PredictionCache(tmp_path)
+    second = evaluate(sequence, ROWS, networks, again)
+    assert (again.hits, again.misses, again.damaged) == (asked, 0, 0)
+    for slug, result in without.items():
+        assert same(result, first[slug])
+        assert same(result, second[slug])
+        assert "network" in first[slug].ms
+        assert "network" not in second[slug].ms, "nothing ran: there is no time to tell"
+        assert "uncertainty" in second[slug].ms
+
+
+def test_without_the_networks_running(path, networks, tmp_path, monkeypatch):
+    sequence = open_sequence(path)
+    first = evaluate(sequence, ROWS, networks, PredictionCache(tmp_path))
+    for network in networks.values():
+        monkeypatch.setattr(network, "one", None)
+    second = evaluate(sequence, ROWS, networks, PredictionCache(tmp_path))
+    assert all(same(first[slug], second[slug]) for slug in first)
+
+
+def test_a_damaged_prediction_is_made_again(path, networks, tmp_path):
+    sequence = open_sequence(path)
+    first = evaluate(sequence, ROWS, networks, PredictionCache(tmp_path))
+    files = sorted(tmp_path.rglob("*.maps"))
+    for file in files[::5]:
+        truncate(file)
+    cache = PredictionCache(tmp_path)
+    second = evaluate(sequence, ROWS, networks, cache)
+    assert (cache.damaged, cache.misses) == (len(files[::5]), 0)
+    assert all(same(first[slug], second[slug]) for slug in first)
+
+
+def test_another_image_under_the_same_name_is_predicted_anew(networks, tmp_path):
+    path, scene = write_generic(tmp_path, frames=3)
+    rows, kept = [row("Evidential")], tmp_path / "cache"
+    before = evaluate(open_sequence(path), rows, networks, PredictionCache(kept))
+    write_image(path / "images" / "8.png", 255 - scene.images[1])
+    cache = PredictionCache(kept)
+    after = evaluate(open_sequence(path), rows, networks, cache)
+    assert (cache.hits, cache.misses) == (2, 1)
+    fresh = evaluate(open_sequence(path), rows, networks)
+    assert same(after["Evidential"], fresh["Evidential"])
+    assert not same(after["Evidential"], before["Evidential"])
+
+
+def test_digests_tell_frames_and_sequences_apart(tmp_path):
+    one, other = (open_sequence(write_generic(tmp_path, frames=3, folder=name)[0]) for name in ("one", "other"))
+    assert sequence_digest(one) != sequence_digest(other)
+    assert sequence_digest(one) == sequence_digest(open_sequence(tmp_path / "one"))
+    frame = one[1]
+    moved = frame.intrinsics.copy()
+    moved[0, 2] += 1
+    changed = [replace(frame, intrinsics=moved), replace(frame, index=2), replace(frame, image=frame.image[:, ::-1])]
+    assert len({frame_digest(f) for f in [frame, *changed]}) == 4
+    assert frame_digest(replace(frame, name="x", depth=None)) == frame_digest(frame)
+
+
+def test_no_folder_keeps_nothing(path, networks, tmp_path):
+    cache = PredictionCache(None)
+    cache.store(KEY, maps())
+    assert cache.load(KEY, CPU) is None
+    evaluate(open_sequence(path), ROWS[:1], networks, cache)
+    assert (cache.hits, cache.misses, cache.damaged) == (0, 0, 0)

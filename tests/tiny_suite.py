@@ -1,0 +1,83 @@
+"""Small networks in files, and rows on small sequences, for the tests of the evaluation."""
+
+from __future__ import annotations
+
+import torch
+
+from ufmstar_torch.eval.suite.cache import PredictionCache
+from ufmstar_torch.eval.suite.evaluate import evaluate_sequence
+from ufmstar_torch.eval.suite.method import Method
+from ufmstar_torch.eval.suite.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import Setting
+from ufmstar_torch.models import NetworkSpec, build_network, save_trained
+
+CPU = torch.device("cpu")
+SPECS = {
+    "depth": {},
+    "aleatoric": {},
+    "evidential": {},
+    "mc_dropout": {"dropout": 0.2},
+    "batch_ensemble": {"members": 3},
+}
+
+
+def write_network(path, method="aleatoric", count=1, seed=0):
+    """A file of FastDepths of a twentieth of the width, 32 x 64, moved from where they began; the file."""
+    spec = NetworkSpec(
+        method=method, widths=0.05, positive="softplus", size=(32, 64), preprocess="resize", **SPECS[method]
+    )
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        networks = [build_network(spec) for _ in range(count)]
+        with torch.no_grad():
+            for network in networks:
+                network.distribution(torch.rand(4, 3, *spec.size))
+                for parameter in network.parameters():
+                    parameter += 0.05 * torch.randn_like(parameter)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_trained(path, [network.eval() for network in networks], spec)
+    return path
+
+
+def write_networks(folder):
+    """One file for every base: {base: what a user types}."""
+    kinds = {
+        "ensemble": ("aleatoric", 3),
+        "mc_dropout": ("mc_dropout", 1),
+        "batch_ensemble": ("batch_ensemble", 1),
+        "evidential": ("evidential", 1),
+        "aleatoric": ("aleatoric", 1),
+        "depth_only": ("depth", 1),
+    }
+    files = {base: write_network(folder / f"{base}.safetensors", *kind) for base, kind in kinds.items()}
+    return {base: f"{base}=trained:{file}" for base, file in files.items()}
+
+
+def base_network(text, **options):
+    """What a user typed, loaded."""
+    return BaseNetwork(NetworkChoice.parse(text), CPU, **options)
+
+
+def row(name, **setting):
+    """The row of a name, under a setting."""
+    return Row(Method.parse(name), Setting(**setting))
+
+
+def evaluate(sequence, rows, networks, cache=None, **options):
+    """``evaluate_sequence`` on the CPU; the results by the row's slug."""
+    results = evaluate_sequence(sequence, rows, networks, cache=cache or PredictionCache(None), device=CPU, **options)
+    assert [result.row for result in results] == list(rows)
+    return {result.row.slug: result for result in results}
+
+
+def same(one, other):
+    """Whether two results agree to the last bit, times left aside."""
+    return (
+        one.frames == other.frames
+        and repr(one.figures) == repr(other.figures)
+        and repr(one.curves) == repr(other.curves)
+        and one.state == other.state
+        and one.sums.keys() == other.sums.keys()
+        and all(torch.equal(one.sums[m][k], other.sums[m][k]) for m in one.sums for k in one.sums[m])
+    )
