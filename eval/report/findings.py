@@ -1,0 +1,224 @@
+"""What an evaluation has found, in words that are computed from its numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from ufmstar_torch.eval.report.aggregate import (
+    Mean,
+    better,
+    difference,
+    has_variance,
+    mean_of,
+    mean_over,
+    references,
+    value_of,
+)
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.names import DELTA1, DIFFERENCES, ECE_DELTA, ECE_Q, LOWER, NLL, Quantity, row_label
+from ufmstar_torch.eval.report.table import number
+from ufmstar_torch.eval.suite.method import ALONE, UFM, UFM_STAR
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import DEFAULT
+
+BETTER, WORSE, OPEN, ALONE_SEQUENCE = "better", "worse", "open", "one sequence"
+_VERDICTS = (BETTER, WORSE, OPEN, ALONE_SEQUENCE)
+# The paper's three: what "uncertainty quality" means there.
+QUALITY = (NLL, ECE_DELTA, ECE_Q)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A row against another one in one figure, in pairs on the same sequences.
+
+    Attributes:
+        row: judged.
+        reference: beside which.
+        quantity: the figure.
+        mine: mean of the row over the sequences that both have.
+        theirs: that of the reference.
+        difference: mine - theirs, with its interval.
+    """
+
+    row: Row
+    reference: Row
+    quantity: Quantity
+    mine: float
+    theirs: float
+    difference: Mean
+
+    @property
+    def verdict(self) -> str:
+        """ "better" or "worse" beyond the interval, "open" within it, "one sequence" where there is none."""
+        if self.difference.sequences < 2:
+            return ALONE_SEQUENCE
+        found = better(self.difference, self.quantity)
+        return OPEN if found is None else BETTER if found else WORSE
+
+    @property
+    def words(self) -> str:
+        """ "NLL 1.33 → 0.96 (-0.37 ± 0.11)"."""
+        q = self.quantity
+        unit = f" {q.unit}" if q.unit else ""
+        values = f"{number(self.theirs, q.decimals)} → {number(self.mine, q.decimals)}{unit}"
+        change = number(self.difference.value, q.decimals, signed=True)
+        half = "" if math.isnan(self.difference.half) else f" ± {number(self.difference.half, q.decimals)}"
+        return f"{q.name} {values} ({change}{half})"
+
+
+def compare(results: Results, row: Row, reference: Row, dataset: str | None = None) -> list[Comparison]:
+    """A row against a reference in all figures that both have."""
+    found = []
+    for quantity in DIFFERENCES:
+        delta = difference(results, row, reference, quantity, dataset)
+        if delta.sequences:
+            mine, theirs = _on_common(results, row, reference, quantity, dataset)
+            found.append(Comparison(row, reference, quantity, mine, theirs, delta))
+    return found
+
+
+def comparisons(results: Results, dataset: str | None = None) -> dict[tuple[Row, Row], list[Comparison]]:
+    """Every row of UfM* with its default settings against what it is to be judged by."""
+    rows = [row for row in results.rows if row.method.fusion == UFM_STAR and row.setting == DEFAULT]
+    pairs = ((row, reference) for row in rows for reference in references(results, row))
+    found = {(row, reference): compare(results, row, reference, dataset) for row, reference in pairs}
+    return {pair: made for pair, made in found.items() if made}
+
+
+def headlines(results: Results) -> list[str]:
+    """UfM* against the networks and against UfM, where it does not win, and what an ablation's settings change."""
+    found = comparisons(results)
+    against = {
+        "the network alone": [c for (_, ref), made in found.items() if ref.method.fusion == ALONE for c in made],
+        "UfM": [c for (_, ref), made in found.items() if ref.method.fusion == UFM for c in made],
+    }
+    sentences = [_tally(name, made) for name, made in against.items() if made]
+    sentences += [_losses(c for made in against.values() for c in made)] if any(against.values()) else []
+    return [*sentences, *_settings(results)]
+
+
+def best_rows(results: Results) -> list[str]:
+    """Which row has the best mean of each figure, and whether its lead is beyond chance."""
+    return [sentence for quantity in (DELTA1, *DIFFERENCES) if (sentence := _best(results, quantity))]
+
+
+def _on_common(
+    results: Results, row: Row, reference: Row, quantity: Quantity, dataset: str | None
+) -> tuple[float, float]:
+    """Means of both over the sequences that both have."""
+    sides = [
+        {(r.dataset, r.sequence): quantity.factor * value_of(r, quantity.key) for r in results.of(side, dataset)}
+        for side in (row, reference)
+    ]
+    both = [key for key in sides[0] if not math.isnan(sides[0][key]) and not math.isnan(sides[1].get(key, math.nan))]
+    mine, theirs = (mean_over([side[key] for key in both]).value for side in sides)
+    return mine, theirs
+
+
+def _tally(name: str, made: Sequence[Comparison]) -> str:
+    """How often UfM* is better than one kind of reference, in the paper's figures, and by how much on average."""
+    told = [c for c in made if c.quantity in QUALITY]
+    of = {verdict: sum(c.verdict == verdict for c in told) for verdict in _VERDICTS}
+    if not told:
+        return f"Against {name} there is no figure of NLL or calibration to compare."
+    about = f"UfM* against {name}, {count(len(told), 'comparison')} of NLL, ECE_δ and ECE_q"
+    if of[ALONE_SEQUENCE]:
+        better_ = sum((c.difference.value < 0) == (c.quantity.better == LOWER) for c in told if c.difference.value)
+        return f"{about}: the better value in {better_}, on a single sequence, which decides nothing."
+    counts = f"better in {of[BETTER]}, worse in {of[WORSE]}, not to be told apart in {of[OPEN]}"
+    # A mean over networks, for a reader who wants one number.
+    changes = [_mean_change(of_figure) for q in QUALITY if (of_figure := [c for c in told if c.quantity is q])]
+    return f"{about}: {counts}. On average {join(changes)}."
+
+
+def _mean_change(made: Sequence[Comparison]) -> str:
+    """How a figure changes on average over the bases: in its own unit where it can be negative, else in percent."""
+    quantity = made[0].quantity
+    change = math.fsum(c.difference.value for c in made) / len(made)
+    before = math.fsum(c.theirs for c in made) / len(made)
+    way = "falls" if change < 0 else "rises"
+    if quantity is NLL or before <= 0:
+        return f"{quantity.name} {way} by {number(abs(change), quantity.decimals)}"
+    return f"{quantity.name} {way} by {100 * abs(change) / before:.0f} %"
+
+
+def _losses(made: Iterable[Comparison]) -> str:
+    """Where UfM* does not win."""
+    judged = [c for c in made if c.verdict != ALONE_SEQUENCE]
+    worse = [c for c in judged if c.verdict == WORSE]
+    if not judged:
+        return "With one sequence nothing can be said about where UfM* does not win."
+    if not worse:
+        return (
+            f"In none of all {len(judged)} comparisons, ranking (AUSE, Spearman) included, is UfM* worse beyond chance."
+        )
+    told = "; ".join(f"{row_label(c.row)} against {row_label(c.reference)}: {c.words}" for c in worse)
+    return f"UfM* is worse beyond chance in {len(worse)} of all {len(judged)} comparisons: {told}."
+
+
+def _best(results: Results, quantity: Quantity) -> str:
+    """Which row has the best mean of a figure, and whether its lead is beyond chance; "" where rows are not alike."""
+    rows = [row for row in results.rows if row.setting == DEFAULT]
+    if quantity is not DELTA1:
+        rows = [row for row in rows if has_variance(results, row)]
+    on = {frozenset((r.dataset, r.sequence) for r in results.of(row)) for row in rows}
+    means = {row: mean_of(results.of(row), quantity) for row in rows}
+    means = {row: mean for row, mean in means.items() if not math.isnan(mean.value)}
+    if len(means) < 2 or len(on) > 1:
+        return ""
+    sign = 1 if quantity.better == LOWER else -1
+    order = sorted(means, key=lambda row: sign * means[row].value)
+    first = order[0]
+    unit = f" {quantity.unit}" if quantity.unit else ""
+    value = f"{number(means[first].value, quantity.decimals)}{unit}"
+    alike = [row for row in order[1:] if number(means[row].value, quantity.decimals) == value.split(" ")[0]]
+    if alike:
+        shared = join([row_label(row) for row in (first, *alike)])
+        return f"Best {quantity.name}: {value}, shared by {shared}." if len(alike) < 6 else ""
+    lead = difference(results, first, order[1], quantity)
+    told = f"Best {quantity.name}: {row_label(first)} with {value}, before {row_label(order[1])}"
+    second = number(means[order[1]].value, quantity.decimals)
+    if lead.sequences < 2:
+        return f"{told} ({second})."
+    beyond = "a lead beyond chance" if better(lead, quantity) else "a lead that may be chance"
+    change = f"{number(lead.value, quantity.decimals, signed=True)} ± {number(lead.half, quantity.decimals)}"
+    return f"{told} ({second}; {beyond}, {change})."
+
+
+def _settings(results: Results) -> list[str]:
+    """For an ablation: which settings beat the default, figure by figure."""
+    sentences = []
+    varied = [row for row in results.rows if row.setting != DEFAULT and row.method.fusion == UFM_STAR]
+    defaults = {row.method: row for row in results.rows if row.setting == DEFAULT}
+    pairs = [(row, defaults[row.method]) for row in varied if row.method in defaults]
+    made = [c for pair in pairs for c in compare(results, *pair)]
+    for quantity in DIFFERENCES:
+        of_figure = [c for c in made if c.quantity is quantity and c.verdict != ALONE_SEQUENCE]
+        if not of_figure:
+            continue
+        parts = []
+        for verdict in (BETTER, WORSE):
+            found = sorted((c for c in of_figure if c.verdict == verdict), key=lambda c: -abs(c.difference.value))
+            named = "; ".join(f"{row_label(c.row)} {_change(c)}" for c in found[:4])
+            more = f"; and {len(found) - 4} more" if len(found) > 4 else ""
+            parts.append(f"{verdict} with {len(found)}{f' ({named}{more})' if found else ''}")
+        sentences.append(
+            f"{quantity.name}, of {count(len(of_figure), 'setting')} beside the default: {', '.join(parts)}, "
+            f"not to be told apart with {sum(c.verdict == OPEN for c in of_figure)}."
+        )
+    return sentences
+
+
+def _change(c: Comparison) -> str:
+    decimals = c.quantity.decimals
+    return f"{number(c.difference.value, decimals, signed=True)} ± {number(c.difference.half, decimals)}"
+
+
+def join(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def count(n: int, noun: str) -> str:
+    return f"{n} {noun}{'' if n == 1 else 's'}"
