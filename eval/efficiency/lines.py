@@ -80,15 +80,18 @@ def _no_network_part(row: Row, network: Contender) -> dict[str, str] | None:
 
 
 def _energy_overhead(spent: Mapping[str, PartEnergy], missing: Mapping[str, str] | None) -> dict[str, float] | None:
-    """Share of uncertainty in all energy [%], gross and net; None unless all of it was measured."""
+    """Share of uncertainty in all energy [%], gross and net; None unless all of it was measured.
+
+    A difference that the noise makes negative counts as nothing.
+    """
     if any(part.reason is not None for part in spent.values()) or (missing is not None and "none" not in missing):
         return None
     overhead: dict[str, float] = {}
     for kind, field in (("gross", "joules"), ("net", "net")):
         middle = {key: median(getattr(part, field)) for key, part in spent.items()}
         depth = middle.pop(DEPTH)
-        if depth > 0 and sum(middle.values()) >= 0:
-            overhead[kind] = overhead_percent(sum(middle.values()), depth)
+        if depth > 0:
+            overhead[kind] = overhead_percent(sum(max(0.0, value) for value in middle.values()), depth)
     return overhead or None
 
 

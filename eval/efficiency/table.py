@@ -20,7 +20,7 @@ from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
 
 NOT_SEPARABLE = "not separable"
 UNITS = {GPU: "GPU", CPU: "CPU"}
-_SMALLEST = 0.005  # prints as "<0.01"
+_SMALLEST = 0.01  # less prints as "<0.01"
 
 
 def efficiency_table(
@@ -127,7 +127,9 @@ def _power_and_energy(row: Mapping[str, Any], parts: Sequence[str], kind: str) -
         return NOT_SEPARABLE, NOT_SEPARABLE
     if any("not_measurable" in one for one in told):
         return NOT_MEASURABLE, NOT_MEASURABLE
-    energy = sum(one[kind]["millijoules"] for one in told)
+    if len(told) == 1 and told[0][kind]["q1"] <= 0:
+        return "", f"<{_digits(max(told[0][kind]['q3'], _SMALLEST), 1)}"
+    energy = sum(max(0.0, one[kind]["millijoules"]) for one in told)
     seconds = sum(one[kind]["seconds"] for one in told)
     return _digits(1e-3 * energy / seconds, 1) if seconds > 0 else "", _digits(energy, 1)
 

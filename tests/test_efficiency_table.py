@@ -1,0 +1,126 @@
+"""The table of what uncertainty costs: the paper's own lines, and words where nothing was measured."""
+
+from __future__ import annotations
+
+import copy
+import re
+
+import pytest
+
+from ufmstar_torch.eval.efficiency.memory import overhead_percent
+from ufmstar_torch.eval.efficiency.power import CPU, GPU, NOT_MEASURABLE
+from ufmstar_torch.eval.efficiency.table import efficiency_table, efficiency_tables, megabytes
+
+
+def part(ms, millijoules=None, low=None):
+    spread = {"median_ms": ms, "q1_ms": ms if low is None else low, "q3_ms": ms}
+    if millijoules is None:
+        return spread, {"not_measurable": "no counter"}
+    told = [
+        {**dict.fromkeys(("q1", "millijoules", "q3"), mJ), "seconds": 1e-3 * ms}
+        for mJ in (millijoules, millijoules / 2)
+    ]
+    return spread, {"gross": told[0], "net": told[1]}
+
+
+def line(depth=(27.0, 206.3), dnn=(252.0, 1857.0), mvd=None, memory=None, overhead=90.0):
+    """A measurement with one row of given medians [ms, mJ]."""
+    parts = {"depth": part(*depth), "network_uncertainty": part(*dnn)} | ({"multiview": part(*mvd)} if mvd else {})
+    sizes = {"depth_bytes": 138.3e6, "network_uncertainty_bytes": 1245e6, "mvd": 0} | (memory or {})
+    state = sizes.pop("mvd")
+    sizes["overhead_percent"] = overhead_percent(sizes["network_uncertainty_bytes"] + state, sizes["depth_bytes"])
+    name = "UfM*-Ensemble" if mvd else "Ensemble"
+    ratios = {key: {"q1": s["q1_ms"] / 27, "median": s["median_ms"] / 27, "q3": s["q3_ms"] / 27}
+              for key, (s, _) in parts.items()}  # fmt: skip
+    row = {
+        "row": name, "base": "ensemble", "network": "ResNet50-Monodepth2",
+        "latency": {key: value[0] for key, value in parts.items()}, "ratios_to_depth": ratios,
+        "energy": {key: value[1] for key, value in parts.items()},
+        "energy_overhead_percent": None if overhead is None else {"gross": overhead, "net": overhead / 2},
+        "memory": {**sizes, "multiview": {"bytes_end": state, "smoothing_bytes": 200704} if state or mvd else None},
+    }  # fmt: skip
+    depth_memory = {"depth": sizes["depth_bytes"], "uncertainty": 0}
+    return {
+        "devices": {"units": {"depth": GPU, "network_uncertainty": GPU, "multiview": CPU}},
+        "machine": {"hardware": {"cpu": "Cortex-A78AE"}, "gpu": "Orin"},
+        "plan": {"frames": 100, "threads": 4},
+        "sequence": {"name": "scene0000_00"},
+        "power": {"missing": {}, "rails": [{"name": "soc gpu"}]},
+        "networks": {"ensemble": {"memory": depth_memory, "whole": None, "latency": {"depth": parts["depth"][0]}}},
+        "rows": [row],
+        "left_out": {},
+    }
+
+
+def cells(measured, **options):
+    (table,) = efficiency_tables(measured, **options)
+    return [cell.value for cell in table.lines[0].cells]
+
+
+def test_the_papers_lines_are_printed_as_in_the_paper():
+    assert cells(line()) == ["252", "7.4", "1857", "", "", "", "90.0", "1245", "", "90.0"]
+    star = line(dnn=(2.0, 10.4), mvd=(25.2, 53.0), memory={"mvd": 30_000}, overhead=32.0)
+    assert cells(star) == ["2.0", "5.2", "10", "25", "2.1", "53", "32.0", "1245", "0.03", "90.0"]
+    assert cells(star, net=True)[:7] == ["2.0", "2.6", "5.2", "25", "1.1", "26", "16.0"]
+    markdown, latex = efficiency_table(star)
+    assert "Depth alone: 27 ms on the GPU, 138.3 MB." in markdown
+    assert "smoothing besides: 0.20 MB" in markdown
+    assert r"UfM$^*$-Ensemble & $2.0$ & $5.2$" in latex
+    assert latex.count(r"\begin{table}") == 1
+
+
+def test_relative_times_are_multiples_of_depth():
+    assert cells(line(), relative=True)[0] == "9.33"
+    assert not re.search(r"\d ms", efficiency_table(line(), relative=True)[0])
+
+
+def test_a_difference_that_the_noise_hides_is_an_upper_bound():
+    hidden = line()
+    hidden["rows"][0]["latency"]["network_uncertainty"] = {"q1_ms": -0.3, "median_ms": 0.1, "q3_ms": 0.8}
+    hidden["rows"][0]["energy"]["network_uncertainty"]["gross"] |= {"q1": -2.0, "q3": 4.0}
+    assert cells(hidden)[:3] == ["<0.8", "", "<4.0"]
+
+
+def test_an_unmeasured_unit_has_words_in_its_cells_only():
+    half = line(dnn=(2.0, 10.4), mvd=(25.2, None), overhead=None)
+    half["power"]["missing"] = {CPU: "no counter"}
+    assert cells(half)[:7] == ["2.0", "5.2", "10", "25", NOT_MEASURABLE, NOT_MEASURABLE, NOT_MEASURABLE]
+    assert "Power and energy of the CPU are not measurable here: no counter." in efficiency_table(half)[0]
+
+
+def test_several_architectures_have_a_table_each():
+    other = copy.deepcopy(line())
+    other["rows"][0]["network"] = "FastDepth"
+    tables = efficiency_tables([line(), other])
+    assert [table.name for table in tables] == ["efficiency-resnet50-monodepth2", "efficiency-fastdepth"]
+    assert efficiency_table([line(), other])[1].count(r"\begin{table}") == 2
+
+
+@pytest.mark.parametrize(
+    ("count", "printed"),
+    [(0, "0"), (580, "<0.01"), (30_000, "0.03"), (4e6, "4.0"), (74.6e6, "74.6"), (138.3e6, "138.3"), (1245e6, "1245")],
+)
+def test_megabytes_are_printed_as_in_the_paper(count, printed):
+    assert megabytes(count) == printed
+
+
+PAPER = [  # the paper's table: depth, DNN uncertainty, MVD [MB], overhead [%]
+    (138.3, 1245, 0, "90.0"),
+    (138.3, 1245, 74.6, "90.5"),
+    (138.3, 1245, 4.0, "90.0"),
+    (138.3, 1245, 0.03, "90.0"),
+    (138.3, 0.01, 4.0, "2.8"),
+    (138.3, 0.01, 0.03, "0.03"),
+    (15.8, 142.6, 0, "90.0"),
+    (15.8, 142.6, 4.0, "90.3"),
+    (15.8, 142.6, 0.03, "90.0"),
+    (15.8, 0.0012, 0, "<0.01"),
+    (15.8, 0.0012, 4.0, "20.2"),
+    (15.8, 0.0012, 0.03, "0.2"),
+]
+
+
+@pytest.mark.parametrize(("depth", "dnn", "mvd", "printed"), PAPER)
+def test_overhead_is_the_papers(depth, dnn, mvd, printed):
+    row = line(memory={"depth_bytes": depth * 1e6, "network_uncertainty_bytes": dnn * 1e6, "mvd": mvd * 1e6})
+    assert cells(row)[-1] == printed
