@@ -93,11 +93,13 @@ def run_windows(
                 reasons[key] = value
             else:
                 results[key].append(value)
-    energies = {}
+    energies: dict[tuple[str, str], PartEnergy] = {}
     for key, values in results.items():
-        energies[key] = (
-            PartEnergy(reason=reasons[key]) if key in reasons else PartEnergy(*map(tuple, zip(*values, strict=True)))
-        )
+        if key in reasons:
+            energies[key] = PartEnergy(reason=reasons[key])
+        else:
+            joules, net, times = zip(*values, strict=True)
+            energies[key] = PartEnergy(joules, net, times)
     return energies
 
 

@@ -10,7 +10,6 @@ from ufmstar_torch.eval.efficiency.contender import contenders
 from ufmstar_torch.eval.efficiency.measure import Plan, measure
 from ufmstar_torch.eval.files import write_json_atomic
 from ufmstar_torch.eval.suite.run_suite import EvalJob
-from ufmstar_torch.eval.suite.setting import DEFAULT
 from ufmstar_torch.eval.suite.worker import device_of
 
 EFFICIENCY = "efficiency.json"
@@ -41,7 +40,6 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     else:
         raise ValueError(f"no sequence can be opened: {'; '.join(failed[:3])}")
     frames = max(1, min(plan.frames, len(sequence) - plan.warm_up))
-    methods = [row.method for row in job.suite.rows if row.setting == DEFAULT]
     networks = contenders(job.load(torch.device(device)))
-    found = measure(methods, networks, sequence, device=device, plan=replace(plan, frames=frames))
+    found = measure(job.suite.rows, networks, sequence, device=device, plan=replace(plan, frames=frames))
     write_json_atomic(job.out / EFFICIENCY, found)
