@@ -22,9 +22,7 @@ def caveats(results: Results) -> list[str]:
         sequences = {(dataset, sequence) for dataset, sequence, _ in results.missing}
         notes.append(f"Not finished: rows of {count(len(sequences), 'sequence')} are still to be evaluated.")
     if results.failed:
-        notes.append(
-            f"{count(len(results.failed), 'sequence')} could not be evaluated and stand in no figure; see Problems."
-        )
+        notes.append(f"Left out, because of errors: {count(len(results.failed), 'sequence')}; see Problems.")
     if len(results.sequences()) == 1:
         notes.append("There is one sequence, so there are no confidence intervals and no verdicts.")
     for dataset in results.datasets:

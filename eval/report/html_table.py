@@ -20,7 +20,7 @@ def html_table(table: Table, *, caption: bool = True) -> Markup:
     heads = tag("tr", tag("th", table.first, scope="col"), [_head(column) for column in table.columns])
     above = _groups(table.columns) if grouped else None
     blocks = [tag("tbody", [_line(line.label, line.cells, line.bold) for line in block]) for block in table.blocks]
-    return figure_of(
+    return framed(
         tag("table", tag("caption", table.title) if caption else None, tag("thead", above, heads), blocks),
         table.title,
         table.notes,
@@ -31,10 +31,10 @@ def plain_table(title: str, heads: Sequence[str], rows: Iterable[Sequence[Child]
     """A table of words."""
     head = tag("tr", [tag("th", name, scope="col") for name in heads])
     body = [tag("tr", [tag("td", cell, class_="words") for cell in row]) for row in rows]
-    return figure_of(tag("table", tag("caption", title), tag("thead", head), tag("tbody", body)), title, notes)
+    return framed(tag("table", tag("caption", title), tag("thead", head), tag("tbody", body)), title, notes)
 
 
-def figure_of(table: Markup, label: str, notes: Sequence[str]) -> Markup:
+def framed(table: Markup, label: str, notes: Sequence[str]) -> Markup:
     """A table in a frame of its own that scrolls, which the keyboard reaches too."""
     below = tag("ul", [tag("li", typeset(note)) for note in notes], class_="notes") if notes else None
     scrolled = tag("div", table, class_="scroll", role="region", aria_label=label, tabindex="0")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from ufmstar_torch.eval.report.caveats import caveats
 from ufmstar_torch.eval.report.findings import (
@@ -13,13 +13,14 @@ from ufmstar_torch.eval.report.findings import (
     Comparison,
     best_rows,
     comparisons,
-    count,
     headlines,
 )
+from ufmstar_torch.eval.report.html_table import framed
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.markup import Markup, tag, typeset
-from ufmstar_torch.eval.report.names import row_label
-from ufmstar_torch.eval.report.page_part import Part, bullets, paragraph
+from ufmstar_torch.eval.report.names import DIFFERENCES, row_label
+from ufmstar_torch.eval.report.page_part import Part, bullets, folded, paragraph
+from ufmstar_torch.eval.report.table import number
 from ufmstar_torch.eval.suite.row import Row
 
 # What the reader sees for a verdict, and its class.
@@ -32,7 +33,7 @@ _WORDS = {
 
 
 def findings_part(results: Results) -> Part:
-    """Sentences, what to beware of, and a card for each comparison."""
+    """Sentences, what to beware of, and a verdict for each comparison."""
     told = headlines(results) or ["No row of UfM* stands beside another row here, so there is nothing to compare."]
     body = [bullets(told, "findings")]
     warned = caveats(results)
@@ -40,11 +41,10 @@ def findings_part(results: Results) -> Part:
         body += [tag("h3", "Before you believe it"), bullets(warned, "caveats")]
     found = comparisons(results)
     if found:
-        body += [tag("h3", "UfM* beside the others"), paragraph(_HOW), _cards(found)]
+        body += [tag("h3", "UfM* beside the others"), paragraph(_HOW), _board(found, "All sequences")]
     if len(results.datasets) > 1:
-        for dataset in results.datasets:
-            of_one = comparisons(results, dataset)
-            body += [tag("h3", f"The same on {dataset} alone"), _cards(of_one)] if of_one else []
+        each = {dataset: of_one for dataset in results.datasets if (of_one := comparisons(results, dataset))}
+        body += [folded(f"The same on {name} alone", _board(of_one, name)) for name, of_one in each.items()]
     best = best_rows(results)
     if best:
         body += [tag("h3", "Best rows"), bullets(best, "findings")]
@@ -52,27 +52,30 @@ def findings_part(results: Results) -> Part:
 
 
 _HOW = (
-    "Each figure goes from the reference's mean to that of UfM*; in brackets their mean difference on the same "
-    "sequences, with its 95 % interval. Better and worse: the interval leaves out 0. Open: it does not."
+    "Means of the reference → of UfM*, over the sequences that both have. Better and worse are beyond chance: the 95 % "
+    "interval of the difference on the same sequences leaves out 0. Open: it does not. The intervals stand under "
+    "Paired differences."
 )
 
 
-def _cards(found: dict[tuple[Row, Row], list[Comparison]]) -> Markup:
-    return tag("div", [_card(row, reference, made) for (row, reference), made in found.items()], class_="cards")
-
-
-def _card(row: Row, reference: Row, made: Sequence[Comparison]) -> Markup:
+def _board(found: Mapping[tuple[Row, Row], Sequence[Comparison]], title: str) -> Markup:
+    """A line for each pair of rows, a verdict for each figure."""
+    shown = [q for q in DIFFERENCES if any(c.quantity is q for made in found.values() for c in made)]
+    heads = ["UfM*", "beside", "sequences", *(q.heading for q in shown)]
     lines = []
-    for verdict, (word, class_) in _WORDS.items():
-        of_verdict = [c.words for c in made if c.verdict == verdict]
-        if of_verdict:
-            told = [tag("div", typeset(words)) for words in of_verdict]
-            lines.append(tag("li", tag("span", word, class_=f"verdict {class_}"), tag("div", told)))
-    sequences = max(c.difference.sequences for c in made)
-    return tag(
-        "article",
-        tag("h3", row_label(row)),
-        tag("p", f"beside {row_label(reference)}, {count(sequences, 'sequence')}"),
-        tag("ul", lines),
-        class_="card",
-    )
+    for (row, reference), made in found.items():
+        by_figure = {c.quantity.key: c for c in made}
+        sequences = max(c.difference.sequences for c in made)
+        names = [tag("th", row_label(row), scope="row"), tag("td", row_label(reference)), tag("td", str(sequences))]
+        lines.append(tag("tr", names, [_verdict(by_figure.get(q.key)) for q in shown]))
+    head = tag("thead", tag("tr", [tag("th", name, scope="col") for name in heads]))
+    return framed(tag("table", tag("caption", title), head, tag("tbody", lines), class_="board"), title, ())
+
+
+def _verdict(c: Comparison | None) -> Markup:
+    if c is None:
+        return tag("td", "–")
+    word, class_ = _WORDS[c.verdict]
+    decimals = c.quantity.decimals
+    told = f"{number(c.theirs, decimals)} → {number(c.mine, decimals)}"
+    return tag("td", tag("span", word, class_=f"verdict {class_}"), " ", typeset(told), title=c.words)

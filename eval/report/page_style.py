@@ -20,7 +20,7 @@ body {
   margin: 0; background: var(--paper); color: var(--ink);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "Liberation Sans", sans-serif;
 }
-.frame { display: grid; grid-template-columns: 15rem minmax(0, 1fr); gap: 2.5rem; max-width: 84rem; margin: 0 auto;
+.frame { display: grid; grid-template-columns: 13.5rem minmax(0, 1fr); gap: 2rem; max-width: 88rem; margin: 0 auto;
   padding: 0 1.5rem; }
 nav { position: sticky; top: 0; align-self: start; max-height: 100vh; overflow: auto; padding: 2.2rem 0;
   font-size: .9rem; }
@@ -46,23 +46,17 @@ code { font: .88em ui-monospace, "SF Mono", Menlo, Consolas, "Liberation Mono", 
 .findings li { margin: .5rem 0; }
 .caveats { border-left: 3px solid var(--even); background: var(--card); padding: .6rem 1rem .6rem 2rem;
   border-radius: 0 .4rem .4rem 0; }
-.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 19rem), 1fr)); gap: 1rem;
-  margin: 1rem 0; }
-.card { background: var(--card); border: 1px solid var(--line); border-radius: .6rem; padding: .8rem 1rem; }
-.card h3 { margin: 0 0 .1rem; font-size: 1rem; }
-.card p { margin: 0 0 .5rem; color: var(--faint); font-size: .88rem; }
-.card ul { list-style: none; margin: 0; padding: 0; font-size: .93rem; }
-.card li { display: grid; grid-template-columns: 5.6rem 1fr; gap: .5rem; padding: .22rem 0;
-  border-top: 1px solid var(--line); }
 .verdict { font-weight: 600; white-space: nowrap; }
 .better { color: var(--good); } .worse { color: var(--bad); } .open, .single { color: var(--even); }
+table.board td { border-left: 1px solid var(--line); }
+.board .verdict { display: block; }
 .table { margin: 1rem 0 1.6rem; }
 .scroll { overflow-x: auto; background: var(--card); border: 1px solid var(--line); border-radius: .5rem; }
 .scroll:focus-visible, summary:focus-visible, .zoom:focus-visible { outline: 2px solid var(--accent);
   outline-offset: 2px; }
-table { border-collapse: collapse; font-size: .9rem; width: 100%; }
-caption { text-align: left; font-weight: 600; padding: .6rem .8rem; position: sticky; left: 0; }
-th, td { padding: .32rem .75rem; text-align: left; vertical-align: baseline; white-space: nowrap; }
+table { border-collapse: collapse; font-size: .87rem; width: 100%; }
+caption { text-align: left; font-weight: 600; padding: .6rem .55rem; position: sticky; left: 0; }
+th, td { padding: .3rem .55rem; text-align: left; vertical-align: baseline; white-space: nowrap; }
 td.words { white-space: normal; overflow-wrap: anywhere; min-width: 7rem; max-width: 40rem; }
 th.number, td.number { text-align: right; font-variant-numeric: tabular-nums; }
 thead th { border-bottom: 1px solid var(--line); font-weight: 600; color: var(--faint); vertical-align: bottom; }
@@ -114,7 +108,7 @@ footer { border-top: 1px solid var(--line); margin-top: 3rem; padding-top: 1rem;
   .frame { display: block; max-width: none; padding: 0; }
   .scroll { overflow: visible; border: 0; }
   table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; }
-  h2, h3, caption { break-after: avoid; } figure, .card, tr { break-inside: avoid; }
+  h2, h3, caption { break-after: avoid; } figure, tr { break-inside: avoid; }
 }
 """
 

@@ -14,9 +14,9 @@ from ufmstar_torch.eval.report.grid import Bar, GridRow, Panel, draw_grid
 
 # Neither depth's map nor that of lengths, and without grey.
 NLL_MAP = "plasma"
-# [nats] The same in all strips, so that they can be compared. 8 is an error of some 4 sigma: beyond it a
-# row is simply wrong there, and how much more so would only flatten the rest of the map.
-NLL_SCALE = ColourScale(-2.0, 8.0, NLL_MAP)
+# [nats] The same in all strips, so that they can be compared. 6 is an error of some 3.5 sigma (of sigma = .3 m): beyond
+# it a row is simply wrong there, and how much more so would only flatten the rest of the map.
+NLL_SCALE = ColourScale(-2.0, 6.0, NLL_MAP)
 
 
 @dataclass(frozen=True)
