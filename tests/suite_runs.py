@@ -1,0 +1,102 @@
+"""Evaluations of a second: rooms of 48x64, rows that are judged by a stub or on ground truth."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import torch
+from layouts import write_generic
+
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.suite.evaluate import RowResult, Stopped
+from ufmstar_torch.eval.suite.networks import NetworkChoice
+from ufmstar_torch.eval.suite.run_suite import Conduct, EvalJob, run_job
+from ufmstar_torch.eval.suite.store import EvalFolder
+from ufmstar_torch.eval.suite.suites import suite_named
+from ufmstar_torch.eval.suite.worklist import find_work
+
+TRUTH = "depth_only=ground-truth:24x32"
+NAMES = ("ash", "birch", "cedar")
+
+
+def write_rooms(root, names=NAMES, frames=4):
+    """Generic sequences of the same walk."""
+    for name in names:
+        write_generic(root, frames, folder=name)
+    return root
+
+
+def job_on(root, out, **changes):
+    """The four rows of depth alone on the sequences of a folder."""
+    job = EvalJob(
+        suite=suite_named("depth-only"),
+        networks={"depth_only": NetworkChoice.parse(TRUTH)},
+        items=tuple(find_work([f"rooms={root}"])),
+        out=out,
+        examples=0,
+    )
+    return replace(job, **changes)
+
+
+class Stub:
+    """Judges nothing: figures are numbers drawn from the names of row and sequence.
+
+    Args:
+        before: called with the sequence's name and the frames that are done.
+
+    Attributes:
+        asked: (sequence, rows) of each call.
+    """
+
+    def __init__(self, before=lambda name, done: None):
+        self.before, self.asked = before, []
+
+    def __call__(self, sequence, rows, networks, *, stop, progress, **_):
+        self.asked.append((sequence.name, [row.method.name for row in rows]))
+        for done in range(len(sequence)):
+            self.before(sequence.name, done)
+            if stop():
+                raise Stopped
+            progress(done + 1, len(sequence))
+        return [_drawn(sequence, row) for row in rows]
+
+
+def _drawn(sequence, row):
+    seed = int(hashlib.sha256(f"{sequence.name} {row.slug}".encode()).hexdigest()[:8], 16)
+    target = torch.rand(50, generator=torch.Generator().manual_seed(seed)) + 1
+    metrics = SequenceMetrics(with_variance=row.method.name != "DepthOnly")
+    variance = torch.full_like(target, 0.01) if metrics.with_variance else None
+    metrics.update(target + 0.1, variance, target)
+    counts = {"selected": len(sequence), "done": len(sequence), "skipped": 0, "reasons": {}}
+    return RowResult(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
+
+
+def go(job, evaluate=None, *, resume=False, overwrite=False, **conduct):
+    """Open the folder and go through the sequences: (came to the end, lines that were told)."""
+    told: list[str] = []
+    networks = job.load(torch.device("cpu"))
+    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
+    ended = run_job(job, folder, networks, Conduct(tell=told.append, **conduct), evaluate or Stub())
+    return ended, told
+
+
+def kept(out):
+    """What does not depend on who computed it, or when: figures, curves and sums by file."""
+    import json
+
+    found = {}
+    for path in sorted((out / "work").rglob("*.json")):
+        values = json.loads(path.read_text())
+        if path.name != "failed.json":
+            sums = torch.load(path.with_suffix(".pt"), weights_only=True)
+            plain = {name: values[name] for name in ("frames", "figures", "curves", "state")}
+            found[str(path.relative_to(out))] = (plain, _bytes(sums))
+    return found
+
+
+def _bytes(value):
+    """Tensors as their type, shape and bytes, at any depth."""
+    if isinstance(value, torch.Tensor):
+        return str(value.dtype), tuple(value.shape), value.numpy().tobytes()
+    return {key: _bytes(item) for key, item in value.items()} if isinstance(value, dict) else value

@@ -1,0 +1,237 @@
+"""``ufmstar eval`` as a user meets it: help, mistakes, dry run, tables, exit codes."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import pytest
+from suite_runs import TRUTH, Stub, write_rooms
+
+from ufmstar_torch import cli
+from ufmstar_torch.eval.suite import dry_run as dry
+from ufmstar_torch.eval.suite import efficiency_step, launch
+from ufmstar_torch.eval.suite.options import eval_parser, job_from, parse_eval
+from ufmstar_torch.eval.suite.suite import rows_of
+from ufmstar_torch.eval.suite.suites import names
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """Three sequences of 4 frames. Nobody may change them."""
+    return write_rooms(tmp_path_factory.mktemp("rooms"))
+
+
+@pytest.fixture
+def ufmstar(capfd, monkeypatch):
+    """Calls the program: (exit code, stdout, stderr)."""
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+
+    def call(*words):
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return call
+
+
+@pytest.fixture
+def stubbed(monkeypatch):
+    """The judge of sequences, replaced by one that draws figures; returns it."""
+    stub = Stub()
+    own = launch.evaluate_suite
+    monkeypatch.setattr(launch, "evaluate_suite", lambda options, **how: own(options, evaluate=stub, **how))
+    return stub
+
+
+def words_for(rooms, out, *more, suite="depth-only"):
+    return ["eval", "--suite", suite, "--network", TRUTH, "--root", f"rooms={rooms}", "--out", out, *more]
+
+
+def test_list_names_every_suite(ufmstar):
+    code, out, _ = ufmstar("eval", "--list")
+    assert code == 0
+    assert [line.split()[0] for line in out.splitlines()] == list(names())
+    assert "Table 4: every member on every image" in out
+
+
+def test_help_names_every_option(capfd):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["eval", "--help"])
+    assert ended.value.code == 0
+    text = capfd.readouterr().out
+    for option in ("suite", "root", "network", "out", "shard", "resume", "processes", "slurm", "cache", "dry-run"):
+        assert f"--{option}" in text
+    assert "\n  eval    " in _main_help(capfd)
+
+
+def _main_help(capfd):
+    cli.main(["--help"])
+    return capfd.readouterr().out
+
+
+MISTAKES = {
+    "nothing": ([], "--suite is missing"),
+    "no network": (["--suite", "depth-only", "--root", "x", "--out", "o"], "--network is missing"),
+    "no suite of the name": (["{}", "--suite", "table-1"], "no suite is called 'table-1': there are paper-table-1"),
+    "no file": (["{}", "--suite", "/nowhere/mine.toml"], "/nowhere/mine.toml"),
+    "base of a table": (["{}", "--base", "aleatoric"], "--base goes with figures and ablations"),
+    "no such base": (["{}", "--network", "resnet=trained:x"], "base must be one of ensemble"),
+    "base twice": (["{}", "--network", "depth_only=ground-truth"], "every base once, got depth_only, depth_only"),
+    "no row left": (["{}", "--suite", "paper-table-1"], "there are networks of depth_only only"),
+    "no root": (["{}", "--root", "/nowhere"], "no such file or folder: /nowhere"),
+    "frames": (["{}", "--frames", "5"], "--frames must be START:STOP"),
+    "shard": (["{}", "--shard", "0/2"], "--shard must be 1/n to n/n"),
+    "shard and pool": (["{}", "--shard", "1/2", "--processes", "2"], "--shard and --processes contradict each other"),
+    "shard and overwrite": (["{}", "--shard", "1/2", "--overwrite"], "--overwrite goes without --shard"),
+    "both": (["{}", "--resume", "--overwrite"], "--resume and --overwrite contradict"),
+    "processes": (["{}", "--processes", "0"], "--processes must be at least 1"),
+    "threads": (["{}", "--threads", "0"], "--threads must be at least 1"),
+    "sequences": (["{}", "--sequences", "0"], "--sequences must be at least 1"),
+    "confident": (["{}", "--confident", "2"], "--confident must be a share"),
+    "list of nothing": (["{}", "--sequence-list", "/nowhere.txt"], "/nowhere.txt"),
+    "unknown option": (["{}", "--etaa", "1"], "--etaa"),
+    "device": (["{}", "--device", "abacus"], "--device abacus is not available"),
+    "slurm": (["{}", "--slurm", "gpu"], "--slurm must be KEY=VALUE"),
+}
+
+
+@pytest.mark.parametrize(("words", "told"), MISTAKES.values(), ids=MISTAKES)
+def test_mistakes_are_one_line_and_leave_no_folder(ufmstar, rooms, tmp_path, words, told):
+    good = words_for(rooms, tmp_path / "out")[1:]
+    code, out, err = ufmstar("eval", *[w for word in words for w in (good if word == "{}" else [word])])
+    assert (code, out) == (2, "")
+    assert err.startswith("ufmstar eval: ")
+    assert err.count("\n") == 1
+    assert told in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
+    out = tmp_path / "out"
+    code, text, err = ufmstar(*words_for(rooms, out, "--frames", "0:2", "--examples", "1"))
+    assert code == 0, err
+    assert "3 sequences of rooms" in text
+    assert all(name in text for name in ("DepthOnly", "UfM-DepthOnly-100K", "UfM\\*-DepthOnly"))
+    assert "95 % confidence" in text
+    assert f"{out}: eval.json, work/DATASET/SEQUENCE/" in text
+    assert (out / "tables" / "main.md").is_file()
+    assert err.count("rooms/") == 3
+    about = json.loads((out / "eval.json").read_text())
+    assert about["settings"] == {"frames": [0, 2, None], "confident": 0.5}
+    code, _, err = ufmstar(*words_for(rooms, out, "--frames", "0:2"))
+    assert (code, "--resume goes on with it" in err) == (2, True)
+    code, _, err = ufmstar(*words_for(rooms, out, "--resume"))
+    assert code == 2
+    assert "settings.frames was [0, 2, null], now [null, null, null]" in err
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_a_broken_sequence_is_listed_at_the_end(ufmstar, tmp_path):
+    root = write_rooms(tmp_path / "own")
+    (root / "birch" / "poses.txt").write_text("x")
+    code, text, err = ufmstar(*words_for(root, tmp_path / "out", "--no-report"))
+    assert code == 1
+    assert "2 sequences" in text
+    assert err.splitlines()[-2].startswith("ufmstar eval: rooms/birch failed: ")
+    assert "--resume tries the rest again" in err.splitlines()[-1]
+    assert not (tmp_path / "out" / "tables").exists()
+    write_rooms(root, ["birch"])
+    assert ufmstar(*words_for(root, tmp_path / "out", "--resume", "--no-report"))[0] == 0
+
+
+def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_path, stubbed):
+    raised = []
+
+    def before(name, done):
+        if (name, done) == ("birch", 1) and not raised:
+            raised.append(signal.raise_signal(signal.SIGTERM))
+
+    stubbed.before = before
+    code, text, err = ufmstar(*words_for(rooms, tmp_path / "out"))
+    assert code == 130
+    assert "1 sequence" in text
+    assert "stopped; --resume goes on" in err
+    assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume"))[0] == 0
+    assert [name for name, _ in stubbed.asked] == ["ash", "birch", "birch", "cedar"]
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_rows_without_a_network_are_named(ufmstar, rooms, tmp_path):
+    (tmp_path / "two.toml").write_text('[[rows]]\nmethods = ["Aleatoric", "DepthOnly", "UfM*-DepthOnly"]\n')
+    words = words_for(rooms, tmp_path / "out", "--no-report", suite=tmp_path / "two.toml")
+    code, text, _ = ufmstar(*words)
+    assert code == 0
+    assert "left out, without a --network: the rows of aleatoric" in text
+    about = json.loads((tmp_path / "out" / "eval.json").read_text())
+    assert about["missing_bases"] == ["aleatoric"]
+    assert [row["method"] for row in about["rows"]] == ["DepthOnly", "UfM*-DepthOnly"]
+
+
+def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
+    words = words_for(rooms, tmp_path / "out", "--dry-run", "--frames", "1:", "--shard", "1/2")
+    code, text, _ = ufmstar(*words)
+    assert code == 0
+    assert "4 rows:" in text
+    assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 8 records" in text
+    assert not (tmp_path / "out").exists()
+
+
+class Members:
+    """Three members that take turns."""
+
+    passes = 3
+
+    def turn(self, position):
+        return position % 3
+
+
+def test_predictions_are_counted_once_however_many_rows_share_them():
+    rows = rows_of(["Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble"])
+    assert dry.predictions(rows[:1], Members(), 10) == 10
+    assert dry.predictions(rows, Members(), 10) == 20
+    from ufmstar_torch.eval.suite.setting import Setting
+
+    # Every second frame: images 0, 2, 4, 6, 8 are member 0, 1, 2, 0, 1's; of the default row 0, 2, 1, 0, 2's.
+    skipping = rows_of(["UfM*-Ensemble"], Setting(skip=1))
+    assert dry.predictions(skipping, Members(), 10) == 5
+    assert dry.predictions([*rows[3:], *skipping], Members(), 10) == 10 + 3
+
+
+def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
+    words = words_for(rooms, "out", "--root", "tour:1?frames=2&size=32x48", "a=tour:2?frames=2", "--sequences", "1")
+    job = job_from(parse_eval(eval_parser(), list(map(str, words[1:]))))
+    assert [item.dataset for item in job.items] == ["a", "rooms", "tour"]
+    given = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
+    (tmp_path / "eval.yaml").write_text(json.dumps(given))
+    options = parse_eval(eval_parser(), ["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
+    assert (options["root"], options["seed"]) == (given["root"], 4)
+    assert len(job_from(options).items) == 3
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkeypatch):
+    measured = []
+
+    def measure(rows, networks, sequence, **how):
+        measured.append(([row.name for row in rows], sequence.name, how["plan"].frames))
+        return {"rows": []}
+
+    monkeypatch.setattr(efficiency_step, "measure", measure)
+    monkeypatch.setattr(efficiency_step, "contenders", lambda networks: networks)
+    monkeypatch.setattr(launch, "job_from", lambda options: _about_efficiency(own(options)))
+    own = job_from
+    words = words_for(rooms, tmp_path / "out", "--no-report")
+    assert ufmstar(*words)[0] == 0
+    assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
+    assert measured == [(["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"], "ash", 1)]
+    assert ufmstar(*words, "--resume")[0] == 0
+    assert len(measured) == 1
+
+
+def _about_efficiency(job):
+    from dataclasses import replace
+
+    return replace(job, suite=replace(job.suite, efficiency=True))

@@ -1,0 +1,343 @@
+"""Several processes that share an evaluation: real ones, and the same result to the last bit."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
+from trainings import SPEC
+
+from ufmstar_torch.eval.output_folder import FolderError
+from ufmstar_torch.eval.suite import launch, pool, slurm, worker
+from ufmstar_torch.eval.suite.evaluate import evaluate_sequence
+from ufmstar_torch.eval.suite.launch import Place, evaluate_suite
+from ufmstar_torch.eval.suite.networks import NetworkChoice
+from ufmstar_torch.eval.suite.options import eval_parser, job_from, parse_eval
+from ufmstar_torch.eval.suite.slurm import Job, Slurm
+from ufmstar_torch.eval.suite.worker import Share
+from ufmstar_torch.models.spec import build_network
+from ufmstar_torch.models.trained import save_trained
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """Three sequences of 4 frames. Nobody may change them."""
+    return write_rooms(tmp_path_factory.mktemp("rooms"))
+
+
+@pytest.fixture
+def no_torchrun(monkeypatch):
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def options_for(rooms, out, *words, network=TRUTH, suite="depth-only"):
+    """Parsed options of an evaluation of the rooms."""
+    fixed = ["--suite", suite, "--network", network, "--root", f"rooms={rooms}", "--out", str(out), "--examples", "0"]
+    return parse_eval(eval_parser(), [*fixed, *words])
+
+
+def quiet(options, evaluate=None, stop=lambda: False):
+    """Carry the options out, in silence: how it ended and what was told."""
+    told: list[str] = []
+    judge = {} if evaluate is None else {"evaluate": evaluate}
+    ended = evaluate_suite(options, stop=stop, tell=told.append, progress=lambda *_: None, **judge)
+    return ended, told
+
+
+# ---- a pool ----
+
+
+@pytest.mark.usefixtures("no_torchrun")
+def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
+    torch.manual_seed(3)
+    save_trained(tmp_path / "net.safetensors", [build_network(SPEC) for _ in range(2)], SPEC)
+    network = f"ensemble=trained:{tmp_path / 'net.safetensors'}"
+    (tmp_path / "some.toml").write_text(
+        '[[rows]]\nmethods = ["Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble"]\n'
+        '[[rows]]\nmethods = ["UfM*-Ensemble"]\nsetting = {rotation_noise = 2.0, skip = 1}\n'
+    )
+    given = {"network": network, "suite": str(tmp_path / "some.toml")}
+    before = torch.get_num_threads()
+    ended, told = quiet(options_for(rooms, tmp_path / "two", "--processes", "2", "--threads", "1", **given))
+    assert (ended.finished, ended.stopped, dict(ended.failed), ended.left) == (True, False, {}, 0), told
+    try:
+        torch.set_num_threads(1)
+        quiet(options_for(rooms, tmp_path / "one", **given))
+    finally:
+        torch.set_num_threads(before)
+    one, two = kept(tmp_path / "one"), kept(tmp_path / "two")
+    assert len(one) == 12
+    assert one == two
+    from ufmstar_torch.eval.report.load import load_results
+
+    both = [load_results(tmp_path / name).merged for name in ("one", "two")]
+    assert both[0].keys() == both[1].keys()
+    assert all(str(both[0][key]) == str(both[1][key]) for key in both[0])
+
+
+SCRIPT = """
+import json, os, signal, sys, time
+share = json.loads(sys.stdin.read())
+folder = share["options"]["out"]
+signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{share['index']}", "w").close(), sys.exit(130)))
+open(f"{folder}/pid{share['index']}", "w").write(str(os.getpid()))
+while True:
+    time.sleep(0.02)
+"""
+
+
+def scripted(tmp_path, text, stop, count=3):
+    """A pool of processes that run a script: whether it ended well, and what was told."""
+    told: list[str] = []
+    options = {"processes": count, "threads": 1, "out": str(tmp_path)}
+    command = (sys.executable, "-c", text)
+    return pool.run_pool(options, stop=stop, tell=told.append, command=command), told
+
+
+def test_a_pool_that_is_stopped_tells_all_its_processes(tmp_path):
+    ended, told = scripted(tmp_path, SCRIPT, lambda: len(list(tmp_path.glob("pid*"))) == 3)
+    assert not ended
+    assert told == []
+    assert {path.name for path in tmp_path.glob("ended*")} == {"ended1", "ended2", "ended3"}
+
+
+def test_a_pool_whose_starter_fails_leaves_no_process(tmp_path):
+    def interrupted():
+        if len(list(tmp_path.glob("pid*"))) == 3:
+            raise KeyboardInterrupt
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        scripted(tmp_path, SCRIPT, interrupted)
+    for file in tmp_path.glob("pid*"):
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(file.read_text()), 0)
+
+
+def test_a_pool_tells_of_a_process_that_was_killed_and_lets_the_others_finish(tmp_path):
+    text = "import json, os, sys\nif json.loads(sys.stdin.read())['index'] == 2: os.kill(os.getpid(), 9)"
+    assert scripted(tmp_path, text, lambda: False) == (False, ["process 2/3 ended early (signal 9)"])
+    assert scripted(tmp_path, "import sys; sys.stdin.read()", lambda: False) == (True, [])
+
+
+def test_threads_are_divided_and_devices_go_round(tmp_path, monkeypatch):
+    text = "import sys; s = sys.stdin.read(); import json; v = json.loads(s)"
+    text += "; open(f\"{v['options']['out']}/{v['index']}.json\", 'w').write(s)"
+    monkeypatch.setattr(pool, "available_cores", lambda: 7)
+    told: list[str] = []
+    options = {"processes": 3, "threads": None, "out": str(tmp_path)}
+    assert pool.run_pool(options, stop=lambda: False, tell=told.append, command=(sys.executable, "-c", text))
+    shares = [Share(**json.loads((tmp_path / f"{n}.json").read_text())) for n in (1, 2, 3)]
+    assert [(s.index, s.count, s.local, s.threads) for s in shares] == [(1, 3, 0, 2), (2, 3, 1, 2), (3, 3, 2, 2)]
+    assert len({s.launch for s in shares}) == 1
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch, "zeros", lambda *_, device: None)
+    assert [worker.device_of("cuda", s.local) for s in shares] == ["cuda:0", "cuda:1", "cuda:0"]
+    assert worker.device_of("cuda:1", 0) == "cuda:1"
+
+
+def test_a_device_that_is_not_there():
+    with pytest.raises(ValueError, match="--device abacus is not available"):
+        worker.device_of("abacus", 0)
+
+
+# ---- torchrun ----
+
+
+def as_rank(rank, world, options, result):
+    """One of torchrun's processes, judging by a stub that takes its time."""
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(world), "LOCAL_RANK": str(rank)}
+    stub = Stub(lambda *_: time.sleep(0.02))
+    ended, _ = quiet(options, stub)
+    result.put((rank, ended.finished, ended.left, ended.tells, [name for name, _ in stub.asked]))
+
+
+def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(rooms, tmp_path):
+    options = options_for(rooms, tmp_path / "out")
+    fork = multiprocessing.get_context("fork")
+    results = fork.Queue()
+    children = [fork.Process(target=as_rank, args=(rank, 2, options, results)) for rank in range(2)]
+    for child in children:
+        child.start()
+    found = sorted(results.get(timeout=60) for _ in children)
+    for child in children:
+        child.join(60)
+    assert [rank[:2] for rank in found] == [(0, True), (1, True)]
+    assert found[0][2:4] == (0, True)
+    assert not found[1][3]
+    assert sorted(found[0][4] + found[1][4]) == list(NAMES)
+    go(job_on(rooms, tmp_path / "whole"))
+    assert kept(tmp_path / "out") == kept(tmp_path / "whole")
+
+
+def test_torchruns_word():
+    said = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
+    assert Place.of(said) == Place(3, 4, 1)
+    assert Place.of({}) is None
+    assert Place.of({"WORLD_SIZE": "4"}) is None
+    assert Place.of({**said, "RANK": "0", "WORLD_SIZE": "1"}) is None
+    with pytest.raises(ValueError, match="must be numbers"):
+        Place.of({**said, "RANK": "first"})
+    with pytest.raises(ValueError, match="RANK 4 must be in"):
+        Place.of({**said, "RANK": "4"})
+
+
+@pytest.mark.parametrize("words", [["--shard", "1/2"], ["--processes", "2"], ["--overwrite"], ["--slurm", "jobs=2"]])
+def test_what_contradicts_torchrun(rooms, tmp_path, monkeypatch, words):
+    for name, value in {"RANK": "0", "WORLD_SIZE": "2", "LOCAL_RANK": "0"}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ValueError, match=f"{words[0]} goes without torchrun"):
+        quiet(options_for(rooms, tmp_path / "out", *words))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_first_waits_for_a_sequence_that_another_is_at(rooms, tmp_path):
+    job = job_on(rooms, tmp_path / "out")
+    go(replace(job, items=job.items[1:]))
+    from ufmstar_torch.eval.suite.store import EvalFolder
+
+    claim, stub = EvalFolder(job.out, {}).claim(job.items[0], "other"), Stub()
+    waiter = threading.Thread(target=go, args=(job, stub), kwargs={"resume": True, "waits": True})
+    waiter.start()
+    time.sleep(0.5)
+    assert waiter.is_alive()
+    assert stub.asked == []
+    claim.file.close()  # the other one was killed
+    waiter.join(30)
+    assert [name for name, _ in stub.asked] == ["ash"]
+
+
+# ---- parts by hand ----
+
+
+@pytest.mark.usefixtures("no_torchrun")
+def test_parts_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path):
+    ends = []
+    for part in ("2/2", "1/2"):
+        ended, _ = quiet(options_for(rooms, tmp_path / "out", "--shard", part), Stub())
+        ends.append((ended.finished, ended.left))
+    assert ends == [(True, 2), (True, 0)]
+    go(job_on(rooms, tmp_path / "whole"))
+    assert kept(tmp_path / "out") == kept(tmp_path / "whole")
+    with pytest.raises(FolderError, match=r"other input: settings\.confident was 0\.5"):
+        quiet(options_for(rooms, tmp_path / "out", "--shard", "1/2", "--confident", "0.1"), Stub())
+
+
+# ---- SLURM ----
+
+
+@pytest.mark.usefixtures("no_torchrun")
+def test_jobs_through_submitit(rooms, tmp_path):
+    # submitit's debug executor runs a job here, when its result is asked for.
+    options = options_for(
+        rooms, tmp_path / "out", "--slurm", "cluster=debug", "jobs=2", "partition=gpu", "timeout_min=5"
+    )
+    ended, told = quiet(options)
+    assert (ended.finished, ended.left) == (True, 0)
+    assert told[0].startswith("jobs ")
+    go(job_on(rooms, tmp_path / "whole"), evaluate_sequence)
+    assert kept(tmp_path / "out") == kept(tmp_path / "whole")
+
+
+def test_what_slurm_is_told():
+    slurm_ = Slurm.parse(["jobs=4", "partition=gpu", "mem_gb=16", "slurm_qos=high", "gres=gpu:1"])
+    assert (slurm_.jobs, slurm_.cluster) == (4, "slurm")
+    assert dict(slurm_.parameters) == {
+        "slurm_partition": "gpu", "mem_gb": 16, "slurm_qos": "high", "slurm_gres": "gpu:1"
+    }  # fmt: skip
+    for words, told in (
+        (["gpu"], "KEY=VALUE"),
+        (["a=1", "a=2"], "each key once"),
+        (["jobs=0"], "at least 1"),
+        (["jobs=many"], "at least 1"),
+        (["cluster=moon"], "slurm, local or debug"),
+        (["nodes=2"], "jobs=N says how many"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            Slurm.parse(words)
+
+
+def test_a_job_is_queued_again_with_the_same_share():
+    job = Job(Share({"out": "x"}, 1, 2, 0, "abc"))
+    again = job.checkpoint()
+    assert again.function == job
+
+
+class Submitted:
+    """A job of a cluster."""
+
+    def __init__(self, error=None, result=True):
+        self.job_id, self.error, self.value, self.cancelled = "7", error, result, False
+
+    def done(self):
+        return self.error is not None or self.value is not None
+
+    def exception(self):
+        return self.error
+
+    def result(self):
+        return self.value
+
+    def cancel(self):
+        self.cancelled = True
+
+
+def test_jobs_that_fail_are_told_and_stopping_cancels_the_rest():
+    told: list[str] = []
+    assert slurm._wait([Submitted(), Submitted()], lambda: False, told.append)
+    assert not slurm._wait([Submitted(), Submitted(result=False)], lambda: False, told.append)
+    assert told == []
+    assert not slurm._wait([Submitted(RuntimeError("node died")), Submitted()], lambda: False, told.append)
+    assert told == ["job 7 failed: node died"]
+    waiting = Submitted(result=None)
+    assert not slurm._wait([waiting], lambda: True, told.append)
+    assert waiting.cancelled
+
+
+def test_without_submitit_it_says_what_to_install(rooms, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    with pytest.raises(ImportError, match=r"pip install 'ufmstar-torch\[cluster\]'"):
+        slurm.run_slurm(options_for(rooms, tmp_path, "--slurm", "jobs=2"), stop=lambda: False, tell=print)
+
+
+# ---- one process of several ----
+
+
+def test_a_worker_reads_its_share_and_says_how_it_ended(rooms, tmp_path, monkeypatch, capsys):
+    def run(share, work=None):
+        monkeypatch.setattr(sys, "stdin", __import__("io").StringIO(worker.as_json(share)))
+        monkeypatch.setattr(signal, "signal", lambda *_: None)
+        if work is not None:
+            monkeypatch.setattr(worker, "work", work)
+        return worker.main()
+
+    def refuse(*_, **__):
+        raise OSError("disk full")
+
+    share = Share(options_for(rooms, tmp_path / "out"), 1, 2, 0, "abc", None)
+    assert run(share, lambda given, **_: given == share) == worker.DONE
+    assert run(share, lambda *_, **__: False) == worker.STOPPED
+    assert run(share, refuse) == worker.FAILED
+    assert capsys.readouterr().err == "[1/2] failed: disk full\n"
+
+
+def test_the_parent_prepares_the_folder_before_any_process_starts(rooms, tmp_path, no_torchrun, monkeypatch):
+    monkeypatch.setattr(pool, "run_pool", lambda *_, **__: pytest.fail("no process may start"))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.tex").write_text("x")
+    with pytest.raises(FolderError, match="files of someone else"):
+        quiet(options_for(rooms, out, "--processes", "2"))
+    assert job_from(options_for(rooms, out)).networks == {"depth_only": NetworkChoice.parse(TRUTH)}
+    assert launch.Ended is not None

@@ -1,0 +1,267 @@
+"""The way through the sequences: what is kept, what is computed again, what a broken one does to the rest."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from suite_runs import NAMES, Stub, go, job_on, kept, write_rooms
+
+from ufmstar_torch.eval.output_folder import FolderError
+from ufmstar_torch.eval.report.load import load_results
+from ufmstar_torch.eval.suite.cache import CacheError
+from ufmstar_torch.eval.suite.evaluate import SequenceError, evaluate_sequence
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.run_suite import DIED, failures, with_references
+from ufmstar_torch.eval.suite.store import EvalFolder
+from ufmstar_torch.eval.suite.suite import rows_of
+from ufmstar_torch.eval.suite.worklist import Shard, content_digest
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    """Three sequences of 4 frames. Nobody may change them."""
+    return write_rooms(tmp_path_factory.mktemp("rooms"))
+
+
+def folder_of(job):
+    return EvalFolder(job.out, {})
+
+
+def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
+    job = job_on(rooms, tmp_path / "out")
+    ended, told = go(job)
+    assert ended
+    assert [line.split(":")[0] for line in told] == [f"rooms/{name}" for name in NAMES]
+    record = Record.load(job.out / "work" / "rooms" / "birch" / "UfMstar-DepthOnly.json")
+    assert (record.suite, record.dataset, record.sequence) == ("depth-only", "rooms", "birch")
+    assert (record.network, record.method, record.setting) == ("ground truth", "UfM*-DepthOnly", {})
+    assert record.provenance["sequence"] == content_digest(job.items[1].open())
+    results = load_results(job.out)
+    assert len(results.records) == 12
+    assert not results.missing
+    assert results.merged["rooms", job.suite.rows[3]].sequences == 3
+
+
+def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
+    from ufmstar_torch.eval.suite.cache import PredictionCache
+
+    job = replace(job_on(rooms, tmp_path / "out"), frames=slice(1, None, 2), examples=1)
+    go(job, evaluate_sequence)
+    networks = job.load(torch.device("cpu"))
+    how = {"cache": PredictionCache(None), "device": torch.device("cpu"), "limit": job.frames}
+    for item in job.items:
+        for result in evaluate_sequence(item.open(), job.suite.rows, networks, **how):
+            record = folder_of(job).records(item)[result.row.slug]
+            assert record.frames["done"] == 2
+            assert {k: v for k, v in record.figures.items() if v is not None} == {
+                k: v for k, v in result.figures.items() if np.isfinite(v)
+            }
+    # Pictures of the first sequence only.
+    assert [path.parent.name for path in sorted(job.out.glob("work/*/*/examples"))] == ["ash"]
+
+
+def test_resume_computes_nothing_that_is_there(rooms, tmp_path):
+    job = job_on(rooms, tmp_path / "out")
+    go(job)
+    before = {path: path.stat().st_mtime_ns for path in job.out.rglob("*.json")}
+    stub = Stub()
+    assert go(job, stub, resume=True) == (True, [])
+    assert stub.asked == []
+    assert {path: path.stat().st_mtime_ns for path in job.out.rglob("*.json")} == before
+
+
+def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path):
+    job = job_on(rooms, tmp_path / "out")
+    rows = job.suite.rows
+    go(replace(job, suite=replace(job.suite, rows=rows[:2]), items=job.items[:2]))
+    stub = Stub()
+    go(job, stub, resume=True)
+    # DepthOnly has no variance, so that it is nobody's reference.
+    names = [row.method.name for row in rows]
+    assert stub.asked == [("ash", names[1:]), ("birch", names[1:]), ("cedar", names)] or stub.asked == [
+        ("ash", names[2:]),
+        ("birch", names[2:]),
+        ("cedar", names),
+    ]
+    go(job_on(rooms, tmp_path / "whole"))
+    assert kept(job.out) == kept(tmp_path / "whole")
+
+
+def test_missing_rows_are_judged_beside_their_references():
+    rows = rows_of(["Aleatoric", "UfM-Aleatoric", "UfM-Aleatoric-100K", "UfM*-Aleatoric", "Ensemble"])
+    needed = with_references(rows[3:4], rows)
+    assert [row.method.name for row in needed] == ["Aleatoric", "UfM-Aleatoric-100K", "UfM*-Aleatoric"]
+    assert with_references(rows[4:], rows) == [rows[4]]
+
+
+def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
+    root = write_rooms(tmp_path / "own")
+    (root / "birch" / "poses.txt").write_text("not a pose\n")
+    job = job_on(root, tmp_path / "out")
+    ended, told = go(job)
+    assert ended
+    assert "rooms/birch: failed: " in told[1]
+    assert sorted(path.split("/")[2] for path in kept(job.out)) == ["ash"] * 4 + ["cedar"] * 4
+    failed = json.loads((job.out / "work" / "rooms" / "birch" / "failed.json").read_text())
+    assert (failed["sequence"], failed["dataset"], len(failed["rows"])) == ("birch", "rooms", 4)
+    assert "poses.txt" in failed["reason"]
+    assert failures(folder_of(job), job.items).keys() == {"rooms/birch"}
+    # Mended, it is tried again.
+    write_rooms(root, ["birch"])
+    stub = Stub()
+    assert go(job, stub, resume=True)[0]
+    assert [name for name, _ in stub.asked] == ["birch"]
+    assert not failures(folder_of(job), job.items)
+    go(job_on(rooms, tmp_path / "whole"))
+    assert kept(job.out) == kept(tmp_path / "whole")
+
+
+def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(rooms, tmp_path):
+    def fails(error):
+        def judge(sequence, *arguments, **named):
+            if sequence.name == "birch":
+                raise error
+            return Stub()(sequence, *arguments, **named)
+
+        return judge
+
+    job = job_on(rooms, tmp_path / "out")
+    go(job, fails(SequenceError("no frame has ground truth")))
+    assert failures(folder_of(job), job.items) == {"rooms/birch": "no frame has ground truth"}
+    go(job, fails(RuntimeError("out of memory")), resume=True)
+    assert failures(folder_of(job), job.items) == {"rooms/birch": "out of memory"}
+    for error in (CacheError("disk full"), OSError("disk full"), TypeError("a mistake of ours")):
+        with pytest.raises(type(error)):
+            go(job, fails(error), resume=True)
+    assert go(job, resume=True)[0]
+
+
+def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
+    root = write_rooms(tmp_path / "own", ["ash", "birch"], frames=2)
+    for file in (root / "ash" / "depth").glob("*"):
+        file.unlink()
+    (root / "ash" / "depth").rmdir()
+    job = job_on(root, tmp_path / "out")
+    assert go(job, evaluate_sequence)[0]
+    assert failures(folder_of(job), job.items) == {"rooms/ash": "no frame has ground truth"}
+    assert len(kept(job.out)) == 4
+
+
+def test_another_sequence_of_the_name_is_refused(tmp_path):
+    root = write_rooms(tmp_path / "own", ["ash"])
+    job = job_on(root, tmp_path / "out")
+    go(job)
+    poses = root / "ash" / "poses.txt"
+    poses.write_text("\n".join(poses.read_text().splitlines()[::-1]))
+    with pytest.raises(FolderError, match="rooms/ash has other frames, cameras or poses than when DepthOnly was"):
+        go(job, resume=True)
+
+
+def test_stopping_loses_the_sequence_in_hand_alone(rooms, tmp_path):
+    asked = []
+
+    def stop():
+        return bool(asked) and asked[-1] == ("birch", 2)
+
+    job = job_on(rooms, tmp_path / "out")
+    assert not go(job, Stub(lambda *where: asked.append(where)), stop=stop)[0]
+    assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
+    stub = Stub()
+    assert go(job, stub, resume=True)[0]
+    assert [name for name, _ in stub.asked] == ["birch", "cedar"]
+
+
+def killed_in_birch(job, launch):
+    """In a process of its own: ends by SIGKILL in the middle of the second sequence."""
+
+    def before(name, done):
+        if (name, done) == ("birch", 2):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    child = multiprocessing.get_context("fork").Process(
+        target=go, args=(job, Stub(before)), kwargs={"resume": True, "launch": launch}
+    )
+    child.start()
+    child.join(60)
+    assert child.exitcode == -signal.SIGKILL
+
+
+def test_a_kill_loses_the_sequence_in_hand_alone(rooms, tmp_path):
+    job = job_on(rooms, tmp_path / "out")
+    killed_in_birch(job, "")
+    assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
+    stub = Stub()
+    assert go(job, stub, resume=True)[0]
+    assert [name for name, _ in stub.asked] == ["birch", "cedar"]
+    go(job_on(rooms, tmp_path / "whole"))
+    assert kept(job.out) == kept(tmp_path / "whole")
+
+
+def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, monkeypatch):
+    job = job_on(rooms, tmp_path / "out")
+    saved = []
+
+    def save(self, path):
+        if len(saved) == 6:
+            raise KeyboardInterrupt
+        saved.append(path)
+        whole(self, path)
+
+    whole = Record.save
+    monkeypatch.setattr(Record, "save", save)
+    with pytest.raises(KeyboardInterrupt):
+        go(job)
+    monkeypatch.undo()
+    assert len(kept(job.out)) == 6
+    stub = Stub()
+    go(job, stub, resume=True)
+    assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)] or [
+        name for name, _ in stub.asked
+    ] == ["birch", "cedar"]
+    go(job_on(rooms, tmp_path / "whole"))
+    assert kept(job.out) == kept(tmp_path / "whole")
+
+
+def test_helpers_do_not_try_again_what_killed_one_of_them(rooms, tmp_path):
+    job = job_on(rooms, tmp_path / "out")
+    killed_in_birch(job, "together")
+    stub = Stub()
+    ended, _ = go(job, stub, resume=True, launch="together", helps=True, shard=Shard(2, 2))
+    assert ended
+    assert [name for name, _ in stub.asked] == ["cedar"]
+    assert failures(folder_of(job), job.items) == {"rooms/birch": DIED}
+    # Nor what has failed for one of them.
+    assert go(job, stub, resume=True, launch="together")[0]
+    assert len(stub.asked) == 1
+    assert go(job, stub, resume=True, launch="later")[0]
+    assert [name for name, _ in stub.asked] == ["cedar", "birch"]
+
+
+def test_a_part_does_its_own_and_a_helper_the_rest(rooms, tmp_path):
+    for shard, helps, expected in (
+        (Shard(1, 2), False, ["ash", "cedar"]),
+        (Shard(2, 2), False, ["birch"]),
+        (Shard(2, 2), True, ["birch", "ash", "cedar"]),
+        (Shard(4, 4), False, []),
+    ):
+        stub = Stub()
+        out = tmp_path / f"{shard.index}{shard.count}{helps}"
+        assert go(job_on(rooms, out), stub, shard=shard, helps=helps)[0]
+        assert [name for name, _ in stub.asked] == expected
+
+
+def test_a_sequence_that_another_process_is_at_is_left_to_it(rooms, tmp_path):
+    job = job_on(rooms, tmp_path / "out")
+    networks = job.load(torch.device("cpu"))
+    folder = EvalFolder.open(job.out, job.about(networks), resume=False, overwrite=False)
+    stub = Stub()
+    with folder.claim(job.items[0], "other"):
+        assert go(job, stub, resume=True)[0]
+    assert [name for name, _ in stub.asked] == ["birch", "cedar"]

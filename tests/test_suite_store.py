@@ -1,0 +1,462 @@
+"""Suites, the work list and the output folder of ``ufmstar eval``."""
+
+from __future__ import annotations
+
+import json
+import random
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from layouts import write_seven_scenes
+from suite_runs import NAMES, go, job_on, write_rooms
+
+from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.eval.output_folder import FolderError, differences, hold
+from ufmstar_torch.eval.packed_sums import pack, unpack
+from ufmstar_torch.eval.suite.method import BASES, MANY
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import DEFAULT, Setting
+from ufmstar_torch.eval.suite.store import EvalFolder
+from ufmstar_torch.eval.suite.suite import Suite, configured, default_of, rows_of, setting_from, value_of
+from ufmstar_torch.eval.suite.suite_file import suite_from_file
+from ufmstar_torch.eval.suite.suites import ROTATIONS, SKIPS, TRANSLATIONS, names, suite_named
+from ufmstar_torch.eval.suite.worklist import Shard, WorkItem, content_digest, find_work, read_names
+
+# ---- suites ----
+
+# The rows of the paper's tables, written off.
+TABLE_1 = """
+Ensemble UfM-Ensemble UfM-Ensemble-100K UfM*-Ensemble
+MC-Dropout UfM-MCD UfM-MCD-100K UfM*-MCD
+BatchEnsemble UfM-BatchEnsemble UfM-BatchEnsemble-100K UfM*-BatchEnsemble
+Evidential UfM-Evidential UfM-Evidential-100K UfM*-Evidential
+Aleatoric UfM-Aleatoric UfM-Aleatoric-100K UfM*-Aleatoric"""
+TABLE_2 = """Ensemble UfM-Ensemble UfM-Ensemble-100K UfM*-Ensemble
+Aleatoric UfM-Aleatoric UfM-Aleatoric-100K UfM*-Aleatoric"""
+TABLE_3 = "UfM-DepthOnly-300K UfM*-DepthOnly-fixed-param UfM*-DepthOnly"
+
+
+def methods(name, base=None):
+    return [row.method.name for row in suite_named(name, base).rows]
+
+
+@pytest.mark.parametrize(("number", "rows"), [(1, TABLE_1), (2, TABLE_2), (3, TABLE_3)])
+def test_tables_have_the_papers_rows_in_its_order(number, rows):
+    suite = suite_named(f"paper-table-{number}")
+    assert [row.method.name for row in suite.rows] == rows.split()
+    assert all(row.setting == DEFAULT for row in suite.rows)
+    assert suite.sequences == 100
+    assert suite.efficiency == (number == 2)
+
+
+def test_table_4_has_the_full_rows_and_the_alternating_ones_beside_them():
+    found = methods("paper-table-4")
+    assert [name for name in found if "Full" in name] == [
+        "UfM*-FullEnsemble", "UfM*-FullMCD", "UfM*-FullBatchEnsemble"
+    ]  # fmt: skip
+    assert [name.replace("Full", "") for name in found[::2]] == found[1::2]
+
+
+def test_every_suite_can_be_made_for_every_base():
+    for name in names():
+        assert suite_named(name).name == name
+        if name.startswith(("ablation", "paper-figure")):
+            for base in BASES:
+                if name == "ablation-no-alternating" and base not in MANY:
+                    with pytest.raises(ValueError, match="take turns"):
+                        suite_named(name, base)
+                else:
+                    assert suite_named(name, base).bases == (base,)
+        else:
+            with pytest.raises(ValueError, match="--base goes with figures"):
+                suite_named(name, "depth_only")
+
+
+def test_no_such_suite_and_no_such_base():
+    with pytest.raises(ValueError, match="no suite is called 'paper-table-9': there are paper-table-1"):
+        suite_named("paper-table-9")
+    with pytest.raises(ValueError, match="--base must be one of ensemble"):
+        suite_named("ablations", "resnet")
+
+
+def test_figures_vary_what_the_paper_varies():
+    noise = suite_named("paper-figure-pose-noise")
+    assert [row.method.name for row in noise.rows] == ["Ensemble"] + ["UfM*-Ensemble"] * 11
+    assert tuple(r.setting.rotation_noise for r in noise.rows[1:7]) == ROTATIONS
+    assert (0.0, *(r.setting.translation_noise for r in noise.rows[7:])) == TRANSLATIONS
+    assert noise.sweep == ("rotation_noise", "translation_noise")
+    overlap = suite_named("paper-figure-overlap")
+    # Both are judged on the same frames: the figure shows their difference.
+    assert [(r.setting.skip, r.method.name) for r in overlap.rows] == [
+        (skip, name) for skip in SKIPS for name in ("Aleatoric", "UfM*-Aleatoric")
+    ]
+    assert SKIPS == (0, 1, 2, 4, 8, 16, 32)
+    assert suite_named("paper-figure-entropy").datasets == ("scannet", "tartanair", "kitti360")
+
+
+def test_ablations_hold_every_row_of_every_ablation_once():
+    together = set(suite_named("ablations", "ensemble").rows)
+    single = [n for n in names() if n.startswith("ablation-")] + ["paper-figure-pose-noise", "paper-figure-overlap"]
+    assert together == {row for name in single for row in suite_named(name, "ensemble").rows}
+
+
+def test_segmentation_has_both_readings_of_small_and_both_rules():
+    tried = {configured(row.setting).segment for row in suite_named("ablation-segmentation").rows}
+    own = UfMStarConfig().segment
+    assert {(s.min_pixels, s.min_rows, s.prune) for s in tried} >= {
+        (pixels, rows, rule) for pixels, rows in ((200, 16), (2000, 32)) for rule in ("both", "either")
+    }
+    assert "none" in {s.prune for s in tried}
+    assert {s.line_thresh / own.line_thresh for s in tried} == {0.5, 1, 2}
+    assert {s.min_gaussian_length / own.min_gaussian_length for s in tried} == {0.5, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [
+        ("eta", "eta"),
+        ("eta-occlusion", "eta_occlusion"),
+        ("ema-alpha", "ema_alpha"),
+        ("prior", "prior_weight"),
+        ("overlap-weighted", "overlap_weighted"),
+        ("regression", "regression"),
+    ],
+)
+def test_an_ablation_tries_the_default_and_others_against_the_base_alone(name, field):
+    suite = suite_named(f"ablation-{name}", "depth_only")
+    assert suite.rows[:2] == rows_of(["DepthOnly", "UfM*-DepthOnly"])
+    assert field in suite.sweep
+    tried = {value_of(row.setting.to_dict(), field) for row in suite.rows[1:]}
+    assert len(tried) > 1
+    assert getattr(UfMStarConfig(), field) in tried
+
+
+def test_a_setting_that_says_what_ufmstar_does_anyway_is_the_default_row():
+    assert setting_from({"ema_alpha": default_of("ema_alpha"), "skip": 0}) == DEFAULT
+    assert setting_from({"segment.min_pixels": 2000, "skip": 2}).to_dict() == {"segment.min_pixels": 2000, "skip": 2}
+    assert configured(setting_from({"segment.min_pixels": 2000})).segment.min_pixels == 2000
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"etaa": 1}, "no setting is called 'etaa'"),
+        ({"segment": 1}, "is a group"),
+        ({"segment.prune.x": 1}, "no setting is called"),
+        ({"eta": 3}, r"UfMStarConfig.eta must lie in \(0.0, 1.0\], got 3"),
+        ({"skip": -1}, "skip must be a whole number"),
+    ],
+)
+def test_impossible_settings(values, told):
+    with pytest.raises(ValueError, match=told):
+        setting_from(values)
+
+
+def test_impossible_suites():
+    rows = rows_of(["Ensemble"])
+    with pytest.raises(ValueError, match="has a row twice: Ensemble"):
+        Suite("x", "", rows * 2)
+    with pytest.raises(ValueError, match="at least one row"):
+        Suite("x", "", ())
+    with pytest.raises(ValueError, match="small letters"):
+        Suite("../x", "", rows)
+    with pytest.raises(ValueError, match="row Ensemble: eta is of UfM"):
+        Suite("x", "", rows_of(["Ensemble"], Setting({"eta": 0.1})))
+    with pytest.raises(ValueError, match="no setting is called 'etta'"):
+        Suite("x", "", rows, sweep=("etta",))
+
+
+def test_rows_without_a_network_are_left_out():
+    left = suite_named("paper-table-1").with_bases(["aleatoric", "depth_only"])
+    assert left.bases == ("aleatoric",)
+    assert len(left.rows) == 4
+    with pytest.raises(ValueError, match="there are networks of depth_only only"):
+        suite_named("paper-table-1").with_bases(["depth_only"])
+
+
+# ---- TOML ----
+
+TOML = """
+title = "Smoothing"
+sweep = ["ema_alpha"]
+datasets = ["scannet"]
+[[rows]]
+methods = ["Ensemble", "UfM*-Ensemble"]
+[[rows]]
+methods = ["UfM*-Ensemble"]
+setting = { "segment.min_pixels" = 2000 }
+each = { ema_alpha = [0.1, 1.0], skip = [0, 2] }
+"""
+
+
+def test_a_suite_from_a_file(tmp_path):
+    (tmp_path / "my-own.toml").write_text(TOML)
+    suite = suite_from_file(tmp_path / "my-own.toml")
+    assert (suite.name, suite.title, suite.sweep, suite.datasets) == (
+        "my-own",
+        "Smoothing",
+        ("ema_alpha",),
+        ("scannet",),
+    )
+    assert suite.rows[:2] == rows_of(["Ensemble", "UfM*-Ensemble"])
+    assert [row.setting.to_dict() for row in suite.rows[2:]] == [
+        {"ema_alpha": alpha, "segment.min_pixels": 2000, **({"skip": skip} if skip else {})}
+        for alpha in (0.1, 1.0)
+        for skip in (0, 2)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("titel = 'x'", "unknown key 'titel', expected name, title"),
+        ("[[rows]]\nmethods = ['Ensemble']\nsettings = {}", "rows 1: unknown key 'settings', expected methods"),
+        ("[[rows]]\nmethods = ['Ensembel']", "rows 1: no method is called 'Ensembel'"),
+        ("[[rows]]\nmethods = 'Ensemble'", "rows 1: methods must be a list"),
+        ("[[rows]]\nmethods = []", "rows 1: methods must name at least one"),
+        ("[[rows]]\nmethods = [1]", "methods must be a list of words"),
+        ("[[rows]]\nmethods = ['UfM*-MCD']\nsetting = {alpha = 1}", "rows 1: no setting is called 'alpha'"),
+        ("[[rows]]\nmethods = ['UfM*-MCD']\neach = {eta = 0.5}", "each.eta must be a list of values"),
+        ("rows = [1]", "rows 1 must be a table"),
+        ("title = 'x'", "needs at least one row"),
+        ("name = ", "Invalid value"),
+    ],
+)
+def test_mistakes_in_a_file_are_told_with_its_name(tmp_path, text, told):
+    (tmp_path / "bad.toml").write_text(text)
+    with pytest.raises(ValueError, match=told) as raised:
+        suite_from_file(tmp_path / "bad.toml")
+    assert "bad.toml" in str(raised.value)
+
+
+# ---- work list ----
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 60), st.integers(1, 12))
+def test_shards_take_every_sequence_exactly_once_and_equally_many(count, parts):
+    items = [WorkItem("d", f"s{n:03}", "p", "auto") for n in range(count)]
+    shares = [Shard(index, parts).of(items) for index in range(1, parts + 1)]
+    assert sorted(item for share in shares for item in share) == items
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+@pytest.mark.parametrize("text", ["0/2", "3/2", "1", "1/0", "a/b", "1/2/3", "-1/2"])
+def test_impossible_shards(text):
+    with pytest.raises(ValueError, match="--shard must be"):
+        Shard.parse(text)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.text(min_size=1, max_size=30), min_size=1, unique=True))
+def test_sequences_of_any_name_have_folders_of_their_own(sequence_names):
+    items = [WorkItem("d", name, "p", "auto") for name in sequence_names]
+    folders = [item.folder.parts for item in items]
+    assert len(set(folders)) == len(items)
+    for _, folder in folders:
+        assert folder.isascii()
+        assert not set(folder) & set('/\\:*?<>|" ')
+        assert not folder.startswith(".")
+
+
+def test_work_is_found_by_layout_or_named_data_set(tmp_path):
+    write_rooms(tmp_path / "a")
+    write_seven_scenes(tmp_path / "b")
+    found = find_work([str(tmp_path / "a"), f"mine={tmp_path / 'b'}", "tour:3?frames=2"])
+    assert [(item.dataset, item.layout) for item in found] == [("generic", "generic")] * 3 + [
+        ("mine", "7scenes"),
+        ("tour", "auto"),
+    ]
+    assert [item.sequence for item in found[:3]] == list(NAMES)
+    assert [len(item.open()) for item in found[:4]] == [4, 4, 4, 6]
+
+
+def test_sample_and_list(tmp_path):
+    folder = write_rooms(tmp_path / "rooms", [f"r{n}" for n in range(7)], frames=1)
+    root = f"d={folder}"
+    everything = find_work([root])
+    sample = find_work([root], sample=3, seed=5)
+    assert sample == sorted(random.Random(5).sample(everything, 3))
+    assert find_work([root], sample=3, seed=6) != sample
+    assert find_work([root], sample=99) == everything
+    (tmp_path / "list.txt").write_text("r5  # the fifth\n\nd/r2\n")
+    assert [item.sequence for item in find_work([root], only=read_names(tmp_path / "list.txt"))] == ["r2", "r5"]
+    with pytest.raises(ValueError, match="names sequences that are not there: r9"):
+        find_work([root], only=["r9", "r1"])
+    with pytest.raises(ValueError, match="--sequences must be at least 1"):
+        find_work([root], sample=0)
+
+
+def test_mistaken_roots(tmp_path):
+    write_rooms(tmp_path / "a", ["ash"], frames=1)
+    write_rooms(tmp_path / "b", ["ash"], frames=1)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="name their data sets"):
+        find_work([str(tmp_path / "a"), str(tmp_path / "b")])
+    assert len(find_work([f"x={tmp_path / 'a'}", str(tmp_path / "b")])) == 2
+    assert len(find_work([str(tmp_path / "a"), str(tmp_path / "a")])) == 1
+    with pytest.raises(ValueError, match="no sequence of a known layout"):
+        find_work([str(tmp_path / "empty")])
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        find_work([str(tmp_path / "nowhere")])
+
+
+def test_the_digest_tells_other_poses(tmp_path):
+    folder = write_rooms(tmp_path, ["ash"], frames=2) / "ash"
+    item = WorkItem("d", "ash", str(folder), "auto")
+    before = content_digest(item.open())
+    assert content_digest(item.open()) == before
+    lines = (folder / "poses.txt").read_text().splitlines()
+    (folder / "poses.txt").write_text("\n".join(lines[::-1]))
+    assert content_digest(item.open()) != before
+
+
+# ---- the folder ----
+
+ABOUT = {
+    "suite": "x", "title": "", "sweep": [], "networks": {"aleatoric": {"sha256": "a" * 64}}, "rows": [{"method": "A"}],
+    "datasets": ["d"], "sequences": [{"dataset": "d", "sequence": "s"}], "missing_bases": ["ensemble"],
+    "settings": {"frames": [None, None, 2], "confident": 0.5},
+}  # fmt: skip
+
+
+def test_a_folder_is_begun_continued_and_replaced_only_as_asked(tmp_path):
+    out = tmp_path / "out"
+    EvalFolder.open(out, ABOUT, resume=False, overwrite=False)
+    with pytest.raises(FolderError, match="--resume goes on with it, --overwrite replaces it"):
+        EvalFolder.open(out, ABOUT, resume=False, overwrite=False)
+    EvalFolder.open(out, ABOUT, resume=True, overwrite=False)
+    EvalFolder.open(out, {**ABOUT, "suite": "y"}, resume=False, overwrite=True)
+    assert json.loads((out / "eval.json").read_text())["suite"] == "y"
+
+
+def test_files_of_someone_else_are_not_touched(tmp_path):
+    (tmp_path / "thesis.tex").write_text("x")
+    with pytest.raises(FolderError, match="files of someone else"):
+        EvalFolder.open(tmp_path, ABOUT, resume=True, overwrite=False)
+    with pytest.raises(FolderError, match="files of someone else"):
+        EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    with pytest.raises(FolderError, match="is a file"):
+        EvalFolder.open(tmp_path / "thesis.tex", ABOUT, resume=False, overwrite=False)
+
+
+def test_overwriting_removes_our_files_alone(tmp_path):
+    root, out = write_rooms(tmp_path / "rooms", ["ash"]), tmp_path / "out"
+    go(job_on(root, out))
+    own = [out / "notes.txt", out / "tables" / "mine.csv", out / "work" / "rooms" / "ash" / "note.md"]
+    for file in own:
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("mine")
+    made = [out / "tables" / "main.md", out / "results.json", out / "cache" / "kept"]
+    for file in made:
+        file.write_text("made")
+    EvalFolder.open(out, ABOUT, resume=False, overwrite=True)
+    assert all(file.read_text() == "mine" for file in own)
+    assert [file.exists() for file in made] == [False, False, True]
+    left = {path.name for path in out.rglob("*") if path.is_file()}
+    assert left == {"eval.json", "eval.lock", ".writable", "kept", *(file.name for file in own)}
+
+
+def test_overwriting_waits_for_nobody(tmp_path):
+    folder = EvalFolder.open(tmp_path / "out", ABOUT, resume=False, overwrite=False)
+    with (
+        folder.claim(WorkItem("d", "s", "p", "auto"), "one"),
+        pytest.raises(FolderError, match="evaluating s there now"),
+    ):
+        EvalFolder.open(folder.path, ABOUT, resume=False, overwrite=True)
+    EvalFolder.open(folder.path, ABOUT, resume=False, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"suite": "y"}, 'suite was "x", now "y"'),
+        ({"networks": {"aleatoric": {"sha256": "b" * 64}}}, r"networks.aleatoric.sha256 was \"aaaaaaaa.*, now \"bbbb"),
+        ({"settings": {"frames": [None, 9, 2], "confident": 0.5}}, "settings.frames was"),
+        ({"settings": {"frames": [None, None, 2], "confident": 0.2}}, "settings.confident was 0.5, now 0.2"),
+    ],
+)
+def test_resuming_something_else_is_refused_by_name(tmp_path, changed, told):
+    EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False)
+    with pytest.raises(FolderError, match=told):
+        EvalFolder.open(tmp_path, {**ABOUT, **changed}, resume=True, overwrite=False)
+
+
+def test_resuming_adds_rows_sequences_and_networks(tmp_path):
+    EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False)
+    more = {
+        "networks": {"ensemble": {"sha256": "c"}},
+        "rows": [{"method": "B"}, {"method": "A"}],
+        "sequences": [{"dataset": "d", "sequence": "t"}],
+        "missing_bases": ["aleatoric", "evidential"],
+    }
+    about = EvalFolder.open(tmp_path, {**ABOUT, **more}, resume=True, overwrite=False).about
+    assert about == json.loads((tmp_path / "eval.json").read_text())
+    assert about["networks"].keys() == {"aleatoric", "ensemble"}
+    assert about["rows"] == [{"method": "A"}, {"method": "B"}]
+    assert [s["sequence"] for s in about["sequences"]] == ["s", "t"]
+    assert about["missing_bases"] == ["evidential"]
+
+
+def test_a_sequence_is_claimed_by_one(tmp_path):
+    folder, item = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False), WorkItem("d", "s", "p", "auto")
+    first = folder.claim(item, "one")
+    assert first is not None
+    assert folder.claim(item, "two") is None
+    with folder.claim(WorkItem("d", "t", "p", "auto"), "two") as another_sequence:
+        assert not another_sequence.died
+    first.file.close()  # as a killed process leaves it
+    with folder.claim(item, "two") as other_launch:
+        assert not other_launch.died
+    folder.claim(item, "one").file.close()
+    with folder.claim(item, "one") as same_launch:
+        assert same_launch.died
+    with folder.claim(item, "one") as in_good_order:
+        assert not in_good_order.died
+
+
+def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
+    job = job_on(write_rooms(tmp_path / "rooms", ["ash"]), tmp_path / "out")
+    go(job)
+    folder, item, rows = EvalFolder(job.out, {}), job.items[0], job.suite.rows
+    assert folder.missing(item, rows) == []
+    assert folder.missing(item, [Row(rows[3].method, Setting(skip=1))]) == [Row(rows[3].method, Setting(skip=1))]
+    (folder.place(item) / "DepthOnly.pt").unlink()
+    (folder.place(item) / "UfM-DepthOnly.json").write_text('{"format": 1')
+    assert [row.method.name for row in folder.missing(item, rows)] == ["DepthOnly", "UfM-DepthOnly"]
+    go(job, resume=True)
+    assert folder.missing(item, rows) == []
+
+
+# ---- small parts ----
+
+
+def test_a_lock_is_held_by_one_and_keeps_the_content(tmp_path):
+    (tmp_path / "lock").write_text("kept")
+    first = hold(tmp_path / "lock")
+    assert hold(tmp_path / "lock", wait=0.05) is None
+    first.close()
+    second = hold(tmp_path / "lock")
+    second.seek(0)
+    assert second.read() == b"kept"
+    second.close()
+
+
+def test_differences_name_five():
+    assert differences({"a": {"b": 1}}, {"a": {"b": 1}}) == ""
+    assert differences({"a": {"b": 1}}, {"a": {"b": 2}, "c": 0}) == "a.b was 1, now 2; c was null, now 0"
+    assert differences({}, {str(n): n for n in range(1, 8)}).endswith("and 2 more")
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 90), st.sampled_from([torch.int64, torch.float64]), st.integers(0, 2**31))
+def test_packed_sums_are_the_same_to_the_last_bit(size, kind, seed):
+    generator = torch.Generator().manual_seed(seed)
+    value = torch.randn(size, size, generator=generator, dtype=torch.float64)
+    value = torch.where(torch.rand(size, size, generator=generator) < 0.1, value * 100, 0.0).to(kind)
+    again = unpack(pack(value))
+    assert again.dtype == kind
+    assert again.equal(value)
