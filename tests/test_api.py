@@ -36,7 +36,7 @@ def test_public_names():
 
 
 def test_signatures():
-    observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features"]
+    observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features", "anchors"]
     assert names(UfMStar.__init__) == ["config", "dtype", "device"]
     assert names(UfMStar.forward) == observation
     assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average"]

@@ -17,6 +17,7 @@ HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetr
 HEAVY += ("numba",)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "disagree", "fuse", "regress", "mixture", "step", "frame")
+REFERENCE += ("anchors", "evidence", "read_out", "output", "stateful")
 
 
 def layer_of(path: Path) -> str:

@@ -76,6 +76,19 @@ def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tenso
     return Regression(disagreement, torch.where(seen[..., None], result.features.view(*shape, -1), torch.nan))
 
 
+def shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Tensor:
+    """How much of a point each component explains, w_k(x) = pi_k N_k(x) / (sum_k pi_k N_k(x) + pi_0).
+
+    Args:
+        mixture, points, config: as :func:`regress`; for few points, all pairs are held at once.
+
+    Returns:
+        [B, P, K] in [0, 1]; 1 less their sum is the prior's.
+    """
+    density = _density(mixture, *_densities(mixture, points.dtype), points, config)
+    return density / (density.sum(-1, keepdim=True) + config.prior_weight)
+
+
 def _densities(mixture: GaussianMixture, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """Inverse Cholesky factors [B, K, 3, 3] and log(pi_k N(mu_k; mu_k, Sigma_k)) [B, K], -inf for empty slots."""
     valid = mixture.valid
@@ -87,9 +100,10 @@ def _densities(mixture: GaussianMixture, dtype: torch.dtype) -> tuple[Tensor, Te
     return L_inv.to(dtype), torch.where(valid, log_peak, torch.full_like(log_peak, -math.inf)).to(dtype)
 
 
-def _chunk(
+def _density(
     mixture: GaussianMixture, whitening: Tensor, log_peak: Tensor, points: Tensor, config: UfMStarConfig
-) -> Regression:
+) -> Tensor:
+    """[B, P, K] pi_k N(x; mu_k, Sigma_k), 0 outside the neighbourhood."""
     dtype = points.dtype
     offset = points[:, :, None] - mixture.mean.to(dtype)[:, None]  # [B, P, K, 3]
     dx, dy, dz = offset.unbind(-1)
@@ -100,6 +114,14 @@ def _chunk(
     density = torch.exp(log_peak[:, None] - 0.5 * squared)
     if config.regression == "neighbourhood":
         density = density * _near(mixture, offset, config)
+    return density
+
+
+def _chunk(
+    mixture: GaussianMixture, whitening: Tensor, log_peak: Tensor, points: Tensor, config: UfMStarConfig
+) -> Regression:
+    dtype = points.dtype
+    density = _density(mixture, whitening, log_peak, points, config)
     evidence = density.sum(-1) + config.prior_weight
     # Products and sums, not matrix products: those may run in TF32 where the caller allows it.
     weighted = (density * mixture.disagreement.to(dtype)[:, None]).sum(-1)

@@ -6,21 +6,23 @@ float64, so large world coordinates never reach the float32 state, and component
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors import AnchorInput
 from ufmstar_torch.backend import Backend
-from ufmstar_torch.camera import focal_and_centre, relative_pose, unproject
+from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.disagree import with_overlap_disagreement
+from ufmstar_torch.evidence import Evidence
 from ufmstar_torch.frame import FRAME_FAULTS, FrameInput
 from ufmstar_torch.fuse import append
 from ufmstar_torch.gaussian import pixel_footprint
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression
+from ufmstar_torch.read_out import average, learn, read_out
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class UfMStarState:
         skipped: [B] int64 number of frames skipped for a fault.
         smoothed: [B, H, W] moving average of the dense disagreement [m^2] in the mixture's dtype, NaN without a
             value; None at the start.
+        evidence: what anchors have taught; None unless ``config.anchored``.
     """
 
     mixture: GaussianMixture
@@ -43,6 +46,7 @@ class UfMStarState:
     frames: Tensor
     skipped: Tensor
     smoothed: Tensor | None
+    evidence: Evidence | None = None
 
     @classmethod
     def initial(
@@ -58,6 +62,7 @@ class UfMStarState:
             frames=counter,
             skipped=counter.clone(),
             smoothed=None,
+            evidence=Evidence.empty(streams, capacity, dtype=dtype, device=device) if config.anchored else None,
         )
 
 
@@ -75,6 +80,8 @@ class FrameStatistics:
         valid_pixels: pixels used.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
+        anchors: given and usable.
+        anchors_used: of those, no gross outliers.
     """
 
     components: Tensor
@@ -86,6 +93,8 @@ class FrameStatistics:
     valid_pixels: Tensor
     fault: Tensor
     rotation_deviation: Tensor
+    anchors: Tensor
+    anchors_used: Tensor
 
 
 @dataclass(frozen=True)
@@ -95,6 +104,8 @@ class StepOutput:
     Attributes:
         disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
         features: regressed features [B, H, W, F] or [B, n, F].
+        residual: [B, H, W, 2] or [B, n, 2] from anchors, the mean relative error r and mean square excess e expected at
+            each pixel (``evidence``); None unless ``config.anchored``.
         labels: [B, H, W] int64 the segment of every pixel, -1 = none.
         current_cam: C_i in the camera frame.
         statistics: of this frame.
@@ -102,6 +113,7 @@ class StepOutput:
 
     disagreement: Tensor
     features: Tensor
+    residual: Tensor | None
     labels: Tensor
     current_cam: GaussianMixture
     statistics: FrameStatistics
@@ -114,7 +126,8 @@ def step(
     backend: Backend,
     *,
     pixels: Tensor | None = None,
-    average: bool = True,
+    smooth: bool = True,
+    anchors: AnchorInput | None = None,
 ) -> tuple[UfMStarState, StepOutput]:
     """Segment, correspond, fuse, regress (section "Uncertainty from Motion*", steps 2 to 5).
 
@@ -123,7 +136,8 @@ def step(
         frame: checked input of B streams.
         config, backend: what to do and by which kernels.
         pixels: [B, n] indices into the flattened image to regress only there; None = every pixel.
-        average: apply the exponential moving average.
+        smooth: apply the exponential moving average.
+        anchors: of this frame; only with ``config.anchored``.
 
     Returns:
         The new state and the output. A stream whose frame is at fault keeps its state and gets NaN.
@@ -154,10 +168,12 @@ def step(
     mixture, dropped = append(mixture, current_first, new)
 
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
-    result = _read_out(mixture_cam, frame, config, backend, pixels)
+    evidence, used = learn(state.evidence, mixture_cam, frame, anchors, config)
+    result, residual = read_out(mixture_cam, evidence, frame, config, backend, pixels)
     disagreement, smoothed = result.disagreement, state.smoothed
-    if average and config.ema_alpha < 1.0:
-        disagreement, smoothed = _average(state, disagreement, frame, config, backend, pixels)
+    if smooth and config.ema_alpha < 1.0:
+        dtype = state.mixture.mean.dtype
+        disagreement, smoothed = average(smoothed, dtype, disagreement, frame, config, backend, pixels)
 
     statistics = FrameStatistics(
         components=mixture.components,
@@ -169,9 +185,12 @@ def step(
         valid_pixels=frame.valid.sum((1, 2)),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
+        anchors=torch.zeros_like(fine, dtype=torch.int64) if anchors is None else anchors.valid.sum(1),
+        anchors_used=used,
     )
-    updated = UfMStarState(mixture, first, state.started | fine, state.frames + fine, state.skipped + ~fine, smoothed)
-    return updated, StepOutput(disagreement, result.features, labels, current_cam, statistics)
+    frames, skipped = state.frames + fine, state.skipped + ~fine
+    updated = UfMStarState(mixture, first, state.started | fine, frames, skipped, smoothed, evidence)
+    return updated, StepOutput(disagreement, result.features, residual, labels, current_cam, statistics)
 
 
 def raise_faults(faults: list[int]) -> None:
@@ -237,42 +256,3 @@ def _pad_pairs(pairs: Correspondence, capacity: int) -> Correspondence:
     pad = torch.nn.functional.pad
     distance = None if pairs.distance is None else pad(pairs.distance, (0, missing))
     return Correspondence(pad(pairs.match, (0, missing)), pad(pairs.overlap, (0, missing)), distance)
-
-
-def _read_out(
-    mixture_cam: GaussianMixture, frame: FrameInput, config: UfMStarConfig, backend: Backend, pixels: Tensor | None
-) -> Regression:
-    """Step 5 at every pixel, or at some; NaN where not valid, which is where the checked depth is 0."""
-    if pixels is None:
-        return backend.regress_image(mixture_cam, frame.depth, frame.intrinsics, config)
-    points = unproject(frame.depth, frame.intrinsics).flatten(1, 2)
-    chosen = torch.gather(points, 1, pixels[..., None].expand(*pixels.shape, 3))
-    result = backend.regress(mixture_cam, chosen, config)
-    valid = torch.gather(frame.valid.flatten(1), 1, pixels)
-    features = torch.where(valid[..., None], result.features, torch.nan)
-    return replace(result, disagreement=torch.where(valid, result.disagreement, torch.nan), features=features)
-
-
-def _average(
-    state: UfMStarState,
-    disagreement: Tensor,
-    frame: FrameInput,
-    config: UfMStarConfig,
-    backend: Backend,
-    pixels: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """The moving average for output (NaN where not valid now) and for the state.
-
-    It is kept in the state's dtype, so that a saved run goes on as it was, and restarts when the image size
-    changes. On a subset the dense map serves as memory at those pixels.
-    """
-    memory = state.smoothed
-    if memory is None or memory.shape[1:] != frame.size:
-        dtype = state.mixture.mean.dtype
-        memory = torch.full(frame.depth.shape, torch.nan, dtype=dtype, device=frame.depth.device)
-    if pixels is None:
-        memory, shown = backend.smooth(memory, disagreement, config.ema_alpha)
-        return shown, memory
-    flat = memory.flatten(1)
-    mixed, shown = backend.smooth(torch.gather(flat, 1, pixels), disagreement, config.ema_alpha)
-    return shown, flat.scatter(1, pixels, mixed).view(memory.shape)

@@ -3,74 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.backend import select
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.evidence import Evidence
 from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
+from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.stateful import StatefulModule, full_precision
-from ufmstar_torch.step import FrameStatistics, StepOutput, UfMStarState, step
+from ufmstar_torch.step import StepOutput, UfMStarState, step
 
 _MIXTURE = ("mean", "covariance", "weight", "disagreement", "count", "features")
-_STATE = (*_MIXTURE, "T_world_first", "started", "frames", "skipped", "smoothed")
-
-
-@dataclass(frozen=True)
-class UfMStarOutput:
-    """The prediction of one frame with its variance. Maps have the layout in which ``depth`` was given.
-
-    Attributes:
-        depth: the depth as given [m].
-        variance: V, the total variance of the depth [m^2]: M, plus A and E where given (and not switched
-            off in the config), at least ``config.variance_floor``. NaN where not valid.
-        disagreement: M, the multiview disagreement [m^2]. NaN where not valid.
-        aleatoric, epistemic: A and E as given [m^2], or None.
-        features: regressed further entries of H, [B, H, W, F], in the caller's units.
-        valid: True where the pixel was used.
-        labels: [B, H, W] the pixel's segment in ``current_cam``, -1 = none.
-        current_cam: C_i, the segments of this frame in the camera frame, float64.
-        statistics: per-stream counts of this frame.
-    """
-
-    depth: Tensor
-    variance: Tensor
-    disagreement: Tensor
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-    features: Tensor
-    valid: Tensor
-    labels: Tensor
-    current_cam: GaussianMixture
-    statistics: FrameStatistics
-
-    @property
-    def std(self) -> Tensor:
-        """sqrt(variance) [m]."""
-        return self.variance.sqrt()
-
-
-@dataclass(frozen=True)
-class MeanUncertainty:
-    """An image average of the total variance from a sample of pixels, per stream [B].
-
-    Attributes:
-        mean: average of V over the sampled pixels [m^2]; NaN without a valid pixel.
-        standard_error: of that average as an estimate of the mean over all valid pixels [m^2];
-            NaN with fewer than two pixels.
-        pixels: number of pixels averaged.
-        statistics: per-stream counts of this frame.
-    """
-
-    mean: Tensor
-    standard_error: Tensor
-    pixels: Tensor
-    statistics: FrameStatistics
+_STATE = (*_MIXTURE, "T_world_first", "started", "frames", "skipped", "smoothed", "evidence", "overall_evidence")
 
 
 class UfMStar(StatefulModule):
@@ -108,6 +59,8 @@ class UfMStar(StatefulModule):
     frames: Tensor
     skipped: Tensor
     smoothed: Tensor
+    evidence: Tensor
+    overall_evidence: Tensor
 
     def __init__(
         self,
@@ -137,6 +90,7 @@ class UfMStar(StatefulModule):
         valid: Tensor | None = None,
         *,
         features: Tensor | None = None,
+        anchors: Anchors | None = None,
     ) -> UfMStarOutput:
         """Take in one predicted depth map per stream and return its variance.
 
@@ -151,6 +105,7 @@ class UfMStar(StatefulModule):
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
             features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed.
+            anchors: sparse depths of this frame, with ``config.anchored``; None = none.
 
         Returns:
             The variance and its parts.
@@ -158,16 +113,21 @@ class UfMStar(StatefulModule):
         Raises:
             TypeError: wrong kind of argument or dtype.
             ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first);
-                a pose that is not rigid or bad intrinsics (``config.on_bad_frame == "skip"``: counted instead).
+                a pose that is not rigid or bad intrinsics (``config.on_bad_frame == "skip"``: counted instead);
+                anchors without ``config.anchored``.
         """
         frame = self._check(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        out = self._advance(frame)
+        out = self._advance(frame, anchors=self._anchors(anchors, frame))
         shape = depth.shape
         disagreement = out.disagreement.reshape(shape)
+        bias, anchored = (None, None) if out.residual is None else out.residual.unbind(-1)
+        if anchored is not None:
+            anchored = (frame.depth.square() * anchored.clamp_min(0)).reshape(shape)
         variance = self._total(
             disagreement,
             None if frame.aleatoric is None else frame.aleatoric.reshape(shape),
             None if frame.epistemic is None else frame.epistemic.reshape(shape),
+            anchored,
         )
         return UfMStarOutput(
             depth=depth,
@@ -175,6 +135,8 @@ class UfMStar(StatefulModule):
             disagreement=disagreement,
             aleatoric=aleatoric,
             epistemic=epistemic,
+            anchored=anchored,
+            bias=None if bias is None else bias.reshape(shape),
             features=out.features,
             valid=frame.valid.reshape(shape),
             labels=out.labels,
@@ -192,6 +154,7 @@ class UfMStar(StatefulModule):
         valid: Tensor | None = None,
         *,
         features: Tensor | None = None,
+        anchors: Anchors | None = None,
         pixels: int | None = None,
         fraction: float | None = None,
         seed: int = 0,
@@ -211,12 +174,15 @@ class UfMStar(StatefulModule):
         """
         frame = self._check(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
-        out = self._advance(frame, pixels=index, average=average)
+        out = self._advance(frame, pixels=index, average=average, anchors=self._anchors(anchors, frame))
 
         def chosen(value: Tensor | None) -> Tensor | None:
             return None if value is None else torch.gather(value.flatten(1), 1, index)
 
-        variance = self._total(out.disagreement, chosen(frame.aleatoric), chosen(frame.epistemic))
+        anchored = None
+        if out.residual is not None:
+            anchored = torch.gather(frame.depth.flatten(1), 1, index).square() * out.residual[..., 1].clamp_min(0)
+        variance = self._total(out.disagreement, chosen(frame.aleatoric), chosen(frame.epistemic), anchored)
         count = used.sum(1)
         value = torch.where(used, variance, torch.zeros_like(variance))
         mean = value.sum(1) / count  # 0/0 = NaN where no pixel is valid
@@ -267,7 +233,10 @@ class UfMStar(StatefulModule):
     def state(self) -> UfMStarState:
         """The state as the pure function :func:`ufmstar_torch.step.step` takes it."""
         smoothed = self.smoothed if self.smoothed.shape[-1] else None
-        return UfMStarState(self.mixture, self.T_world_first, self.started, self.frames, self.skipped, smoothed)
+        evidence = Evidence(self.evidence, self.overall_evidence) if self.config.anchored else None
+        return UfMStarState(
+            self.mixture, self.T_world_first, self.started, self.frames, self.skipped, smoothed, evidence
+        )
 
     def reset(self, streams: Sequence[int] | Tensor | None = None) -> None:
         """Forget everything, or only some streams.
@@ -302,7 +271,27 @@ class UfMStar(StatefulModule):
                 torch.where(mask, old, torch.as_tensor(fresh.get(name, 0), dtype=old.dtype, device=device)),
             )
 
-    def _advance(self, frame: FrameInput, pixels: Tensor | None = None, average: bool = True) -> StepOutput:
+    def _anchors(self, anchors: Anchors | None, frame: FrameInput) -> AnchorInput | None:
+        """Checked, with what the network itself claims where they lie.
+
+        Raises:
+            ValueError: anchors without ``config.anchored``; and as :func:`check_anchors`.
+        """
+        if anchors is None:
+            return None
+        if not self.config.anchored:
+            raise ValueError("anchors need UfMStarConfig(anchored=True)")
+        own = [(frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)]
+        claimed = [value for value, counts in own if value is not None and counts]
+        return check_anchors(anchors, frame, torch.stack(claimed).sum(0) if claimed else None)
+
+    def _advance(
+        self,
+        frame: FrameInput,
+        pixels: Tensor | None = None,
+        average: bool = True,
+        anchors: AnchorInput | None = None,
+    ) -> StepOutput:
         """Run the pure step and keep its state. Normal tensors also under inference_mode: they must
         outlive it."""
         with (
@@ -311,7 +300,9 @@ class UfMStar(StatefulModule):
             full_precision(frame.depth.device),
         ):
             backend = select(self.config.backend, frame.depth.device.type)
-            state, out = step(self._state_for(frame), frame, self.config, backend, pixels=pixels, average=average)
+            state, out = step(
+                self._state_for(frame), frame, self.config, backend, pixels=pixels, smooth=average, anchors=anchors
+            )
         self._store(_to_buffers(state))
         return out
 
@@ -334,9 +325,11 @@ class UfMStar(StatefulModule):
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
         )  # fmt: skip
 
-    def _total(self, disagreement: Tensor, aleatoric: Tensor | None, epistemic: Tensor | None) -> Tensor:
-        """V = M + A + E, at least the floor (section "Uncertainty Regression"); NaN stays NaN."""
-        total = disagreement
+    def _total(
+        self, disagreement: Tensor, aleatoric: Tensor | None, epistemic: Tensor | None, anchored: Tensor | None
+    ) -> Tensor:
+        """V = M + A + E (+ B), at least the floor (section "Uncertainty Regression"); NaN stays NaN."""
+        total = disagreement if anchored is None else disagreement + anchored
         if aleatoric is not None and self.config.add_aleatoric:
             total = total + aleatoric
         if epistemic is not None and self.config.add_epistemic:
@@ -353,7 +346,10 @@ def _to_buffers(state: UfMStarState) -> dict[str, Tensor]:
     mean = state.mixture.mean
     smoothed = state.smoothed if state.smoothed is not None else mean.new_zeros(mean.shape[0], 0, 0)
     rest = {name: getattr(state, name) for name in ("T_world_first", "started", "frames", "skipped")}
-    return {**state.mixture.tensors(), **rest, "smoothed": smoothed}
+    # Without anchors nothing is kept: rows for no slot.
+    learnt = state.evidence or Evidence.empty(mean.shape[0], 0, dtype=mean.dtype, device=mean.device)
+    evidence = {"evidence": learnt.component, "overall_evidence": learnt.overall}
+    return {**state.mixture.tensors(), **rest, "smoothed": smoothed, **evidence}
 
 
 def _sample_size(frame: FrameInput, pixels: int | None, fraction: float | None) -> int:

@@ -1,0 +1,145 @@
+"""What anchors teach: how far off the network has been lately, by component and overall.
+
+At an anchor (depth g, variance s^2) the prediction d has the relative error r = (g - d)/d. UfM* claims V_0 = M + A + E
+there. Were V_0 right, E[r^2] = (V_0 + s^2)/d^2. What is left over,
+
+    e = r^2 - (s^2 + V_0)/d^2,
+
+is the relative mean square error that neither the views' disagreement nor the network's own variance explains. It may
+be negative at one anchor; its mean over many is unbiased, since expectations are linear. So B = d^2 max(0, mean of e)
+makes V = V_0 + B agree with what was measured, on average; disagreement is not counted twice, because it is subtracted
+before, and neither is the anchors' own noise.
+
+Sums of (1, r, e) live beside the mixture, one row a component, and one for the stream as a whole. A component takes an
+anchor by its share in explaining the predicted point, w_k = pi_k N_k / (sum pi N + pi_0). Old evidence fades by a
+factor a frame. Means shrink: (sum_k + kappa mean)/(n_k + kappa) towards the stream's; and where no component explains a
+point, the stream's mean is the answer: what the network has been getting wrong lately, not nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors import AnchorInput
+
+# Entries of a row of sums.
+COUNT, BIAS, EXCESS = 0, 1, 2
+SUMS = 3
+# A wrong track stands alone: an anchor is believed where at least _SUPPORT of its _NEIGHBOURS nearest ones in the image
+# have a similar ratio g/d. Not a distance from the frame's median: a network may be wrong by another factor on each
+# surface, and a small region that differs from the rest is what anchors are to find.
+_NEIGHBOURS, _SUPPORT = 8, 3
+# "Similar" is within 3 sigma of what neighbours differ by. sigma comes from the lower quartile of all such differences,
+# .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
+_SIMILAR_SIGMAS, _LOWER_QUARTILE = 3.0, 0.4506
+# Least sigma of log g/d: tracked landmarks are right to some 2 %, whatever variance they state.
+_LEAST_SIGMA = 0.02
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Fading sums over anchors of (1, r, e).
+
+    Attributes:
+        component: [B, K, 3], row k of the mixture's slot k.
+        overall: [B, 3] of the stream.
+    """
+
+    component: Tensor
+    overall: Tensor
+
+    @classmethod
+    def empty(cls, streams: int, capacity: int, *, dtype: torch.dtype, device: torch.device | str) -> Evidence:
+        """Nothing learnt yet."""
+        return cls(
+            torch.zeros(streams, capacity, SUMS, dtype=dtype, device=device),
+            torch.zeros(streams, SUMS, dtype=dtype, device=device),
+        )
+
+    def padded(self, capacity: int) -> Evidence:
+        """With room for a mixture that has grown."""
+        missing = capacity - self.component.shape[1]
+        return Evidence(torch.nn.functional.pad(self.component, (0, 0, 0, max(missing, 0))), self.overall)
+
+    def faded(self, memory: Tensor) -> Evidence:
+        """Older by a frame: multiplied by ``memory`` [B] in (0, 1]."""
+        m = memory.to(self.overall.dtype)
+        return Evidence(m[:, None, None] * self.component, m[:, None] * self.overall)
+
+
+def inliers(anchors: AnchorInput) -> Tensor:
+    """[B, N] True for valid anchors that enough of their neighbours in the image support.
+
+    With fewer anchors than have neighbours enough to ask, all valid ones are believed.
+    """
+    n = anchors.valid.shape[1]
+    few = anchors.valid.sum(1, keepdim=True) <= _SUPPORT
+    if n <= _SUPPORT:
+        return anchors.valid
+    log_ratio = (anchors.depth / anchors.predicted).log()
+    both = anchors.valid[:, :, None] & anchors.valid[:, None] & ~torch.eye(n, dtype=torch.bool, device=few.device)
+    apart = (anchors.pixel[:, :, None] - anchors.pixel[:, None]).square().sum(-1)
+    apart = torch.where(both, apart, torch.full_like(apart, torch.inf))
+    distance, neighbour = apart.topk(min(_NEIGHBOURS, n - 1), dim=2, largest=False)
+    asked = distance < torch.inf
+    differ = (log_ratio[:, :, None] - _take(log_ratio, neighbour)).abs()
+    quartile = torch.where(asked, differ, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
+    noise = anchors.variance / anchors.depth.square()  # of log g: no reason for mistrust
+    sigma2 = (quartile / _LOWER_QUARTILE).square()[:, None, None] + 2 * _LEAST_SIGMA**2
+    similar = differ <= _SIMILAR_SIGMAS * (sigma2 + noise[:, :, None] + _take(noise, neighbour)).sqrt()
+    return anchors.valid & (few | ((similar & asked).sum(2) >= _SUPPORT))
+
+
+def _take(value: Tensor, index: Tensor) -> Tensor:
+    """value[b, index[b, i, j]] of [B, N] and [B, N, M]."""
+    return torch.gather(value, 1, index.flatten(1)).view(index.shape)
+
+
+def observe(
+    evidence: Evidence, anchors: AnchorInput, disagreement: Tensor, share: Tensor, memory: Tensor
+) -> tuple[Evidence, Tensor]:
+    """Let old evidence fade and add a frame's.
+
+    Args:
+        evidence: up to the frame before.
+        anchors: of the frame.
+        disagreement: [B, N] M at the anchors' predicted points [m^2].
+        share: [B, N, K] how much of each anchor's point a component explains, in [0, 1].
+        memory: [B] in (0, 1], by which old evidence is multiplied.
+
+    Returns:
+        The evidence, and [B, N] which anchors were used.
+    """
+    used = inliers(anchors)
+    d2 = anchors.predicted.square()
+    r = anchors.depth / anchors.predicted - 1
+    e = r.square() - (anchors.variance + anchors.own_variance + disagreement) / d2
+    rows = torch.stack([torch.ones_like(r), r, e], dim=-1)
+    rows = torch.where(used[..., None], rows, torch.zeros_like(rows))
+    dtype = evidence.overall.dtype
+    fade = memory.double()[:, None]
+    component = fade[..., None] * evidence.component.double() + torch.einsum("bnk,bns->bks", share.double(), rows)
+    overall = fade * evidence.overall.double() + rows.sum(1)
+    return Evidence(component.to(dtype), overall.to(dtype)), used
+
+
+def means(evidence: Evidence, shrinkage: float) -> tuple[Tensor, Tensor]:
+    """What is believed of each component beyond the stream, and of the stream.
+
+    Args:
+        evidence: so far.
+        shrinkage: kappa, the number of anchors that the stream's mean counts for in a component's.
+
+    Returns:
+        [B, K, 2] mean r and e of the components less the stream's, 0 without evidence; [B, 2] the stream's, 0 before
+        the first anchor.
+    """
+    overall = evidence.overall.double()
+    n = overall[..., :1]
+    stream = torch.where(n > 0, overall[..., 1:] / torch.where(n > 0, n, torch.ones_like(n)), torch.zeros_like(n))
+    component = evidence.component.double()
+    beyond = component[..., 1:] - component[..., :1] * stream[:, None]
+    return beyond / (component[..., :1] + shrinkage), stream
