@@ -97,7 +97,7 @@ def test_help_loads_nothing_beyond_the_package():
 
 
 MISTAKES = {
-    "unknown command": (["walk"], "no command 'walk', there are demo, run, bench, train"),
+    "unknown command": (["walk"], "no command 'walk', there are demo, run, eval,"),
     "no sequence": (["run"], "sequence"),
     "no out": (["run", "{path}", "--depth", "self"], "out"),
     "no such sequence": (["run", "/nowhere", "--depth", "self", "--out", "{out}"], "no such file or folder: /nowhere"),
