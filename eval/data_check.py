@@ -152,7 +152,8 @@ def _verdict(
 def _remedies(found: SequenceCheck, sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
     remedies = []
     if found.convention != OURS:
-        remedies.append(f"--poses {found.convention}")
+        given = options.get("poses", OURS)
+        remedies.append(f"--poses {found.convention}" if given == OURS else f"leave --poses {given} out")
     if any("depth looks too" in problem for problem in found.problems):
         remedies.append(_scale_remedy(found.scale, sequence, path, options))
     if any("disagree" in problem or "no two frames overlap" in problem for problem in found.problems):

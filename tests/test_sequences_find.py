@@ -14,19 +14,26 @@ def found(root, **options):
     return {one.name: (one.layout, one.path) for one in find_sequences(root, **options)}
 
 
-@pytest.fixture
-def root(tmp_path):
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
     """A disk with a sequence of each of several layouts, at different depths."""
-    layouts.write_tum(tmp_path / "tum", frames=1)
-    layouts.write_seven_scenes(tmp_path / "7scenes" / "chess", frames=1)
-    shutil.copytree(tmp_path / "7scenes" / "chess" / "seq-01", tmp_path / "7scenes" / "chess" / "seq-02")
-    layouts.write_scannet(tmp_path / "scans", frames=1)
-    layouts.write_tartanair(tmp_path, frames=1)
-    shutil.copytree(tmp_path / "office" / "P000", tmp_path / "office" / "P001")
-    layouts.write_generic(tmp_path / "a" / "b", frames=1)
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes" / "readme.txt").write_text("nothing")
-    return tmp_path
+    root = tmp_path_factory.mktemp("disk")
+    layouts.write_tum(root / "tum", frames=1)
+    layouts.write_seven_scenes(root / "7scenes" / "chess", frames=1)
+    shutil.copytree(root / "7scenes" / "chess" / "seq-01", root / "7scenes" / "chess" / "seq-02")
+    layouts.write_scannet(root / "scans", frames=1)
+    layouts.write_tartanair(root, frames=1)
+    shutil.copytree(root / "office" / "P000", root / "office" / "P001")
+    layouts.write_generic(root / "a" / "b", frames=1)
+    (root / "notes").mkdir()
+    (root / "notes" / "readme.txt").write_text("nothing")
+    return root
+
+
+@pytest.fixture
+def root(written, tmp_path):
+    """A copy that may be changed."""
+    return shutil.copytree(written, tmp_path / "disk")
 
 
 NAMES = {

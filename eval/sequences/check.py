@@ -19,8 +19,9 @@ AS_GIVEN = CONVENTIONS[OURS].told
 _READINGS = {convention.told: convention.convert for convention in CONVENTIONS.values()}
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
-_MIN_OVERLAP = 0.3  # share of a frame's points that must land on valid depth, or a pair tells nothing
-_SPARSE = 0.3  # share of a map's pixels that are valid, below which (a laser's) accordingly fewer points must land
+# Share of a frame's points that must land on valid depth, of those that would if all fell into the image, or a pair
+# tells nothing; a laser's map has values at few pixels only.
+_MIN_OVERLAP = 0.3
 _GAPS = (5, 3, 2, 1)
 # A reading is no better than another within this factor and this relative error (depth's own noise).
 _SAME_FACTOR, _SAME_ERROR = 1.5, 0.003
@@ -151,7 +152,7 @@ def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> floa
     found = pair.depth_b[row[inside].astype(int), column[inside].astype(int)]
     valid = found > 0
     filled = np.count_nonzero(pair.depth_b > 0) / pair.depth_b.size
-    if valid.sum() < max(1, _MIN_OVERLAP * min(1.0, filled / _SPARSE) * pair.points.shape[1]):
+    if valid.sum() < max(1, _MIN_OVERLAP * filled * pair.points.shape[1]):
         return float("inf")
     return float(np.median(np.abs(np.log(z[inside][valid] / found[valid]))))
 

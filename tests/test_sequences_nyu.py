@@ -1,0 +1,127 @@
+"""NYU's h5 files as single images to judge a network on: no poses, known intrinsics, broken files counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from layouts import truncate
+from layouts_more import write_h5, write_nyu
+
+from ufmstar_torch.eval.ground_truth import truth_at
+from ufmstar_torch.eval.run_job import job_from
+from ufmstar_torch.eval.run_options import parse_run, run_parser
+from ufmstar_torch.eval.sequences import FrameError, check_sequence, find_sequences, open_sequence
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.train.nyu import NyuFrames
+
+NAMES = ("kitchen_1__9", "kitchen_1__10", "office_2__11", "office_2__12")
+
+
+@pytest.fixture
+def written(tmp_path):
+    return write_nyu(tmp_path / "nyudepthv2")
+
+
+def test_frames_and_that_they_have_no_poses(written):
+    root, truth = written
+    sequence = open_sequence(root)
+    assert (sequence.layout, sequence.name, sequence.posed) == ("nyu", "nyu_val", False)
+    assert sequence.names == NAMES
+    np.testing.assert_allclose(sequence.intrinsics, truth.K, rtol=1e-12)
+    for i, frame in enumerate(sequence):
+        np.testing.assert_array_equal(frame.image, truth.images[i])
+        np.testing.assert_allclose(frame.depth, truth.depths[i], rtol=1e-6)
+        np.testing.assert_array_equal(frame.T_world_cam, np.eye(4))
+
+
+def test_training_reads_the_same(written):
+    root, _ = written
+    frame, sample = open_sequence(root)[2], NyuFrames(root, "val").load(2)
+    np.testing.assert_array_equal(frame.image.transpose(2, 0, 1), sample.image.numpy())
+    np.testing.assert_array_equal(frame.depth, sample.depth.numpy())
+    np.testing.assert_allclose(frame.intrinsics, sample.intrinsics.numpy())
+
+
+def test_every_other_sequence_has_poses(tmp_path):
+    from layouts import write_generic
+
+    assert open_sequence(write_generic(tmp_path, frames=2)[0]).posed
+
+
+def test_parts_and_scenes(written):
+    root, _ = written
+    assert open_sequence(root / "val").names == NAMES
+    assert open_sequence(root / "val" / "office_2").names == NAMES[2:]
+    assert open_sequence(root / "val" / "office_2").name == "nyu_val_office_2"
+    assert open_sequence(root / "train").names == ("den__1",)
+    found = find_sequences(root.parent)  # one set, not one per scene, and not the training part
+    assert [(one.name, one.layout, one.path) for one in found] == [("nyudepthv2__val", "nyu", root / "val")]
+
+
+def test_the_validation_crop_is_the_fields(written):
+    """480 x 640 -> height 250 -> centre 228 x 304 -> 224 x 224, with K and truth that follow."""
+    root, _ = written
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 5, (480, 640)).astype(np.float32)
+    write_h5(root / "val" / "zoo" / "1.h5", rng.integers(0, 256, (3, 480, 640), np.uint8), depth)
+    frame = open_sequence(root / "val" / "zoo")[0]
+    nyu = Preprocess.nyu()
+    K = nyu.apply_intrinsics(torch.from_numpy(frame.intrinsics), 480, 640)
+    rx, ry = 333 / 640, 250 / 480
+    assert float(K[0, 0]) == pytest.approx(518.857901 * rx * 224 / 304, rel=1e-9)
+    assert float(K[1, 1]) == pytest.approx(519.469611 * ry * 224 / 228, rel=1e-9)
+    assert float(K[0, 2]) == pytest.approx(((325.582449 + 0.5) * rx - 14) * 224 / 304 - 0.5, rel=1e-9)
+    expected = nyu.apply_depth(torch.from_numpy(depth)).numpy()
+    np.testing.assert_array_equal(truth_at(frame, K.numpy(), (224, 224)), expected)
+
+
+def test_holes_are_no_depth(written):
+    root, _ = written
+    depth = np.full((48, 64), 2.0, np.float32)
+    depth[0, :4] = [np.nan, np.inf, -1, 0]
+    write_h5(root / "val" / "kitchen_1" / "9.h5", np.zeros((3, 48, 64), np.uint8), depth)
+    assert open_sequence(root)[0].depth[0, :5].tolist() == [0, 0, 0, 0, 2]
+
+
+def test_broken_files_are_counted(written):
+    root, _ = written
+    val = root / "val"
+    truncate(val / "kitchen_1" / "9.h5")
+    write_h5(val / "kitchen_1" / "10.h5", np.zeros((3, 48, 64), np.uint8), None)
+    write_h5(val / "office_2" / "11.h5", np.zeros((3, 24, 32), np.uint8), np.ones((24, 32), np.float32))
+    sequence, errors = open_sequence(root), []
+    assert sequence.image_size == (24, 32)  # of the first that can be read
+    sequence = open_sequence(root / "val" / "kitchen_1", intrinsics=(50, 50, 32, 24))
+    assert list(sequence.readable(errors.append)) == []
+    assert "cannot be read" in str(errors[0])
+    assert "no dataset 'depth'" in str(errors[1])
+    with pytest.raises(FrameError, match="the image is 64x48, the sequence's are 32x24"):
+        open_sequence(root)[3]
+
+
+def test_cropped_images_need_intrinsics(tmp_path):
+    root, _ = write_nyu(tmp_path, scenes=("a",), frames=1, size=(48, 48))
+    with pytest.raises(ValueError, match="these are 48x48, which is not only a resize: pass intrinsics"):
+        open_sequence(root)
+    assert open_sequence(root, intrinsics=(40, 40, 24, 24)).intrinsics[0, 0] == 40
+
+
+def test_a_trajectory_or_another_convention_is_refused(written):
+    with pytest.raises(ValueError, match="layout 'nyu' takes no trajectory"):
+        open_sequence(written[0], trajectory="x.txt")
+    with pytest.raises(ValueError, match="'nyu_val' has no poses to convert"):
+        open_sequence(written[0], poses="world-to-camera")
+
+
+def test_a_run_that_compares_views_refuses_it(written, tmp_path):
+    words = [str(written[0]), "--depth", "ground-truth", "--out", str(tmp_path / "out")]
+    with pytest.raises(ValueError, match="single images without poses, which UfM\\* needs"):
+        job_from(parse_run(run_parser(), words))
+
+
+def test_the_check_says_so(written):
+    found = check_sequence(open_sequence(written[0]))
+    assert found.ok
+    assert found.pairs == 0
+    assert found.undecided[0] == "there are no poses: methods that compare views cannot be run"
