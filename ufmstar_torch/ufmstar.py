@@ -303,7 +303,7 @@ class UfMStar(StatefulModule):
             state, out = step(
                 self._state_for(frame), frame, self.config, backend, pixels=pixels, smooth=average, anchors=anchors
             )
-        self._store(_to_buffers(state))
+            self._store(_to_buffers(state))
         return out
 
     def _state_for(self, frame: FrameInput) -> UfMStarState:
