@@ -1,0 +1,294 @@
+"""What makes a row: its name, its settings, the noise on its poses, and the networks behind it."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
+from tiny_suite import CPU, base_network, row, write_network, write_networks
+
+from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.eval.suite.estimator import make_estimator, ufm_star_config
+from ufmstar_torch.eval.suite.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.suite.perturb import perturbed, rotation, selects
+from ufmstar_torch.eval.suite.setting import Setting
+
+POSE = np.block([[Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix(), np.array([[1.0], [2], [3]])], [np.eye(4)[3:]]])
+
+
+# ---- names ----
+
+
+def test_names_for_files_and_for_people():
+    assert row("UfM*-Ensemble").slug == "UfMstar-Ensemble"
+    assert row("UfM-MCD-100K").slug == "UfM-MCD-100K"
+    assert row("UfM*-Ensemble").label == "UfM*-Ensemble"
+    changed = row("UfM*-DepthOnly-fixed-param", overrides={"ema_alpha": 1.0}, skip=3)
+    assert changed.slug == f"UfMstar-DepthOnly-fixed-param@{changed.setting.slug}"
+    assert changed.label == "UfM*-DepthOnly-fixed-param (ema_alpha 1.0, skip 3)"
+    assert row("Ensemble", seed=7) != row("Ensemble")
+    assert row("Ensemble", seed=7).slug == "Ensemble", "without noise a seed changes nothing"
+
+
+# ---- settings of UfM* ----
+
+
+def test_the_default_row_has_the_default_settings():
+    assert ufm_star_config(row("UfM*-MCD")) == UfMStarConfig(on_bad_frame="skip")
+
+
+def test_overrides_by_dotted_name():
+    wanted = {"segment.min_pixels": 2000, "segment.min_rows": 32, "ema_alpha": 1.0, "regression": "neighbourhood"}
+    config = ufm_star_config(row("UfM*-MCD", overrides=wanted))
+    assert (config.segment.min_pixels, config.segment.min_rows) == (2000, 32)
+    assert (config.ema_alpha, config.regression) == (1.0, "neighbourhood")
+    others = {name: value for name, value in config.to_dict().items() if name not in (*wanted, "segment")}
+    assert others.items() <= UfMStarConfig(on_bad_frame="skip").to_dict().items()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("segment.min_pixel", 3, "segment.min_pixels"),
+        ("alpha", 1.0, "ema_alpha"),
+        ("segment", {}, "no setting 'segment'"),
+        ("xyz", 3, "eta_occlusion"),
+        ("ema_alpha", 1.5, "must lie in"),
+        ("eta", "much", "must be a number"),
+    ],
+)
+def test_an_override_that_is_none_is_refused(name, value, told):
+    with pytest.raises(ValueError, match=told) as raised:
+        ufm_star_config(row("UfM*-MCD", overrides={name: value}))
+    assert "UfM*-MCD" in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["Ensemble", "UfM-Ensemble-100K"])
+def test_settings_of_ufm_star_go_with_it_only(name):
+    with pytest.raises(ValueError, match="with UfM\\* only"):
+        make_estimator(row(name, overrides={"eta": 0.3}), CPU)
+
+
+def test_fixed_param_takes_the_thresholds_as_they_stand_for_224():
+    fixed, scaled = ufm_star_config(row("UfM*-DepthOnly-fixed-param")), ufm_star_config(row("UfM*-DepthOnly"))
+    pixels = ("min_pixels", "min_rows", "n_check", "occlusion_gap", "sparse")
+
+    def at(config, size):
+        segment = config.segment.scaled_to(size, size)
+        return [getattr(segment, name) for name in pixels]
+
+    assert at(fixed, 518) == at(fixed, 224) == at(scaled, 224)
+    assert at(scaled, 518)[0] == round(200 * (518 / 224) ** 2)
+    # a is a setting like the others: a z^2 / f with the image's f, where scaling keeps a / f.
+    assert fixed.segment.slope(462.5) == pytest.approx(2.4 / 462.5)
+    assert scaled.segment.slope(462.5) == pytest.approx(2.4 / 200)
+    assert fixed == UfMStarConfig(on_bad_frame="skip", segment=fixed.segment)
+
+
+# ---- noise and overlap ----
+
+
+@given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
+def test_rodrigues_formula(w):
+    expected = Rotation.from_rotvec(w).as_matrix()
+    np.testing.assert_allclose(rotation(np.array(w)), expected, atol=1e-14)
+
+
+def test_without_noise_a_pose_stays_itself():
+    assert perturbed(POSE, Setting(seed=5, skip=2), 3) is POSE
+
+
+def noise(setting, indices):
+    """Rotation vectors [rad] about the camera's axes, and translations [m], of the noise on some frames."""
+    poses = [perturbed(POSE, setting, index) for index in indices]
+    turned = [Rotation.from_matrix(POSE[:3, :3].T @ T[:3, :3]).as_rotvec() for T in poses]
+    return np.array(turned), np.array([T[:3, 3] - POSE[:3, 3] for T in poses])
+
+
+def test_noise_has_the_distribution_that_was_asked_for():
+    turned, moved = noise(Setting(rotation_noise=2.0, translation_noise=0.05, seed=3), range(400))
+    for values, deviation in ((turned, math.radians(2)), (moved, 0.05)):
+        assert kstest(values.ravel() / deviation, "norm").pvalue > 0.01
+    together = np.corrcoef(np.hstack([turned, moved]).T) - np.eye(6)
+    assert np.abs(together).max() < 0.2, "axes are independent"
+    assert np.abs(np.corrcoef(turned[:-1, 0], turned[1:, 0])[0, 1]) < 0.2, "frames are independent"
+
+
+def test_noise_is_of_the_frame_and_the_seed_alone():
+    setting = Setting(rotation_noise=1.0, translation_noise=0.1, seed=3)
+    forth, back = noise(setting, range(5)), noise(setting, reversed(range(5)))
+    np.testing.assert_array_equal(forth[0], back[0][::-1])
+    np.testing.assert_array_equal(forth[1], back[1][::-1])
+    other = noise(Setting(rotation_noise=1.0, translation_noise=0.1, seed=4), range(5))
+    assert np.abs(other[0] - forth[0]).min() > 1e-6
+    assert not np.shares_memory(perturbed(POSE, setting, 0), POSE)
+
+
+def test_along_a_sweep_the_noise_only_grows():
+    weak, strong = noise(Setting(rotation_noise=0.5), range(5)), noise(Setting(rotation_noise=5.0), range(5))
+    np.testing.assert_allclose(strong[0], 10 * weak[0], rtol=1e-10)
+    assert not strong[1].any()
+    turned, moved = noise(Setting(rotation_noise=0.5, translation_noise=0.2), range(5))
+    np.testing.assert_allclose(turned, weak[0], atol=1e-14)
+    np.testing.assert_allclose(moved, 2 * noise(Setting(translation_noise=0.1), range(5))[1], rtol=1e-12)
+
+
+@given(st.floats(0, 30), st.floats(0, 2), st.integers(0, 2**31), st.integers(0, 10**6))
+def test_a_noisy_pose_is_a_pose(degrees, metres, seed, index):
+    T = perturbed(POSE, Setting(rotation_noise=degrees, translation_noise=metres, seed=seed), index)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-13)
+    assert np.linalg.det(T[:3, :3]) > 0
+    np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
+
+
+def test_skip_leaves_images_out_between_two():
+    assert [n for n in range(9) if selects(Setting(skip=2), n)] == [0, 3, 6]
+    assert all(selects(Setting(), n) for n in range(9))
+
+
+# ---- networks ----
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return write_networks(tmp_path_factory.mktemp("networks"))
+
+
+@pytest.fixture(scope="module")
+def loaded(files):
+    return {base: base_network(text, samples=4) for base, text in files.items()}
+
+
+def test_a_choice_as_it_is_typed():
+    choice = NetworkChoice.parse("ensemble=trained:a/m0.safetensors,m1.safetensors#3")
+    assert (choice.base, choice.model) == ("ensemble", "trained")
+    assert (choice.weights, choice.spec) == (("a/m0.safetensors", "m1.safetensors#3"), None)
+    with_spec = NetworkChoice.parse("depth_only=onnx:net.onnx,spec.json", "My network")
+    assert (with_spec.weights, with_spec.spec, with_spec.label) == (("net.onnx",), "spec.json", "My network")
+    assert NetworkChoice.parse("depth_only=ground-truth:48x64").size == (48, 64)
+    assert NetworkChoice.parse("depth_only=ground-truth").size is None
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "must be given as"),
+        ("ensemble", "must be given as"),
+        ("=trained:x", "must be given as"),
+        ("ensemble=", "must be given as"),
+        ("ensembles=trained:x", "base must be one of"),
+        ("ensemble=train:x", "model must be one of"),
+        ("ensemble=trained", "needs the file"),
+        ("depth_only=onnx:spec.json", "needs the file"),
+        ("depth_only=onnx:net.onnx,a.json,b.json", "one spec"),
+        ("aleatoric=ground-truth", "goes with depth_only"),
+        ("depth_only=ground-truth:48", "HxW"),
+    ],
+)
+def test_a_choice_that_is_none(text, told):
+    with pytest.raises(ValueError, match=told):
+        NetworkChoice.parse(text)
+
+
+def test_networks_of_every_base(loaded):
+    passes = {base: network.passes for base, network in loaded.items()}
+    assert passes == {
+        "ensemble": 3,
+        "mc_dropout": 4,
+        "batch_ensemble": 3,
+        "evidential": 1,
+        "aleatoric": 1,
+        "depth_only": 1,
+    }
+
+
+def test_turns_of_members_and_of_samples(loaded):
+    assert [loaded["ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
+    assert [loaded["batch_ensemble"].turn(i) for i in range(5)] == [0, 1, 2, 0, 1]
+    assert [loaded["mc_dropout"].turn(i) for i in range(5)] == [0] * 5, "one sample of every image"
+
+
+@pytest.mark.parametrize(
+    ("base", "of", "told"),
+    [
+        ("ensemble", "aleatoric", "two members or more, got 1 network"),
+        ("ensemble", "batch_ensemble", "batch_ensemble="),
+        ("aleatoric", "ensemble", "one network .* got 3 members"),
+        ("aleatoric", "depth_only", "an aleatoric variance, got none"),
+        ("aleatoric", "evidential", "an aleatoric variance alone, got an epistemic one"),
+        ("evidential", "aleatoric", "an aleatoric and an epistemic variance, got an aleatoric one"),
+        ("mc_dropout", "aleatoric", "which samples, got one that does not"),
+        ("batch_ensemble", "ensemble", "a file with a BatchEnsemble"),
+        ("depth_only", "ensemble", "one network"),
+    ],
+)
+def test_a_network_that_is_not_what_its_base_is_about(files, base, of, told):
+    with pytest.raises(ValueError, match=told):
+        base_network(files[of].replace(of, base, 1))
+
+
+def test_an_ensemble_needs_variances(tmp_path):
+    file = write_network(tmp_path / "two.safetensors", "depth", count=2)
+    with pytest.raises(ValueError, match="ensemble needs an aleatoric variance, got none"):
+        base_network(f"ensemble=trained:{file}")
+
+
+def test_members_one_by_one_and_from_several_files(files, loaded, tmp_path):
+    file = files["ensemble"].partition(":")[2]
+    alone = base_network(f"aleatoric=trained:{file}#2")
+    assert alone.identity["files"][0]["member"] == 2
+    together, other = loaded["ensemble"], base_network(f"ensemble=trained:{file}#2,{file}#0")
+    image = torch.rand(1, 3, 32, 64, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        depths = [network(image).depth for network in together.networks]
+        assert torch.equal(alone.networks[0](image).depth, depths[2])
+        assert [torch.equal(n(image).depth, depths[m]) for n, m in zip(other.networks, (2, 0), strict=True)] == [
+            True
+        ] * 2
+    with pytest.raises(ValueError, match="has 3 members, there is no 3"):
+        base_network(f"aleatoric=trained:{file}#3")
+    named = write_network(tmp_path / "run#1.safetensors")
+    assert base_network(f"aleatoric=trained:{named}").identity["files"][0]["member"] is None
+
+
+def test_digests_tell_networks_apart(files, loaded):
+    file = files["mc_dropout"].partition(":")[2]
+    file_of_members = files["ensemble"].partition(":")[2]
+    different = [
+        *loaded.values(),
+        base_network(files["mc_dropout"], samples=3),
+        base_network(f"aleatoric=trained:{file}"),
+        base_network(f"aleatoric=trained:{file_of_members}#1"),
+        base_network(f"aleatoric=trained:{file_of_members}#2"),
+        base_network("depth_only=ground-truth"),
+        base_network("depth_only=ground-truth:32x64"),
+    ]
+    assert len({network.digest for network in different}) == len(different)
+    assert base_network(files["evidential"]).digest == loaded["evidential"].digest
+    as_depth = base_network(files["aleatoric"].replace("aleatoric", "depth_only", 1))
+    assert as_depth.digest == loaded["aleatoric"].digest, "it is the same network"
+
+
+def test_labels(files, loaded):
+    assert loaded["ensemble"].label == "FastDepth"
+    assert base_network("depth_only=ground-truth").label == "ground truth"
+    assert BaseNetwork(NetworkChoice.parse(files["evidential"], "Mine"), CPU).label == "Mine"
+
+
+def test_what_was_run_is_told_in_plain_values(loaded):
+    told = loaded["mc_dropout"].identity
+    assert json.loads(json.dumps(told)) == told
+    assert (told["model"], told["members"], told["samples"]) == ("trained", 1, 4)
+    assert len(told["files"][0]["sha256"]) == 64
+
+
+def test_files_that_are_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        base_network(f"aleatoric=trained:{tmp_path / 'nowhere.safetensors'}")
