@@ -1,0 +1,168 @@
+"""Trajectories of other programs on every layout: by time, by frame number, by place; nothing shifts silently."""
+
+from __future__ import annotations
+
+import layouts
+import numpy as np
+import pytest
+from layouts import quaternion_line
+
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.attach import frame_numbers, in_seconds
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate
+
+FRAMES = 6
+# Frame numbers as the layouts' writers name them.
+NUMBERED = {
+    "scannet": (layouts.write_scannet, range(FRAMES)),
+    "7scenes": (layouts.write_seven_scenes, range(FRAMES)),
+    "tartanair": (layouts.write_tartanair, range(FRAMES)),
+    "generic": (layouts.write_generic, range(7, 7 + FRAMES)),
+}
+MOVED = [T + np.array([[0, 0, 0, 5.0], [0] * 4, [0] * 4, [0] * 4]) for T in layouts.walk(FRAMES)]
+
+
+@pytest.fixture(scope="module", params=NUMBERED)
+def numbered(request, tmp_path_factory):
+    writer, numbers = NUMBERED[request.param]
+    path = writer(tmp_path_factory.mktemp(request.param), frames=FRAMES)[0]
+    options = {"trajectory": path / "slam.txt"}
+    return path, list(numbers), options
+
+
+def write(path, stamps, poses=MOVED, form="{:.6f}"):
+    lines = [f"{form.format(t)} {quaternion_line(T)}" for t, T in zip(stamps, poses, strict=True)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def assert_moved(sequence, indices):
+    assert len(sequence) == len(indices)
+    for entry, i in zip(sequence.entries, indices, strict=True):
+        np.testing.assert_allclose(entry.T_world_cam, MOVED[i], atol=1e-9)
+
+
+def test_by_frame_number(numbered):
+    path, numbers, options = numbered
+    write(options["trajectory"], numbers, form="{}")
+    assert_moved(open_sequence(path, **options), range(FRAMES))
+
+
+def test_one_timestamp_off_skips_that_frame(numbered):
+    path, numbers, options = numbered
+    write(options["trajectory"], [*numbers[:2], 900, *numbers[3:]], form="{}")
+    sequence = open_sequence(path, **options)
+    assert_moved(sequence, [0, 1, 3, 4, 5])
+    assert [frame.reason for frame in sequence.skipped] == ["no pose within 0.1 s around the image"]
+    assert sequence.names_on_disk[2] == sequence.skipped[0].name
+
+
+def test_by_time_with_frames_per_second(numbered):
+    """Number / fps + offset; a generic sequence's images are counted from 0, whatever their names."""
+    path, numbers, options = numbered
+    counted = range(FRAMES) if open_sequence(path).layout == "generic" else numbers
+    write(options["trajectory"], [100 + n / 30 for n in counted], form="{:.9f}")
+    sequence = open_sequence(path, fps=30, time_offset=100, **options)
+    assert_moved(sequence, range(FRAMES))
+    assert sequence[1].timestamp == pytest.approx(100 + counted[1] / 30)
+    write(options["trajectory"], [100 + (n + (0.5 if i == 4 else 0)) / 30 for i, n in enumerate(counted)])
+    sequence = open_sequence(path, fps=30, time_offset=100, max_pose_gap=0.04, **options)
+    assert_moved(sequence, [0, 1, 2, 3, 5])
+    assert len(sequence.skipped) == 1
+
+
+def test_kitti_rows_by_place_and_a_wrong_count(numbered):
+    path, _, options = numbered
+    np.savetxt(options["trajectory"], [T[:3].ravel() for T in MOVED])
+    assert_moved(open_sequence(path, **options), range(FRAMES))
+    np.savetxt(options["trajectory"], [T[:3].ravel() for T in MOVED[:-1]])
+    with pytest.raises(ValueError, match="trajectory has 5 poses for 6 images: without timestamps, there must be one"):
+        open_sequence(path, **options)
+
+
+def test_stamps_that_are_neither(numbered):
+    path, _, options = numbered
+    write(options["trajectory"], [500.5 + i / 30 for i in range(FRAMES)])
+    with pytest.raises(
+        ValueError, match=r"are no frame numbers of the images: pass fps|images lie at 7\.000 to 12\.000"
+    ):
+        open_sequence(path, **options)
+
+
+def test_the_layouts_own_poses_are_not_needed(tmp_path):
+    path, _, _ = layouts.write_scannet(tmp_path)
+    (path / "pose" / "1.txt").write_text("-inf -inf -inf -inf\n" * 4)
+    (path / "pose" / "2.txt").unlink()
+    write(tmp_path / "slam.txt", range(FRAMES), form="{}")
+    assert_moved(open_sequence(path, trajectory=tmp_path / "slam.txt"), range(FRAMES))
+
+
+def test_depth_stays_registered_with_a_trajectory(tmp_path):
+    """7-Scenes: the trajectory is the colour camera's, and depth is warped into that camera as before."""
+    path, _, _ = layouts.write_seven_scenes(tmp_path)
+    write(tmp_path / "slam.txt", range(FRAMES), form="{}")
+    sequence = open_sequence(path, trajectory=tmp_path / "slam.txt")
+    np.testing.assert_array_equal(sequence[3].depth, open_sequence(path)[3].depth)
+    assert_moved(sequence, range(FRAMES))
+
+
+def test_orb_slam3_in_nanoseconds(tmp_path):
+    """EuRoC's format: whole nanoseconds since 1970, of a recording whose images have seconds."""
+    path, _ = layouts.write_tum(tmp_path)
+    text = (path / "rgb.txt").read_text()
+    names = [line.split()[1] for line in text.splitlines()[1:]]
+    seconds = 1403636579.763555 + np.arange(FRAMES) / 30
+    (path / "rgb.txt").write_text("\n".join(f"{t:.6f} {name}" for t, name in zip(seconds, names, strict=True)))
+    write(tmp_path / "f_dataset.txt", seconds * 1e9, form="{:.6f}")
+    sequence = open_sequence(path, trajectory=tmp_path / "f_dataset.txt")
+    assert_moved(sequence, range(FRAMES))
+    write(tmp_path / "f_dataset.txt", (seconds + 0.01) * 1e9, form="{:.6f}")  # interpolated, not taken for the next
+    sequence = open_sequence(path, trajectory=tmp_path / "f_dataset.txt")
+    x = MOVED[1][0, 3] + (MOVED[2][0, 3] - MOVED[1][0, 3]) * 0.7
+    assert sequence.entries[1].T_world_cam[0, 3] == pytest.approx(x, abs=1e-4)
+    assert [frame.name for frame in sequence.skipped] == [sequence.names_on_disk[0]]
+
+
+@pytest.mark.parametrize("unit", [1e9, 1e6, 1e3, 1.0])
+def test_units_are_recognised_by_meeting_the_images(unit):
+    seconds = 20 + np.arange(50) / 10
+    trajectory = Trajectory(seconds * unit, np.tile(np.eye(4), (50, 1, 1)))
+    np.testing.assert_allclose(in_seconds(trajectory, seconds[5:9]).timestamps, seconds)
+
+
+def test_a_trajectory_at_another_time_stays_as_it_is():
+    trajectory = Trajectory(5 + np.arange(50) / 10, np.tile(np.eye(4), (50, 1, 1)))
+    assert in_seconds(trajectory, np.array([0.0, 0.1])).timestamps[0] == 5  # 5 s are no 5 ms
+    single = Trajectory(np.array([5e9]), np.eye(4)[None])
+    assert in_seconds(single, np.array([5.0, 6])).timestamps[0] == 5e9
+
+
+def test_whole_seconds_of_a_video_are_seconds(tmp_path):
+    """A pose each second beside 10 images per second: numbers that some images have are no frame numbers."""
+    poses = layouts.walk(41)
+    images = [np.full((48, 64, 3), i, np.uint8) for i in range(41)]
+    layouts.write_video(tmp_path / "walk.mkv", images, fps=10)
+    write(tmp_path / "slam.txt", range(5), [poses[10 * i] for i in range(5)], form="{}")
+    K = layouts.resized(500, 500, 320, 240, (480, 640))
+    sequence = open_sequence(tmp_path / "walk.mkv", trajectory=tmp_path / "slam.txt", intrinsics=K, max_pose_gap=1.0)
+    assert len(sequence) == 41
+    expected = interpolate(Trajectory(np.arange(5.0), np.stack([poses[10 * i] for i in range(5)])), 1.5, 1.0)
+    np.testing.assert_allclose(sequence.entries[15].T_world_cam, expected, atol=1e-9)
+
+
+def test_frame_numbers_of_names():
+    assert frame_numbers(["frame-000012", "frame-000013"]).tolist() == [12, 13]
+    assert frame_numbers(["000012_left", "7"]).tolist() == [12, 7]
+    assert frame_numbers(["1.5", "2"]) is None
+    assert frame_numbers(["a", "b"]) is None
+    assert frame_numbers([]) is None
+
+
+@pytest.mark.parametrize("layout", ["scannet", "7scenes", "tartanair"])
+def test_frames_per_second_go_with_a_trajectory(tmp_path, layout):
+    path = NUMBERED[layout][0](tmp_path, frames=1)[0]
+    with pytest.raises(ValueError, match=f"layout '{layout}' takes no fps"):
+        open_sequence(path, fps=30)
+    with pytest.raises(FileNotFoundError, match=r"no such file or folder: absent\.txt"):
+        open_sequence(path, trajectory="absent.txt")
+    Options(trajectory="x", fps=30).only_attached(layout)
