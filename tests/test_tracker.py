@@ -1,0 +1,186 @@
+"""Triangulation against closed forms, and the tracker on rendered rooms where every depth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
+from ufmstar_torch.triangulate import triangulate
+
+HERE = np.array([1000.0, -500.0, 20.0])  # far from the world's origin
+K = np.array([[300.0, 0, 160], [0, 310, 120], [0, 0, 1]])
+
+
+def views(count, seed, spread=0.5):
+    """Poses near the origin that look along z, far from the world's origin."""
+    rng = np.random.default_rng(seed)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(0.05 * rng.standard_normal((count, 3))).as_matrix()
+    T[:, :3, 3] = spread * rng.standard_normal((count, 3)) * [1, 1, 0.3] + HERE
+    return T
+
+
+def seen_from(points, T):
+    cam = np.einsum("wji,nwj->nwi", T[:, :3, :3], points[:, None] - T[:, :3, 3])
+    return cam[..., :2] / cam[..., 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+
+
+def world_points(count, seed):
+    rng = np.random.default_rng(seed + 1)
+    return rng.uniform([-1, -1, 2], [1, 1, 6], (count, 3)) + HERE
+
+
+@given(st.integers(0, 10**6), st.integers(2, 10))
+@settings(max_examples=40, deadline=None)
+def test_exact_tracks_give_exact_points(seed, count):
+    T, points = views(count, seed), world_points(7, seed)
+    seen = np.random.default_rng(seed).random((7, count)) < 0.8
+    seen[:, :2] = True
+    baseline = np.linalg.norm(T[0, :3, 3] - T[1, :3, 3])
+    if baseline < 0.1:
+        return
+    found = triangulate(seen_from(points, T), seen, T, K)
+    np.testing.assert_allclose(found.point, points, atol=1e-7)
+    assert found.ahead.all()
+    assert found.error.max() < 1e-6
+    # What a view did not see does not matter.
+    spoiled = np.where(seen[..., None], seen_from(points, T), 1e4)
+    np.testing.assert_allclose(triangulate(spoiled, seen, T, K).point, found.point, atol=1e-9)
+
+
+def test_the_variance_is_what_noise_makes_of_it():
+    T, points = views(6, 3, spread=0.2), np.repeat(world_points(1, 3), 4000, axis=0)
+    rng, sigma = np.random.default_rng(0), 0.3
+    pixel = seen_from(points, T) + sigma * rng.standard_normal((4000, 6, 2))
+    found = triangulate(pixel, np.ones((4000, 6), dtype=bool), T, K)
+    spread = np.cov((found.point - points).T)
+    np.testing.assert_allclose(sigma**2 * found.covariance.mean(0), spread, atol=0.08 * np.trace(spread))
+
+
+def test_two_views_side_by_side_in_closed_form():
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 0.1
+    pixel = np.array([[[160.0, 120.0], [145.0, 120.0]]])  # a disparity of 15 px: z = f b/15
+    found = triangulate(pixel, np.ones((1, 2), dtype=bool), T, K)
+    np.testing.assert_allclose(found.point[0], [0, 0, 300 * 0.1 / 15], atol=1e-9)
+    # dz = z^2/(f b) d(disparity), whose variance is 2 px^2
+    np.testing.assert_allclose(found.covariance[0, 2, 2], 2 * (4 / 30) ** 2, rtol=1e-2)
+
+
+def test_behind_a_camera_is_told():
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 0.1
+    crossed = np.array([[[145.0, 120.0], [160.0, 120.0]]])
+    assert not triangulate(crossed, np.ones((1, 2), dtype=bool), T, K).ahead[0]
+
+
+@pytest.fixture(scope="module")
+def tour():
+    return list(open_sequence("tour:5?frames=14&size=180x240"))
+
+
+def true_depth(frame, pixel):
+    u, v = np.rint(pixel).astype(int).T
+    return frame.depth[v, u]
+
+
+def test_landmarks_of_a_rendered_room_are_where_they_are(tour):
+    tracker, errors, counts, surprises = LandmarkTracker(), [], [], []
+    for frame in tour:
+        found = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        z = true_depth(frame, found.pixel)
+        errors.extend(np.abs(found.depth - z) / z)
+        surprises.extend((found.depth - z) / np.sqrt(found.variance))
+        counts.append(len(z))
+    assert counts[0] == counts[1] == 0, "one view has no parallax"
+    assert np.median(counts[4:]) >= 20
+    assert np.median(errors) < 0.03
+    assert 0.2 < 1.4826 * np.median(np.abs(surprises)) < 2.5, "the variance is of the errors' size"
+
+
+def test_a_standing_and_a_turning_camera_have_no_anchors(tour):
+    frame = tour[3]
+    tracker = LandmarkTracker()
+    for _ in range(6):
+        still = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+    assert len(still.depth) == 0
+    assert still.tracked > 20, "there was something to follow"
+    turning = LandmarkTracker()
+    rng = np.random.default_rng(0)
+    pixel = rng.uniform([20, 20], [220, 160], (50, 2))
+    rays = np.concatenate([pixel, np.ones((50, 1))], 1) @ np.linalg.inv(frame.intrinsics).T
+    for step in range(5):  # the tracker's own memory, filled as a turning camera would
+        R = Rotation.from_rotvec([0, 0.01 * step, 0]).as_matrix()
+        cam = rays @ R
+        turning._view = step
+        turning._poses[step] = np.block([[R, np.zeros((3, 1))], [np.zeros((1, 3)), 1]])
+        turning._pixel[:50, step] = (cam / cam[:, 2:] @ frame.intrinsics.T)[:, :2] + 0.2 * rng.standard_normal((50, 2))
+        turning._seen[:50, step] = True
+    turning._K = frame.intrinsics
+    assert len(turning._landmarks(50).depth) == 0
+
+
+def test_memory_does_not_grow_and_reset_forgets(tour):
+    tracker = LandmarkTracker(TrackerConfig(max_points=40, window=4))
+    sizes = set()
+    first = [tracker.update(f.image, f.T_world_cam, f.intrinsics) for f in tour]
+    for frame in tour:
+        assert len(tracker.update(frame.image, frame.T_world_cam, frame.intrinsics).depth) <= 40
+        sizes.add((tracker._pixel.shape, tracker._seen.shape, tracker._poses.shape))
+    assert len(sizes) == 1
+    tracker.reset()
+    again = [tracker.update(f.image, f.T_world_cam, f.intrinsics) for f in tour]
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a.depth, b.depth)
+
+
+def test_anchors_lie_where_the_depth_map_says(tour):
+    tracker = LandmarkTracker()
+    for frame in tour[:8]:
+        found = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+    small = resize_intrinsics(torch.from_numpy(frame.intrinsics), (180, 240), (90, 120))
+    anchors = found.anchors(frame.intrinsics, small, capacity=300)
+    n = len(found.depth)
+    assert anchors.depth.shape == (1, 300)
+    assert anchors.valid.sum() == n
+    np.testing.assert_allclose(anchors.pixel[0, :n].numpy(), (found.pixel + 0.5) / 2 - 0.5, atol=1e-9)
+    np.testing.assert_array_equal(anchors.variance[0, :n].numpy(), found.variance)
+    with pytest.raises(ValueError, match="capacity must be at least"):
+        found.anchors(frame.intrinsics, small, capacity=n - 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"image": np.zeros((180, 240, 3))}, "image must be uint8"),
+        ({"image": np.zeros((90, 120, 3), dtype=np.uint8)}, r"call reset\(\) first"),
+        ({"T_world_cam": np.full((4, 4), np.nan)}, "T_world_cam must be a finite 4x4"),
+        ({"K": np.zeros((3, 3))}, "K must be a finite 3x3"),
+        ({"K": np.diag([200.0, 200, 1])}, r"call reset\(\) first"),
+    ],
+)
+def test_wrong_input_leaves_the_tracker_as_it_was(tour, change, told):
+    one, other = LandmarkTracker(), LandmarkTracker()
+    for frame in tour[:6]:
+        arguments = {"image": frame.image, "T_world_cam": frame.T_world_cam, "K": frame.intrinsics}
+        expected = one.update(**arguments)
+        if frame.index > 0:
+            with pytest.raises(ValueError, match=told):
+                other.update(**{**arguments, **change})
+        np.testing.assert_array_equal(other.update(**arguments).depth, expected.depth)
+
+
+def test_config_refuses_the_impossible():
+    for values in ({"max_points": 0}, {"window": 1}, {"min_views": 11}, {"pixel_noise": 0.0}, {"spacing": True}):
+        with pytest.raises(ValueError, match="TrackerConfig"):
+            TrackerConfig(**values)
+    with pytest.raises(TypeError):
+        TrackerConfig.from_dict({"windows": 3})
+    assert TrackerConfig.from_dict(TrackerConfig(window=5).to_dict()) == TrackerConfig(window=5)

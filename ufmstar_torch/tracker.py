@@ -1,0 +1,253 @@
+"""Anchors from the images themselves: corners tracked over a few frames and triangulated with the given poses.
+
+Needs OpenCV (``opencv-python-headless``), on the CPU; nothing else of the package does. One tracker a camera. What it
+keeps is of fixed size: a window of views, and the positions of at most ``max_points`` corners in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.triangulate import triangulate
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """How corners are found, followed and believed. Lengths in pixels are the camera's.
+
+    Attributes:
+        max_points: corners followed at a time.
+        window: views kept, and used for triangulation.
+        min_views: of a corner, before it is triangulated.
+        spacing: least distance between two corners [px] in an image 640 wide; it follows the width.
+        back_tolerance: a corner tracked forward and back must return this near to where it was [px].
+        pixel_noise: standard deviation of a tracked position [px], poses' errors included.
+        max_error: largest root mean square reprojection error of a track [px].
+        max_relative_sigma: largest standard deviation of the depth, as a share of it: less parallax is no anchor.
+
+    Raises:
+        ValueError: an impossible value.
+    """
+
+    max_points: int = 300
+    window: int = 10
+    min_views: int = 3
+    spacing: float = 14.0
+    back_tolerance: float = 0.5
+    pixel_noise: float = 1.0
+    max_error: float = 1.5
+    max_relative_sigma: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, least in (("max_points", 1), ("window", 2), ("min_views", 2)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(f"TrackerConfig.{name} must be a whole number of at least {least}, got {value!r}")
+        for name in ("spacing", "back_tolerance", "pixel_noise", "max_error", "max_relative_sigma"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
+                raise ValueError(f"TrackerConfig.{name} must be a positive number, got {value!r}")
+        if self.min_views > self.window:
+            raise ValueError(f"TrackerConfig.min_views must be at most window = {self.window}, got {self.min_views}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The config as plain values."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> TrackerConfig:
+        """Rebuild a config from :meth:`to_dict`; an unknown key is a ``TypeError``."""
+        return cls(**values)
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Triangulated corners as the current image sees them.
+
+    Attributes:
+        pixel: [N, 2] position (u, v) [px].
+        depth: [N] along the optical axis [m].
+        variance: [N] of ``depth`` [m^2].
+        tracked: corners followed into this image, of which these N passed all tests.
+    """
+
+    pixel: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    tracked: int
+
+    def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
+        """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
+
+        Args:
+            K_camera: [3, 3] of the images [px].
+            intrinsics: [3, 3] or [1, 3, 3] of the depth map [px]: the same camera, resized or cropped.
+            capacity: pad to this number, so that shapes stay the same from frame to frame.
+
+        Raises:
+            ValueError: more landmarks than ``capacity``.
+        """
+        n = len(self.depth)
+        room = n if capacity is None else capacity
+        if room < n:
+            raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
+        rays = np.concatenate([self.pixel, np.ones((n, 1))], axis=1) @ np.linalg.inv(K_camera).T
+        pixel = (rays @ intrinsics.detach().reshape(3, 3).double().cpu().numpy().T)[:, :2]
+
+        def padded(values: NDArray) -> Tensor:
+            full = np.zeros((1, room, *values.shape[1:]))
+            full[0, :n] = values
+            return torch.from_numpy(full).to(intrinsics.device)
+
+        valid = torch.arange(room, device=intrinsics.device)[None] < n
+        return Anchors(padded(pixel), padded(self.depth), padded(self.variance), valid)
+
+
+class LandmarkTracker:
+    """Follows corners from image to image and triangulates them.
+
+    Args:
+        config: see :class:`TrackerConfig`; None = its defaults.
+
+    Example::
+
+        tracker = LandmarkTracker()
+        for image, T_world_cam in video:
+            landmarks = tracker.update(image, T_world_cam, K)
+            out = ufm(depth, T_world_cam, K_map, anchors=landmarks.anchors(K, K_map))
+    """
+
+    def __init__(self, config: TrackerConfig | None = None) -> None:
+        self.config = config if config is not None else TrackerConfig()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        n, w = self.config.max_points, self.config.window
+        self._gray: NDArray[np.uint8] | None = None
+        self._K: NDArray[np.float64] | None = None
+        self._pixel = np.zeros((n, w, 2))
+        self._seen = np.zeros((n, w), dtype=bool)
+        self._poses = np.tile(np.eye(4), (w, 1, 1))
+        self._view = -1
+
+    def update(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]) -> Landmarks:
+        """Take in the next image.
+
+        Args:
+            image: [H, W, 3] RGB or [H, W] gray, uint8.
+            T_world_cam: [4, 4] camera-to-world [m].
+            K: [3, 3] of the image [px]; the same for all images.
+
+        Returns:
+            The landmarks that it shows; none before there is parallax.
+
+        Raises:
+            ValueError: wrong shape or dtype, a pose that is not finite, another size or camera than before (call
+                :meth:`reset` first); the tracker is as it was then.
+            ModuleNotFoundError: OpenCV is not installed.
+        """
+        gray, T, K = _checked(image, T_world_cam, K)
+        if self._gray is not None and self._K is not None:
+            if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
+                raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
+            position, alive = self._followed(gray)
+        else:
+            position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)
+        self._view = (self._view + 1) % self.config.window
+        self._seen[~alive] = False  # a lost corner's slot is free
+        self._seen[:, self._view] = alive
+        self._pixel[:, self._view] = position
+        self._poses[self._view] = T
+        tracked = int(alive.sum())
+        self._fill(gray)
+        self._gray, self._K = gray, K
+        return self._landmarks(tracked)
+
+    def _followed(self, gray: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
+        """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
+        import cv2
+
+        before, alive = self._pixel[:, self._view], self._seen[:, self._view].copy()
+        position = before.copy()
+        if not alive.any() or self._gray is None:
+            return position, alive
+        start = before[alive].astype(np.float32)[:, None]
+        options: dict[str, Any] = {"winSize": (15, 15), "maxLevel": 3}
+        forward, found, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, start, np.empty_like(start), **options)
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(gray, self._gray, forward, start.copy(), **options)
+        gap = np.linalg.norm(back - start, axis=-1)[:, 0]
+        height, width = gray.shape
+        u, v = forward[:, 0, 0], forward[:, 0, 1]
+        inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+        fine = (found[:, 0] == 1) & (returned[:, 0] == 1) & (gap < self.config.back_tolerance) & inside
+        position[alive] = forward[:, 0]
+        alive[alive] = fine
+        return position, alive
+
+    def _fill(self, gray: NDArray[np.uint8]) -> None:
+        """New corners in free slots, away from those that are followed."""
+        import cv2
+
+        free = np.flatnonzero(~self._seen[:, self._view])
+        # A detection costs as much as following all corners: not for a few.
+        if len(free) < max(1, self.config.max_points // 5):
+            return
+        spacing = self.config.spacing * gray.shape[1] / 640
+        mask = np.full(gray.shape, 255, dtype=np.uint8)
+        for u, v in self._pixel[self._seen[:, self._view], self._view]:
+            cv2.circle(mask, (round(u), round(v)), round(spacing), 0, -1)
+        corners = cv2.goodFeaturesToTrack(gray, len(free), 0.01, spacing, mask=mask)
+        if corners is None:
+            return
+        slots = free[: len(corners)]
+        self._seen[slots] = False
+        self._seen[slots, self._view] = True
+        self._pixel[slots, self._view] = corners[:, 0]
+
+    def _landmarks(self, tracked: int) -> Landmarks:
+        """What the views in the window say of the corners that the newest one shows."""
+        config = self.config
+        chosen = self._seen[:, self._view] & (self._seen.sum(1) >= config.min_views)
+        if not chosen.any() or self._K is None:
+            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked)
+        found = triangulate(self._pixel[chosen], self._seen[chosen], self._poses, self._K)
+        T = self._poses[self._view]
+        axis = T[:3, 2]
+        depth = (found.point - T[:3, 3]) @ axis
+        # A track that fits worse than the noise allows is as uncertain as it fits.
+        views = self._seen[chosen].sum(1)
+        excess = np.square(found.error) * 2 * views / np.maximum(2 * views - 3, 1) / config.pixel_noise**2
+        variance = config.pixel_noise**2 * np.maximum(excess, 1) * np.einsum("i,nij,j->n", axis, found.covariance, axis)
+        safe = np.maximum(depth, 1e-9)
+        fine = found.ahead & (depth > 0) & (found.error <= config.max_error)
+        fine &= np.sqrt(variance) <= config.max_relative_sigma * safe
+        return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
+
+
+def _checked(image: NDArray, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
+    """Gray image, pose and intrinsics.
+
+    Raises:
+        ValueError: as :meth:`LandmarkTracker.update`.
+    """
+    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+        raise ValueError(f"image must be uint8 [H, W, 3] or [H, W], got {image.dtype} {image.shape}")
+    T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise ValueError("T_world_cam must be a finite 4x4 camera-to-world matrix")
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise ValueError("K must be a finite 3x3 matrix with positive focal lengths [px]")
+    if image.ndim == 2:
+        return np.ascontiguousarray(image), T, K
+    import cv2
+
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8), T, K
