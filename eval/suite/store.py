@@ -261,7 +261,7 @@ def _clear(out: Path) -> None:
                 claim.close()
     for name in (*_REPORT, MANIFEST):
         (out / name).unlink(missing_ok=True)
-    for folder, endings in _REPORT_PARTS.items():
-        for file in (out / folder).glob("*"):
+    for name, endings in _REPORT_PARTS.items():
+        for file in (out / name).glob("*"):
             if file.suffix in endings:
                 file.unlink()
