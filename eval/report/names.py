@@ -100,13 +100,15 @@ SETTINGS = {
     "segment.min_pixels": ("smallest segment", "px"),
     "segment.min_rows": ("smallest segment", "rows"),
     "segment.prune": ("pruning rule", ""),
+    "segment.line_thresh": ("line threshold", "m"),
+    "segment.min_gaussian_length": ("shortest Gaussian", "m"),
     "segment.adaptive_thresh_scale": ("segment threshold a", "px/m"),
 }
 
 
 def setting_name(name: str) -> str:
     """A setting's name for people; the config's own where it has none."""
-    return SETTINGS.get(name, (name.replace("_", " "), ""))[0]
+    return SETTINGS.get(name, (name.rpartition(".")[2].replace("_", " "), ""))[0]
 
 
 def setting_value(name: str, value: Any) -> str:

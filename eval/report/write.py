@@ -12,8 +12,6 @@ from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.report.tables import difference_table, extra_table, is_empty, main_table, sequence_tables
 from ufmstar_torch.eval.report.tidy import write_tidy
 
-PICTURES = ("svg", "png")
-
 
 def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> list[Path]:
     """Write tables, figures and the tidy results of an evaluation, finished or not.
@@ -21,21 +19,25 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> l
     Args:
         out: the folder of ``ufmstar eval``.
         figures: False = tables and results alone, which needs no matplotlib.
-        pictures: "svg" or "png".
+        pictures: kind of the figures, "svg" or "png".
 
     Returns:
         The files, in the order in which they were written.
 
     Raises:
         ResultsError: the folder is no evaluation, or its records do not belong together.
-        ValueError: another kind of pictures.
+        ValueError: another kind of figures, or a file with an example that cannot be read.
         ImportError: matplotlib is missing.
         OSError: a file cannot be written.
     """
-    if pictures not in PICTURES:
-        raise ValueError(f"pictures must be one of {', '.join(PICTURES)}, got {pictures!r}")
     results = load_results(out, with_sums=figures)
-    return [*write_tidy(results), *write_tables(results)]
+    files = [*write_tidy(results), *write_tables(results)]
+    if figures:
+        from ufmstar_torch.eval.report.figures import write_figures
+        from ufmstar_torch.eval.report.pictures import write_pictures
+
+        files += [*write_figures(results, pictures), *write_pictures(results, out)]
+    return files
 
 
 def write_tables(results: Results) -> list[Path]:

@@ -1,0 +1,155 @@
+"""What a method costs, and what it gives for that: time by stage, calibration against memory and time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ufmstar_torch.eval.plots import FAINT, INK
+from ufmstar_torch.eval.report.aggregate import mean_of
+from ufmstar_torch.eval.report.figure_style import TICK, finish, new_figure, short_name, spread_apart, style_of
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, UNCERTAINTY_MS, Quantity
+from ufmstar_torch.eval.suite.method import BASES
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import DEFAULT
+
+NETWORK_COLOUR = "#bdbdbd"
+# The stages of a step of UfM*, from dark to light, as a print in grey needs it.
+STAGES = {
+    "check": "#4d4d4d", "segment": "#0072B2", "correspond": "#009E73", "fuse": "#D55E00", "append": "#CC79A7",
+    "regress": "#E69F00", "average": "#56B4E9",
+}  # fmt: skip
+_LETTERS = {"regress": INK, "average": INK}  # on the light ones
+_BASE_MARKERS = dict(zip(BASES, "osD^vP", strict=True))
+
+
+def draw_latency(results: Results) -> Any | None:
+    """Time per frame of every method: the network's, and what uncertainty takes; None where nothing was timed."""
+    timed = [
+        (row, mean_of(results.of(row), NETWORK_MS), mean_of(results.of(row), UNCERTAINTY_MS)) for row in _rows(results)
+    ]
+    timed = [(row, n, u) for row, n, u in timed if not (math.isnan(n.value) and math.isnan(u.value))]
+    if not timed:
+        return None
+    figure = new_figure(7.6, 1.2 + 0.27 * len(timed), "Time per frame")
+    axes = figure.subplots()
+    longest = 0.0
+    for y, (row, network, uncertainty) in enumerate(timed):
+        n, u = (0.0 if math.isnan(mean.value) else mean.value for mean in (network, uncertainty))
+        axes.barh(y, n, color=NETWORK_COLOUR, height=0.66)
+        axes.barh(y, u, left=n, color=style_of(row.method).colour, height=0.66)
+        axes.text(n + u, y, f"  {n:.1f} + {u:.1f} ms", size=TICK, va="center", color=INK)
+        longest = max(longest, n + u)
+    axes.set_xlim(0, 1.22 * longest)
+    axes.set_ylim(len(timed) - 0.4, -0.6)
+    axes.set_yticks(range(len(timed)), [row.method.name for row, _, _ in timed])
+    finish(axes, x="network (grey) + uncertainty (coloured) [ms], mean over sequences of the median frame")
+    axes.grid(visible=False, axis="y")
+    return figure
+
+
+def draw_stages(results: Results) -> Any | None:
+    """Where UfM*'s time goes, stage by stage, as in the paper's figure; None unless ``efficiency.json`` has it."""
+    measured = results.efficiency or {}
+    staged = [row for row in measured.get("rows", ()) if row.get("stages")]
+    if not staged:
+        return None
+    figure = new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")
+    axes = figure.subplots()
+    for y, row in enumerate(staged):
+        times = {name: row["stages"]["stages"][name]["median_ms"] for name in STAGES if name in row["stages"]["stages"]}
+        _draw_stages(axes, y, times)
+    axes.set_ylim(len(staged) - 0.4, -0.6)
+    names = [f"{row['row']}\n{row['network']}" for row in staged]
+    axes.set_yticks(range(len(staged)), names)
+    finish(axes, x="share of the step [%], medians of its stages")
+    axes.grid(visible=False)
+    axes.set_xlim(0, 100)
+    from matplotlib.patches import Patch
+
+    handles = [Patch(color=colour, label=name) for name, colour in STAGES.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=TICK)
+    return figure
+
+
+def _draw_stages(axes: Any, y: int, times: Mapping[str, float]) -> None:
+    """One bar of shares, with their numbers where there is room, and the sum behind."""
+    total, left = math.fsum(times.values()), 0.0
+    for name, ms in times.items():
+        share = 100 * ms / total
+        axes.barh(y, share, left=left, color=STAGES[name], height=0.62, edgecolor="white", linewidth=0.5)
+        if share >= 6:
+            axes.text(
+                left + share / 2,
+                y,
+                f"{share:.0f} %",
+                size=TICK,
+                color=_LETTERS.get(name, "white"),
+                ha="center",
+                va="center",
+            )
+        left += share
+    axes.text(101, y, f"{total:.1f} ms", size=TICK, color=INK, va="center")
+
+
+def draw_tradeoff(results: Results, dataset: str | None = None) -> Any | None:
+    """ECE_delta against the bytes that are kept between frames, and against the time per frame; None without points."""
+    costs = (STATE, Quantity("ms.total", "time per frame", "", 1, None, "ms"))
+    points = {row: mean_of(results.of(row, dataset), ECE_DELTA) for row in _rows(results)}
+    points = {row: mean for row, mean in points.items() if not math.isnan(mean.value)}
+    panels = [[(row, mean_of(results.of(row, dataset), cost).value) for row in points] for cost in costs]
+    panels = [[(row, 0.0 if math.isnan(x) else x) for row, x in panel] for panel in panels]
+    if not points or not any(x for _, x in panels[0]):
+        return None
+    where = dataset or "all sequences"
+    figure = new_figure(11.0, 4.8, f"Calibration against cost on {where}")
+    for axes, panel, cost in zip(figure.subplots(1, 2), panels, costs, strict=True):
+        for row, x in panel:
+            mean = points[row]
+            half = 0.0 if math.isnan(mean.half) else mean.half
+            axes.errorbar(
+                x, mean.value, yerr=half, color=style_of(row.method).colour, marker=_BASE_MARKERS[row.method.base],
+                markersize=6, linewidth=1, elinewidth=0.5, capsize=0,
+            )  # fmt: skip
+        _cost_axis(axes, [x for _, x in panel])
+        finish(
+            axes,
+            x=f"{'kept between frames' if cost is STATE else cost.name} [{cost.unit}]",
+            y="ECE_δ ↓ (bar: 95 % interval)",
+        )
+        _name_points(axes, [(x, points[row].value, row) for row, x in panel])
+    return figure
+
+
+def _cost_axis(axes: Any, values: Sequence[float]) -> None:
+    """Logarithmic, with room for 0 at the left (methods alone keep nothing)."""
+    positive = [value for value in values if value > 0]
+    if positive and max(positive) > 8 * min(positive):
+        if min(values) > 0:
+            axes.set_xscale("log")
+        else:
+            axes.set_xscale("symlog", linthresh=min(positive) / 2, linscale=0.4)
+    else:
+        axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.set_ylim(bottom=0)
+
+
+def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:
+    """Each point's name in a column right of the panel, apart from each other, with a thin line to its point."""
+    height = axes.get_position().height * axes.figure.get_figheight()
+    high = axes.get_ylim()[1]
+    places = spread_apart([y / high for _, y, _ in points], 1.2 * TICK / 72 / height, 0, 1)
+    for (x, y, row), place in zip(points, places, strict=True):
+        name = f"{BASES[row.method.base][1]} {short_name(row.method)}"
+        axes.annotate(
+            name, (x, y), (1.04, place), textcoords="axes fraction", size=TICK, va="center",
+            color=style_of(row.method).colour,
+            arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.4, "relpos": (0, 0.5), "shrinkB": 3},
+        )  # fmt: skip
+
+
+def _rows(results: Results) -> list[Row]:
+    return [row for row in results.rows if row.setting == DEFAULT]
