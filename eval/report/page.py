@@ -34,8 +34,8 @@ def write_page(results: Results, out: Path, files: Iterable[Path], *, most_bytes
 
     Args:
         results: of the evaluation.
-        out: its folder; the pictures that ``write_pictures`` left in ``OUT/figures`` are found there.
-        files: what else was written; figures among them (SVG or PNG) are shown, the rest is not.
+        out: its folder; the words to the pictures of ``write_pictures`` are found in its ``figures``.
+        files: all that was written; figures and pictures among them (SVG or PNG) are shown, the rest is not.
         most_bytes: of all pictures together; those that do not fit are named instead.
 
     Returns:
@@ -54,9 +54,10 @@ def write_page(results: Results, out: Path, files: Iterable[Path], *, most_bytes
 
 def page(results: Results, folder: Path, files: Iterable[Path], embedder: Embedder) -> str:
     """The report as text; arguments as of ``write_page``."""
-    pictures = read_index(folder)
+    written = list(files)
+    pictures = [picture for picture in read_index(folder) if folder / picture.file in written]
     own = {folder / picture.file for picture in pictures}
-    figures = [file for file in files if file.suffix in (".svg", ".png") and file not in own]
+    figures = [file for file in written if file.suffix in (".svg", ".png") and file not in own]
     efficiency = efficiency_part(results)
     parts = [
         findings_part(results),

@@ -34,7 +34,7 @@ def bullets(texts: Sequence[str], class_: str) -> Markup:
     return tag("ul", [tag("li", typeset(text)) for text in texts], class_=class_)
 
 
-def figure(embedder: Embedder, path: Path, title: str, caption: str, alt: str) -> Markup | None:
+def figure(embedder: Embedder, path: Path, alt: str, title: str = "", caption: str = "") -> Markup | None:
     """A picture with its words; None where there is no room for it.
 
     Raises:
@@ -43,8 +43,8 @@ def figure(embedder: Embedder, path: Path, title: str, caption: str, alt: str) -
     found = embedder.take(path)
     if found is None:
         return None
-    words = tag("figcaption", tag("b", title), f". {caption}" if caption else None)
-    shown = tag("div", image(found, alt), class_="scroll", role="region", aria_label=title, tabindex="0")
+    words = tag("figcaption", tag("b", f"{title}. ") if title else None, caption) if title or caption else None
+    shown = tag("div", image(found, alt), class_="scroll", role="region", aria_label=title or alt, tabindex="0")
     return tag("figure", shown, words)
 
 

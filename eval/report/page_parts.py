@@ -27,19 +27,23 @@ _PICTURES = {
     COMPARE: ("Pictures: UfM* against UfM", ""),
     ROOM: ("Rooms as Gaussians", ""),
 }
-# Of a figure by the first word of its file's name: the part's title, and what it shows.
+# Of a figure by the first word of its file's name: the part's title, and how to read it.
 _FIGURES = {
     "calibration": (
         "Calibration curves",
-        "On the dashed diagonal a method is exactly right. Below it the δ curve is overconfident.",
+        "On the dashed diagonal a method is exactly right; below it the δ curve is overconfident, above it too modest.",
     ),
-    "sweep": ("Sweeps and ablations", "The value of a setting against the figures; bars are 95 % intervals."),
     "error": (
         "NLL by size of the error",
-        "Over the pixels of which the named method is confident, from its smallest errors to its largest. Low at the "
-        "right: large errors are noticed. High at the left: good predictions are distrusted.",
+        "Over the pixels of which the named method is confident, from a row's smallest errors to its largest. Low at "
+        "the right: large errors are noticed. High at the left: good predictions are distrusted.",
     ),
-    "entropy": ("Entropy by data set", "How uncertain each method is, whether or not it should be."),
+    "entropy": (
+        "Entropy by data set",
+        "How uncertain each method is, whether or not it should be: for data on which no calibration can be had.",
+    ),
+    "sweep": ("Sweeps and ablations", "Figures over the values of a setting; bars and bands are 95 % intervals."),
+    "tradeoff": ("Calibration against cost", ""),
     "latency": ("Where the time goes", ""),
 }
 
@@ -83,11 +87,11 @@ def figure_parts(files: Iterable[Path], embedder: Embedder) -> list[Part]:
         by_kind.setdefault(_kind(path), []).append(path)
     parts = []
     for kind in [*(k for k in _FIGURES if k in by_kind), *(k for k in by_kind if k not in _FIGURES)]:
-        title, caption = _FIGURES.get(kind, ("Further diagrams", ""))
-        shown = [figure(embedder, path, _spoken(path), caption, f"{title}: {_spoken(path)}") for path in by_kind[kind]]
-        body = [drawn for drawn in shown if drawn is not None]
+        title, words = _FIGURES.get(kind, ("Further diagrams", ""))
+        drawn = (figure(embedder, path, f"{title}: {_spoken(path)}") for path in by_kind[kind])
+        body = [shown for shown in drawn if shown is not None]
         if body:
-            parts.append(Part(title, body))
+            parts.append(Part(title, [paragraph(words), *body] if words else body))
     return parts
 
 
@@ -99,7 +103,7 @@ def picture_parts(pictures: Sequence[Picture], folder: Path, embedder: Embedder)
     """
     parts = []
     for kind, (title, words) in _PICTURES.items():
-        drawn = (figure(embedder, folder / p.file, p.title, p.caption, p.alt) for p in pictures if p.kind == kind)
+        drawn = (figure(embedder, folder / p.file, p.alt, p.title, p.caption) for p in pictures if p.kind == kind)
         body = [shown for shown in drawn if shown is not None]
         if body:
             parts.append(Part(title, [paragraph(words), *body] if words else body))
