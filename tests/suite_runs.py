@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import shutil
 from dataclasses import replace
 
 import torch
@@ -21,9 +23,10 @@ NAMES = ("ash", "birch", "cedar")
 
 
 def write_rooms(root, names=NAMES, frames=4):
-    """Generic sequences of the same walk."""
-    for name in names:
-        write_generic(root, frames, folder=name)
+    """Generic sequences of the same walk; those that are there are written anew."""
+    first, _ = write_generic(root, frames, folder=names[0])
+    for name in names[1:]:
+        shutil.copytree(first, root / name, dirs_exist_ok=True)
     return root
 
 
@@ -65,7 +68,7 @@ class Stub:
 def _drawn(sequence, row):
     seed = int(hashlib.sha256(f"{sequence.name} {row.slug}".encode()).hexdigest()[:8], 16)
     target = torch.rand(50, generator=torch.Generator().manual_seed(seed)) + 1
-    metrics = SequenceMetrics(with_variance=row.method.name != "DepthOnly")
+    metrics = SequenceMetrics(with_variance=row.method.name != "DepthOnly", ranking=False)
     variance = torch.full_like(target, 0.01) if metrics.with_variance else None
     metrics.update(target + 0.1, variance, target)
     counts = {"selected": len(sequence), "done": len(sequence), "skipped": 0, "reasons": {}}
@@ -83,8 +86,6 @@ def go(job, evaluate=None, *, resume=False, overwrite=False, **conduct):
 
 def kept(out):
     """What does not depend on who computed it, or when: figures, curves and sums by file."""
-    import json
-
     found = {}
     for path in sorted((out / "work").rglob("*.json")):
         values = json.loads(path.read_text())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 
 import pytest
 from suite_runs import TRUTH, Stub, write_rooms
@@ -12,6 +13,7 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.suite import dry_run as dry
 from ufmstar_torch.eval.suite import efficiency_step, launch
 from ufmstar_torch.eval.suite.options import eval_parser, job_from, parse_eval
+from ufmstar_torch.eval.suite.setting import Setting
 from ufmstar_torch.eval.suite.suite import rows_of
 from ufmstar_torch.eval.suite.suites import names
 
@@ -154,7 +156,7 @@ def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_pat
     assert code == 130
     assert "1 sequence" in text
     assert "stopped; --resume goes on" in err
-    assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume"))[0] == 0
+    assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume", "--no-report"))[0] == 0
     assert [name for name, _ in stubbed.asked] == ["ash", "birch", "birch", "cedar"]
 
 
@@ -176,6 +178,7 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
     assert code == 0
     assert "4 rows:" in text
     assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 8 records" in text
+    assert "cache of predictions: up to 0.0 MB" in text  # ground truth is not kept
     assert not (tmp_path / "out").exists()
 
 
@@ -192,8 +195,6 @@ def test_predictions_are_counted_once_however_many_rows_share_them():
     rows = rows_of(["Ensemble", "UfM*-FullEnsemble", "UfM-Ensemble", "UfM*-Ensemble"])
     assert dry.predictions(rows[:1], Members(), 10) == 10
     assert dry.predictions(rows, Members(), 10) == 20
-    from ufmstar_torch.eval.suite.setting import Setting
-
     # Every second frame: images 0, 2, 4, 6, 8 are member 0, 1, 2, 0, 1's; of the default row 0, 2, 1, 0, 2's.
     skipping = rows_of(["UfM*-Ensemble"], Setting(skip=1))
     assert dry.predictions(skipping, Members(), 10) == 5
@@ -232,6 +233,4 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 
 
 def _about_efficiency(job):
-    from dataclasses import replace
-
     return replace(job, suite=replace(job.suite, efficiency=True))

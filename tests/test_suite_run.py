@@ -83,13 +83,8 @@ def test_resume_computes_rows_and_sequences_added_since(rooms, tmp_path):
     go(replace(job, suite=replace(job.suite, rows=rows[:2]), items=job.items[:2]))
     stub = Stub()
     go(job, stub, resume=True)
-    # DepthOnly has no variance, so that it is nobody's reference.
     names = [row.method.name for row in rows]
-    assert stub.asked == [("ash", names[1:]), ("birch", names[1:]), ("cedar", names)] or stub.asked == [
-        ("ash", names[2:]),
-        ("birch", names[2:]),
-        ("cedar", names),
-    ]
+    assert stub.asked == [("ash", names[2:]), ("birch", names[2:]), ("cedar", names)]
     go(job_on(rooms, tmp_path / "whole"))
     assert kept(job.out) == kept(tmp_path / "whole")
 
@@ -193,6 +188,11 @@ def killed_in_birch(job, launch):
     assert child.exitcode == -signal.SIGKILL
 
 
+# Python 3.12 warns of forks beside threads; these processes use none of what is not theirs.
+forks = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+
+
+@forks
 def test_a_kill_loses_the_sequence_in_hand_alone(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
     killed_in_birch(job, "")
@@ -222,13 +222,12 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
     assert len(kept(job.out)) == 6
     stub = Stub()
     go(job, stub, resume=True)
-    assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)] or [
-        name for name, _ in stub.asked
-    ] == ["birch", "cedar"]
+    assert [(name, len(rows)) for name, rows in stub.asked] == [("birch", 2), ("cedar", 4)]
     go(job_on(rooms, tmp_path / "whole"))
     assert kept(job.out) == kept(tmp_path / "whole")
 
 
+@forks
 def test_helpers_do_not_try_again_what_killed_one_of_them(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
     killed_in_birch(job, "together")

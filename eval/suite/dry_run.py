@@ -29,7 +29,8 @@ def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> 
         lines.append(f"left out, without a network: the rows of {', '.join(job.missing_bases)}")
     items = shard.of(job.items)
     lines.append(f"{len(items)} sequences:" if len(items) == len(job.items) else f"{len(items)} of {len(job.items)}:")
-    frames, size, sample = 0, 0, None
+    frames, size = 0, 0
+    sample: dict[str, int] | None = None
     for item in items:
         try:
             sequence = item.open()
@@ -38,11 +39,12 @@ def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> 
             continue
         count = len(range(len(sequence))[job.frames])
         lines.append(f"  {item.label}: {count} frames")
-        sample = sample or _bytes_per_file(sequence, networks)
+        sample = _bytes_per_file(sequence, networks) if sample is None else sample
         frames += count
         size += _cached(job.suite.rows, networks, count, sample or {})
     lines.append(f"{frames} frames, {len(items) * len(job.suite.rows)} records")
-    lines.append(f"cache of predictions: up to {size / 1e6:.1f} MB" if sample else "cache of predictions: unknown")
+    told = "no frame can be read" if sample is None else f"up to {size / 1e6:.1f} MB"
+    lines.append(f"cache of predictions: {told}")
     return "\n".join(lines)
 
 
