@@ -30,7 +30,7 @@ def hold(path: Path, *, wait: float = 0.0) -> BinaryIO | None:
         The open file, which closing releases; None where another process (or an earlier call) holds it.
 
     Raises:
-        OSError: the file cannot be opened.
+        OSError: the file cannot be opened, or the file system has no locks.
     """
     file = path.open("a+b")
     try:
@@ -46,6 +46,10 @@ def hold(path: Path, *, wait: float = 0.0) -> BinaryIO | None:
                 file.close()
                 return None
             time.sleep(_POLL_SECONDS)
+        except OSError as error:
+            file.close()
+            told = f"the file system knows no locks (flock: {error.strerror}), choose a folder on another one"
+            raise OSError(error.errno, told, str(path)) from error
         else:
             return file
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import random
 
@@ -443,6 +444,17 @@ def test_a_lock_is_held_by_one_and_keeps_the_content(tmp_path):
     second.seek(0)
     assert second.read() == b"kept"
     second.close()
+
+
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
+    import fcntl
+
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(OSError, match="the file system knows no locks"):
+        hold(tmp_path / "lock")
 
 
 def test_differences_name_five():
