@@ -5,17 +5,13 @@ Each command imports what it needs when it is called, so that help and errors co
 
 from __future__ import annotations
 
-import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from types import TracebackType
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.run import Progress
-    from ufmstar_torch.eval.suite.run_suite import EvalJob
+    from ufmstar_torch.eval.suite.launch import Ended
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 _HELP = """usage: ufmstar COMMAND ...
@@ -106,6 +102,7 @@ def train(arguments: Sequence[str]) -> int:
         raise UsageError(_one_line(error)) from error
     from lightning.pytorch.utilities import rank_zero_only
 
+    from ufmstar_torch.eval.terminal import stop_signals
     from ufmstar_torch.train.fit import fit, report
     from ufmstar_torch.train.start import missing_start
 
@@ -115,7 +112,7 @@ def train(arguments: Sequence[str]) -> int:
         print(f"ufmstar train: {remark}", file=sys.stderr)
     how = {"resume": options["resume"], "overwrite": options["overwrite"]}
     try:
-        with _stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
+        with stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
             summary = fit(job, asked=stop, command=["ufmstar", "train", *arguments], **how)
     except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
         if options["debug"]:
@@ -235,6 +232,7 @@ def _run(options: Mapping[str, Any]) -> dict[str, Any]:
     from ufmstar_torch.eval.run import run as run_job
     from ufmstar_torch.eval.run_folder import FolderError
     from ufmstar_torch.eval.run_job import job_from
+    from ufmstar_torch.eval.terminal import Bars, stop_signals
 
     try:
         _set_threads(options["threads"])
@@ -244,7 +242,7 @@ def _run(options: Mapping[str, Any]) -> dict[str, Any]:
             traceback.print_exc()
         raise UsageError(_one_line(error)) from error
     try:
-        with _Bars() as bars, _stop_signals(bars.say) as stop:
+        with Bars() as bars, stop_signals(bars.say) as stop:
             return run_job(
                 job,
                 options["out"],
@@ -264,22 +262,26 @@ def _evaluate(options: Mapping[str, Any]) -> int:
         FileNotFoundError, ValueError: it cannot be begun.
         CacheError, ImportError, OSError, RuntimeError: it cannot be finished.
     """
-    from ufmstar_torch.eval.report.load import ResultsError
     from ufmstar_torch.eval.suite.launch import evaluate_suite
-    from ufmstar_torch.eval.suite.outcome import draw, table
+    from ufmstar_torch.eval.terminal import Bars, stop_signals
 
-    with _Bars() as bars, _stop_signals(bars.say) as stop:
+    with Bars() as bars, stop_signals(bars.say) as stop:
         ended = evaluate_suite(options, stop=stop, tell=bars.say, progress=bars.frames)
-    if not ended.tells:
-        return OK if ended.finished else INTERRUPTED
+    if ended.tells:
+        return _tell(ended, draws=not options["no_report"])
+    return OK if ended.finished else INTERRUPTED
+
+
+def _tell(ended: Ended, *, draws: bool) -> int:
+    """The table, the measurements and pictures that belong to it, and what is broken; the exit code."""
+    from ufmstar_torch.eval.suite.outcome import draw, measure, table
+
     print(table(ended))
-    if ended.finished and ended.job.suite.efficiency:
-        _measure(ended.job)
-    if ended.finished and not options["no_report"]:
-        try:
-            print(draw(ended))
-        except (ImportError, ResultsError) as error:
-            print(f"no report: {_one_line(error)}", file=sys.stderr)
+    if ended.finished:
+        for step in (measure, *([draw] if draws else [])):
+            told = step(ended)
+            if told is not None:
+                print(told)
     for label, reason in ended.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
     if ended.stopped:
@@ -287,18 +289,6 @@ def _evaluate(options: Mapping[str, Any]) -> int:
     if ended.failed or not ended.finished:
         return _told("ufmstar eval: not all is there; --resume tries the rest again", FAILED)
     return OK
-
-
-def _measure(job: EvalJob) -> None:
-    """The measurements of a suite about efficiency, unless they are there or cannot be had."""
-    from ufmstar_torch.eval.suite.efficiency_step import EFFICIENCY, measure_job
-
-    if (job.out / EFFICIENCY).exists():
-        return
-    try:
-        measure_job(job)
-    except ValueError as error:
-        print(f"no {EFFICIENCY}: {_one_line(error)}", file=sys.stderr)
 
 
 def _dry_run(options: Mapping[str, Any]) -> int:
@@ -326,6 +316,7 @@ def _demo(options: Any) -> dict[str, Any]:
     """
     from ufmstar_torch.eval.demo import DemoOptions, run_demo
     from ufmstar_torch.eval.demo_folder import DemoError
+    from ufmstar_torch.eval.terminal import Bars
 
     try:
         _set_threads(options.threads)
@@ -340,7 +331,7 @@ def _demo(options: Any) -> dict[str, Any]:
             device=options.device,
             overwrite=options.overwrite,
         )
-        with _Bars() as bars:
+        with Bars() as bars:
             return run_demo(chosen, bars.show)
     except (DemoError, FileNotFoundError) as error:
         raise UsageError(_one_line(error)) from error
@@ -378,82 +369,6 @@ def _set_threads(count: int | None) -> None:
     import torch
 
     torch.set_num_threads(count)
-
-
-class _Bars:
-    """A progress bar for each stage of a run."""
-
-    def __init__(self) -> None:
-        self._bar: Any = None
-        self._stage = ""
-
-    def show(self, progress: Progress) -> None:
-        """Bring the bar of the stage up to date."""
-        from tqdm import tqdm
-
-        if progress.stage != self._stage:
-            self._close()
-            first = progress.done if progress.components is None and progress.stage == "frames" else 0
-            self._bar = tqdm(total=progress.total, initial=first, desc=progress.stage, unit="frame", dynamic_ncols=True)
-            self._stage = progress.stage
-        if progress.components is not None:
-            skipped = {"skipped": progress.skipped} if progress.skipped else {}
-            self._bar.set_postfix(K=progress.components, refresh=False, **skipped)
-        self._bar.update(progress.done - self._bar.n)
-
-    def frames(self, label: str, done: int, total: int) -> None:
-        """Bring the bar of a sequence's frames up to date; it goes when they are done."""
-        from tqdm import tqdm
-
-        if label != self._stage:
-            self._close()
-            self._bar = tqdm(total=total, desc=label, unit="frame", dynamic_ncols=True, leave=False, disable=None)
-            self._stage = label
-        self._bar.update(done - self._bar.n)
-        if done == total:
-            self._close()
-            self._stage = ""
-
-    def say(self, text: str) -> None:
-        """Print a line without breaking the bar."""
-        from tqdm import tqdm
-
-        tqdm.write(text, file=sys.stderr)
-
-    def __enter__(self) -> _Bars:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-
-@contextmanager
-def _stop_signals(say: Callable[[str], None], what: str = "frame") -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM end the run after the frame (or step) in hand; a second one ends it at once.
-
-    Yields:
-        Whether one has come.
-    """
-    received: list[int] = []
-
-    def handle(number: int, _: object) -> None:
-        received.append(number)
-        if len(received) > 1:
-            raise KeyboardInterrupt
-        say(f"stopping after this {what}; once more stops at once")
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _one_line(error: BaseException) -> str:

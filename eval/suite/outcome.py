@@ -20,13 +20,31 @@ def table(ended: Ended) -> str:
     return "\n".join(lines)
 
 
-def draw(ended: Ended) -> str:
-    """Draw tables and figures; a line that says where.
+def measure(ended: Ended) -> str | None:
+    """Measure what a suite about efficiency asks for, unless it is there; a line if it cannot be had.
 
     Raises:
-        ResultsError: nothing is finished.
-        ImportError: matplotlib is missing.
+        OSError: the file cannot be written.
+    """
+    from ufmstar_torch.eval.suite.efficiency_step import EFFICIENCY, measure_job
+
+    if not ended.job.suite.efficiency or (ended.job.out / EFFICIENCY).exists():
+        return None
+    try:
+        measure_job(ended.job)
+    except ValueError as error:
+        return f"no {EFFICIENCY}: {' '.join(str(error).split())}"
+    return None
+
+
+def draw(ended: Ended) -> str:
+    """Draw tables and figures; a line that says where, or why there are none.
+
+    Raises:
         OSError: a file cannot be written.
     """
-    files = write_report(ended.job.out)
+    try:
+        files = write_report(ended.job.out)
+    except (ImportError, ResultsError) as error:
+        return f"no report: {' '.join(str(error).split())}"
     return f"{ended.job.out}: {', '.join(str(file.relative_to(ended.job.out)) for file in files)}"
