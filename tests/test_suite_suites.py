@@ -1,0 +1,216 @@
+"""Suites of ``ufmstar eval``: the paper's tables and figures, ablations, and a user's own."""
+
+from __future__ import annotations
+
+import pytest
+
+from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.eval.suite.method import BASES, MANY
+from ufmstar_torch.eval.suite.setting import DEFAULT, Setting
+from ufmstar_torch.eval.suite.suite import Suite, configured, default_of, rows_of, setting_from, value_of
+from ufmstar_torch.eval.suite.suite_file import suite_from_file
+from ufmstar_torch.eval.suite.suites import ROTATIONS, SKIPS, TRANSLATIONS, names, suite_named
+
+# The rows of the paper's tables, written off.
+TABLE_1 = """
+Ensemble UfM-Ensemble UfM-Ensemble-100K UfM*-Ensemble
+MC-Dropout UfM-MCD UfM-MCD-100K UfM*-MCD
+BatchEnsemble UfM-BatchEnsemble UfM-BatchEnsemble-100K UfM*-BatchEnsemble
+Evidential UfM-Evidential UfM-Evidential-100K UfM*-Evidential
+Aleatoric UfM-Aleatoric UfM-Aleatoric-100K UfM*-Aleatoric"""
+TABLE_2 = """Ensemble UfM-Ensemble UfM-Ensemble-100K UfM*-Ensemble
+Aleatoric UfM-Aleatoric UfM-Aleatoric-100K UfM*-Aleatoric"""
+TABLE_3 = "UfM-DepthOnly-300K UfM*-DepthOnly-fixed-param UfM*-DepthOnly"
+
+
+def methods(name, base=None):
+    return [row.method.name for row in suite_named(name, base).rows]
+
+
+@pytest.mark.parametrize(("number", "rows"), [(1, TABLE_1), (2, TABLE_2), (3, TABLE_3)])
+def test_tables_have_the_papers_rows_in_its_order(number, rows):
+    suite = suite_named(f"paper-table-{number}")
+    assert [row.method.name for row in suite.rows] == rows.split()
+    assert all(row.setting == DEFAULT for row in suite.rows)
+    assert suite.sequences == 100
+    assert suite.efficiency == (number == 2)
+
+
+def test_table_4_has_the_full_rows_and_the_alternating_ones_beside_them():
+    found = methods("paper-table-4")
+    assert [name for name in found if "Full" in name] == [
+        "UfM*-FullEnsemble", "UfM*-FullMCD", "UfM*-FullBatchEnsemble"
+    ]  # fmt: skip
+    assert [name.replace("Full", "") for name in found[::2]] == found[1::2]
+
+
+def test_every_suite_can_be_made_for_every_base():
+    for name in names():
+        assert suite_named(name).name == name
+        if name.startswith(("ablation", "paper-figure")):
+            for base in BASES:
+                if name == "ablation-no-alternating" and base not in MANY:
+                    with pytest.raises(ValueError, match="take turns"):
+                        suite_named(name, base)
+                else:
+                    assert suite_named(name, base).bases == (base,)
+        else:
+            with pytest.raises(ValueError, match="--base goes with figures"):
+                suite_named(name, "depth_only")
+
+
+def test_no_such_suite_and_no_such_base():
+    with pytest.raises(ValueError, match="no suite is called 'paper-table-9': there are paper-table-1"):
+        suite_named("paper-table-9")
+    with pytest.raises(ValueError, match="--base must be one of ensemble"):
+        suite_named("ablations", "resnet")
+
+
+def test_figures_vary_what_the_paper_varies():
+    noise = suite_named("paper-figure-pose-noise")
+    assert [row.method.name for row in noise.rows] == ["Ensemble"] + ["UfM*-Ensemble"] * 11
+    assert tuple(r.setting.rotation_noise for r in noise.rows[1:7]) == ROTATIONS
+    assert (0.0, *(r.setting.translation_noise for r in noise.rows[7:])) == TRANSLATIONS
+    assert noise.sweep == ("rotation_noise", "translation_noise")
+    overlap = suite_named("paper-figure-overlap")
+    # Both are judged on the same frames: the figure shows their difference.
+    assert [(r.setting.skip, r.method.name) for r in overlap.rows] == [
+        (skip, name) for skip in SKIPS for name in ("Aleatoric", "UfM*-Aleatoric")
+    ]
+    assert SKIPS == (0, 1, 2, 4, 8, 16, 32)
+    assert suite_named("paper-figure-entropy").datasets == ("scannet", "tartanair", "kitti360")
+
+
+def test_ablations_hold_every_row_of_every_ablation_once():
+    together = set(suite_named("ablations", "ensemble").rows)
+    single = [n for n in names() if n.startswith("ablation-")] + ["paper-figure-pose-noise", "paper-figure-overlap"]
+    assert together == {row for name in single for row in suite_named(name, "ensemble").rows}
+
+
+def test_segmentation_has_both_readings_of_small_and_both_rules():
+    tried = {configured(row.setting).segment for row in suite_named("ablation-segmentation").rows}
+    own = UfMStarConfig().segment
+    assert {(s.min_pixels, s.min_rows, s.prune) for s in tried} >= {
+        (pixels, rows, rule) for pixels, rows in ((200, 16), (2000, 32)) for rule in ("both", "either")
+    }
+    assert "none" in {s.prune for s in tried}
+    assert {s.line_thresh / own.line_thresh for s in tried} == {0.5, 1, 2}
+    assert {s.min_gaussian_length / own.min_gaussian_length for s in tried} == {0.5, 1, 2}
+
+
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [
+        ("eta", "eta"),
+        ("eta-occlusion", "eta_occlusion"),
+        ("ema-alpha", "ema_alpha"),
+        ("prior", "prior_weight"),
+        ("overlap-weighted", "overlap_weighted"),
+        ("regression", "regression"),
+    ],
+)
+def test_an_ablation_tries_the_default_and_others_against_the_base_alone(name, field):
+    suite = suite_named(f"ablation-{name}", "depth_only")
+    assert suite.rows[:2] == rows_of(["DepthOnly", "UfM*-DepthOnly"])
+    assert field in suite.sweep
+    tried = {value_of(row.setting.to_dict(), field) for row in suite.rows[1:]}
+    assert len(tried) > 1
+    assert getattr(UfMStarConfig(), field) in tried
+
+
+def test_a_setting_that_says_what_ufmstar_does_anyway_is_the_default_row():
+    assert setting_from({"ema_alpha": default_of("ema_alpha"), "skip": 0}) == DEFAULT
+    assert setting_from({"segment.min_pixels": 2000, "skip": 2}).to_dict() == {"segment.min_pixels": 2000, "skip": 2}
+    assert configured(setting_from({"segment.min_pixels": 2000})).segment.min_pixels == 2000
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"etaa": 1}, "no setting is called 'etaa'"),
+        ({"segment": 1}, "is a group"),
+        ({"segment.prune.x": 1}, "no setting is called"),
+        ({"eta": 3}, r"UfMStarConfig.eta must lie in \(0.0, 1.0\], got 3"),
+        ({"skip": -1}, "skip must be a whole number"),
+    ],
+)
+def test_impossible_settings(values, told):
+    with pytest.raises(ValueError, match=told):
+        setting_from(values)
+
+
+def test_impossible_suites():
+    rows = rows_of(["Ensemble"])
+    with pytest.raises(ValueError, match="has a row twice: Ensemble"):
+        Suite("x", "", rows * 2)
+    with pytest.raises(ValueError, match="at least one row"):
+        Suite("x", "", ())
+    with pytest.raises(ValueError, match="small letters"):
+        Suite("../x", "", rows)
+    with pytest.raises(ValueError, match="row Ensemble: eta is of UfM"):
+        Suite("x", "", rows_of(["Ensemble"], Setting({"eta": 0.1})))
+    with pytest.raises(ValueError, match="no setting is called 'etta'"):
+        Suite("x", "", rows, sweep=("etta",))
+
+
+def test_rows_without_a_network_are_left_out():
+    left = suite_named("paper-table-1").with_bases(["aleatoric", "depth_only"])
+    assert left.bases == ("aleatoric",)
+    assert len(left.rows) == 4
+    with pytest.raises(ValueError, match="there are networks of depth_only only"):
+        suite_named("paper-table-1").with_bases(["depth_only"])
+
+
+# ---- TOML ----
+
+TOML = """
+title = "Smoothing"
+sweep = ["ema_alpha"]
+datasets = ["scannet"]
+[[rows]]
+methods = ["Ensemble", "UfM*-Ensemble"]
+[[rows]]
+methods = ["UfM*-Ensemble"]
+setting = { "segment.min_pixels" = 2000 }
+each = { ema_alpha = [0.1, 1.0], skip = [0, 2] }
+"""
+
+
+def test_a_suite_from_a_file(tmp_path):
+    (tmp_path / "my-own.toml").write_text(TOML)
+    suite = suite_from_file(tmp_path / "my-own.toml")
+    assert (suite.name, suite.title, suite.sweep, suite.datasets) == (
+        "my-own",
+        "Smoothing",
+        ("ema_alpha",),
+        ("scannet",),
+    )
+    assert suite.rows[:2] == rows_of(["Ensemble", "UfM*-Ensemble"])
+    assert [row.setting.to_dict() for row in suite.rows[2:]] == [
+        {"ema_alpha": alpha, "segment.min_pixels": 2000, **({"skip": skip} if skip else {})}
+        for alpha in (0.1, 1.0)
+        for skip in (0, 2)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("titel = 'x'", "unknown key 'titel', expected name, title"),
+        ("[[rows]]\nmethods = ['Ensemble']\nsettings = {}", "rows 1: unknown key 'settings', expected methods"),
+        ("[[rows]]\nmethods = ['Ensembel']", "rows 1: no method is called 'Ensembel'"),
+        ("[[rows]]\nmethods = 'Ensemble'", "rows 1: methods must be a list"),
+        ("[[rows]]\nmethods = []", "rows 1: methods must name at least one"),
+        ("[[rows]]\nmethods = [1]", "methods must be a list of words"),
+        ("[[rows]]\nmethods = ['UfM*-MCD']\nsetting = {alpha = 1}", "rows 1: no setting is called 'alpha'"),
+        ("[[rows]]\nmethods = ['UfM*-MCD']\neach = {eta = 0.5}", "each.eta must be a list of values"),
+        ("rows = [1]", "rows 1 must be a table"),
+        ("title = 'x'", "needs at least one row"),
+        ("name = ", "Invalid value"),
+    ],
+)
+def test_mistakes_in_a_file_are_told_with_its_name(tmp_path, text, told):
+    (tmp_path / "bad.toml").write_text(text)
+    with pytest.raises(ValueError, match=told) as raised:
+        suite_from_file(tmp_path / "bad.toml")
+    assert "bad.toml" in str(raised.value)
