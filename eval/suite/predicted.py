@@ -37,7 +37,13 @@ class Predicted:
 
     def to(self, device: torch.device) -> Predicted:
         """With its maps on a device."""
-        return replace(self, **{name: value.to(device) for name, value in self.maps().items()})
+        a, e = self.aleatoric, self.epistemic
+        return replace(
+            self,
+            depth=self.depth.to(device),
+            aleatoric=None if a is None else a.to(device),
+            epistemic=None if e is None else e.to(device),
+        )
 
     def maps(self) -> dict[str, Tensor]:
         """Those of depth, aleatoric and epistemic that are there."""

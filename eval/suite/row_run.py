@@ -133,7 +133,7 @@ class _StateLog:
 
     def __init__(self) -> None:
         self._frames = 0
-        self._sum: Counter[str] = Counter()
+        self._sum: dict[str, float] = {}
         self._most: dict[str, float] = {}
         self._last: dict[str, float] = {}
 
@@ -141,7 +141,7 @@ class _StateLog:
         self._frames += 1
         self._last = dict(state)
         for name, value in state.items():
-            self._sum[name] += value  # type: ignore[assignment]
+            self._sum[name] = self._sum.get(name, 0) + value
             self._most[name] = max(value, self._most.get(name, 0))
 
     def summary(self) -> dict[str, float]:

@@ -1,0 +1,433 @@
+"""Judging many rows in one pass equals judging each by hand, and what is left behind is what was computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from layouts import truncate, write_generic, write_tum
+from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
+
+from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.eval.ground_truth import truth_at
+from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+from ufmstar_torch.eval.sequences import FrameError, open_sequence
+from ufmstar_torch.eval.suite.evaluate import SequenceError, Stopped
+from ufmstar_torch.eval.suite.perturb import perturbed
+from ufmstar_torch.eval.tour.name import open_tour
+from ufmstar_torch.eval.ufm import UfM, UfMConfig
+from ufmstar_torch.models import load_trained
+from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
+from ufmstar_torch.pipeline import combine
+
+SKIP = UfMStarConfig(on_bad_frame="skip")
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def texts(tmp_path_factory):
+    return write_networks(tmp_path_factory.mktemp("networks"))
+
+
+@pytest.fixture(scope="module")
+def networks(texts):
+    return {base: base_network(text, samples=3) for base, text in texts.items()}
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return write_generic(tmp_path_factory.mktemp("evaluate"), frames=FRAMES)[0]
+
+
+@pytest.fixture(scope="module")
+def sequence(path):
+    return open_sequence(path)
+
+
+def frames_of(sequence, indices=None):
+    """(frame, image [1, 3, H, W], pose, K) of the frames."""
+    for index in range(len(sequence)) if indices is None else indices:
+        frame = sequence[index]
+        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+        yield frame, image, torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
+
+
+def judged(sequence, maps, indices=None):
+    """The metrics of (depth, variance, valid, K) by frame, [1, h, w] each."""
+    metrics = None
+    for (frame, *_), (depth, variance, valid, K) in zip(frames_of(sequence, indices), maps, strict=True):
+        truth = torch.from_numpy(truth_at(frame, K[0].numpy(), tuple(depth.shape[-2:])))
+        metrics = metrics or SequenceMetrics(with_variance=variance is not None)
+        metrics.update(depth[0], None if variance is None else variance[0], truth, valid[0])
+    return metrics.compute()
+
+
+def agrees(figures, expected):
+    """Whether all figures are equal but for those of what was left out, which a mask hides by hand."""
+    names = [name for name in expected if "left_out" not in name]
+    assert figures.keys() == expected.keys()
+    for name in names:
+        assert figures[name] == pytest.approx(expected[name], rel=1e-12, abs=1e-12, nan_ok=True), name
+    return True
+
+
+def through(estimator, members, sequence, *, aleatoric=True, poses=None, indices=None):
+    """By hand: member n = i mod N of every image, then UfM or UfM*."""
+    for i, (frame, image, pose, K) in enumerate(frames_of(sequence, indices)):
+        with torch.no_grad():
+            x, K = members[0].preprocess(image, K)
+            p = members[i % len(members)](x)
+        pose = pose if poses is None else torch.from_numpy(poses(frame))[None]
+        a, e = (p.aleatoric_variance, p.epistemic_variance) if aleatoric else (None, None)
+        out = estimator(p.depth, pose, K, a, e)
+        yield p.depth, out.variance, out.valid, K
+
+
+@pytest.mark.parametrize("base", ["ensemble", "batch_ensemble", "evidential", "aleatoric", "depth_only"])
+def test_a_row_equals_a_loop_by_hand(base, texts, networks, sequence):
+    members = load_trained(texts[base].partition(":")[2])
+    behind = {"ensemble": "Ensemble", "batch_ensemble": "BatchEnsemble", "depth_only": "DepthOnly"}
+    name = behind.get(base, base.capitalize())
+    rows = [row(f"UfM*-{name}"), row(f"UfM-{name}"), row(f"UfM-{name}-1K")]
+    found = evaluate(sequence, rows, networks)
+    hands = [UfMStar(SKIP), UfM(UfMConfig(max_points=None)), UfM(UfMConfig(max_points=1000))]
+    for one, estimator in zip(rows, hands, strict=True):
+        by_hand = judged(sequence, through(estimator, members, sequence))
+        assert agrees(found[one.slug].figures, by_hand)
+    ufm, components = hands[2], int(hands[0].mixture.components)
+    assert found[rows[2].slug].state["bytes_end"] == 40 * int(ufm.points) == 40_000
+    assert found[rows[0].slug].state["count_end"] == components
+    assert found[rows[0].slug].state["bytes_end"] == 64 * components
+    assert found[rows[0].slug].state["smoothing_bytes"] == 4 * 32 * 64
+
+
+def test_full_and_alone_put_the_members_together(texts, networks, sequence):
+    members = load_trained(texts["ensemble"].partition(":")[2])
+    rows = [row("Ensemble"), row("UfM*-FullEnsemble"), row("UfM*-Ensemble")]
+    found = evaluate(sequence, rows, networks)
+    full = UncertainDepth(members, SKIP, mode="full", preprocess=members[0].preprocess)
+    alternating = UncertainDepth(members, SKIP, preprocess=members[0].preprocess)
+
+    def piped(pipeline):
+        for _, image, pose, K in frames_of(sequence):
+            out = pipeline(image, pose, K)
+            yield out.depth, out.variance, out.ufm.valid, out.intrinsics
+
+    def alone():
+        for _, image, _, K in frames_of(sequence):
+            with torch.no_grad():
+                x, K = members[0].preprocess(image, K)
+                depths = torch.stack([member(x).depth for member in members])
+                variance = torch.stack([member(x).aleatoric_variance for member in members]).mean(0)
+            variance = variance + (depths.square().mean(0) - depths.mean(0).square())
+            yield depths.mean(0), variance, torch.ones_like(variance, dtype=torch.bool), K
+
+    assert agrees(found["UfMstar-FullEnsemble"].figures, judged(sequence, piped(full)))
+    assert agrees(found["UfMstar-Ensemble"].figures, judged(sequence, piped(alternating)))
+    by_hand = judged(sequence, alone())
+    for name in ("delta1", "rmse", "nll", "ece_delta", "ece_q"):
+        assert found["Ensemble"].figures[name] == pytest.approx(by_hand[name], abs=2e-3)
+    assert found["Ensemble"].state == {}
+    assert found["Ensemble"].figures["delta1"] == found["UfMstar-FullEnsemble"].figures["delta1"]
+
+
+def test_depth_only_ignores_variances(texts, sequence):
+    with_head = base_network(texts["aleatoric"].replace("aleatoric", "depth_only", 1))
+    rows = [row("DepthOnly"), row("UfM*-DepthOnly")]
+    found = evaluate(sequence, rows, {"depth_only": with_head})
+    assert {"delta1", "rmse", "abs_rel"} < found["DepthOnly"].figures.keys()
+    assert not {"nll", "ece_delta", "spearman"} & found["DepthOnly"].figures.keys(), "it has no variance"
+    assert list(found["DepthOnly"].sums) == ["metrics"]
+    members = load_trained(texts["aleatoric"].partition(":")[2])
+    by_hand = judged(sequence, through(UfMStar(SKIP), members, sequence, aleatoric=False))
+    assert agrees(found["UfMstar-DepthOnly"].figures, by_hand)
+
+
+def test_ground_truth_as_prediction_shows_the_floor(sequence):
+    floor = {"depth_only": base_network("depth_only=ground-truth:24x32")}
+    found = evaluate(sequence, [row("UfM*-DepthOnly"), row("DepthOnly")], floor)
+    assert found["DepthOnly"].figures["rmse"] == 0
+    assert found["DepthOnly"].figures["delta1"] == 1
+    assert found["UfMstar-DepthOnly"].figures["rmse"] == 0
+    assert np.isfinite(found["UfMstar-DepthOnly"].figures["nll"])
+    assert found["UfMstar-DepthOnly"].state["smoothing_bytes"] == 4 * 24 * 32
+    assert "network" not in found["UfMstar-DepthOnly"].ms, "no network ran"
+
+
+# ---- MC-Dropout ----
+
+
+def test_samples_depend_on_the_frame_and_their_number_alone(texts, networks, sequence):
+    network = networks["mc_dropout"]
+    frames = [sequence[i] for i in range(3)]
+    asked = [(2, 1), (0, 0), (1, 2), (0, 1), (2, 0), (2, 1), (0, 0)]
+    first = {key: network.one(frames[key[0]], key[1]).depth for key in asked}
+    other = base_network(texts["mc_dropout"], samples=3)
+    for key in reversed(asked):
+        assert torch.equal(other.one(frames[key[0]], key[1]).depth, first[key])
+    assert not torch.equal(first[0, 0], first[0, 1])
+    same_image = replace(frames[0], index=1)
+    assert not torch.equal(network.one(same_image, 0).depth, first[0, 0]), "each frame has its own draw"
+
+
+def test_mc_dropout_equals_seeded_passes_by_hand(texts, networks, sequence):
+    found = evaluate(sequence, [row("UfM*-MCD"), row("MC-Dropout"), row("UfM*-FullMCD")], networks)
+    [member] = load_trained(texts["mc_dropout"].partition(":")[2])
+    generator = torch.Generator()
+    set_sampling(member, True, generator)
+
+    def passes(frame, x, samples):
+        for n in range(samples):
+            generator.manual_seed(frame.index + 1_000_003 * n)
+            yield member(x)
+
+    def by_hand(samples, ufm):
+        for frame, image, pose, K in frames_of(sequence):
+            with torch.no_grad():
+                x, K = member.preprocess(image, K)
+                p = combine(list(passes(frame, x, samples))) if samples > 1 else next(passes(frame, x, 1))
+            if ufm is None:
+                yield p.depth, p.variance, torch.ones_like(p.depth, dtype=torch.bool), K
+            else:
+                out = ufm(p.depth, pose, K, p.aleatoric_variance, p.epistemic_variance)
+                yield p.depth, out.variance, out.valid, K
+
+    assert agrees(found["UfMstar-MCD"].figures, judged(sequence, by_hand(1, UfMStar(SKIP))))
+    assert agrees(found["MC-Dropout"].figures, judged(sequence, by_hand(3, None)))
+    assert agrees(found["UfMstar-FullMCD"].figures, judged(sequence, by_hand(3, UfMStar(SKIP))))
+
+
+def test_a_network_that_samples_stops_doing_so_for_other_bases(texts, sequence):
+    text = texts["mc_dropout"].replace("mc_dropout", "aleatoric", 1)
+    network = base_network(text)
+    assert not isinstance(network.networks[0], MonteCarloDropout)
+    assert torch.equal(network.one(sequence[0], 0).depth, network.one(sequence[0], 0).depth)
+
+
+# ---- one pass ----
+
+
+def test_rows_do_not_depend_on_each_other(networks, sequence):
+    rows = [
+        row("Ensemble"),
+        row("UfM*-Ensemble"),
+        row("UfM*-Ensemble", overrides={"ema_alpha": 1.0}),
+        row("UfM*-Ensemble", skip=1),
+        row("UfM-Ensemble-100K"),
+        row("UfM*-MCD", rotation_noise=1.0),
+        row("Evidential"),
+    ]
+    together = evaluate(sequence, rows, networks)
+    for one in rows:
+        alone = evaluate(sequence, [one], networks)[one.slug]
+        assert alone.figures == together[one.slug].figures
+        assert alone.state == together[one.slug].state
+    reversed_ = evaluate(sequence, rows[::-1], networks)
+    assert all(same(reversed_[slug], result) for slug, result in together.items())
+
+
+def test_every_inference_is_made_once(networks, sequence, monkeypatch):
+    calls = []
+
+    def counted(base, one):
+        def call(frame, n):
+            calls.append((base, frame.index, n))
+            return one(frame, n)
+
+        return call
+
+    for base, network in networks.items():
+        monkeypatch.setattr(network, "one", counted(base, network.one))
+    names = ["Ensemble", "UfM*-Ensemble", "UfM-Ensemble", "UfM*-FullEnsemble", "UfM*-MCD", "UfM-MCD", "Aleatoric"]
+    evaluate(sequence, [*map(row, names), row("UfM*-Ensemble", skip=1)], networks)
+    expected = [("ensemble", i, n) for i in range(FRAMES) for n in range(3)]
+    expected += [(base, i, 0) for base in ("mc_dropout", "aleatoric") for i in range(FRAMES)]
+    assert sorted(calls) == sorted(expected)
+
+
+def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
+    members = load_trained(texts["ensemble"].partition(":")[2])
+    one, two = row("UfM*-Ensemble", skip=1), row("UfM*-Ensemble")
+    found = evaluate(sequence, [one, two], networks, limit=slice(1, None))
+    assert (found[one.slug].frames["done"], found[two.slug].frames["done"]) == (2, 4)
+    skipping = judged(sequence, through(UfMStar(SKIP), members, sequence, indices=[1, 3]), [1, 3])
+    assert agrees(found[one.slug].figures, skipping)
+    every = judged(sequence, through(UfMStar(SKIP), members, sequence, indices=[1, 2, 3, 4]), [1, 2, 3, 4])
+    assert agrees(found[two.slug].figures, every)
+
+
+def test_noise_reaches_the_estimator_and_nothing_else(texts, networks, sequence):
+    noisy = row("UfM*-Aleatoric", rotation_noise=3.0, translation_noise=0.1, seed=2)
+    found = evaluate(sequence, [noisy, row("UfM*-Aleatoric"), row("Aleatoric")], networks)
+    members = load_trained(texts["aleatoric"].partition(":")[2])
+
+    def poses(frame):
+        return perturbed(frame.T_world_cam, noisy.setting, frame.index)
+
+    by_hand = judged(sequence, through(UfMStar(SKIP), members, sequence, poses=poses))
+    assert agrees(found[noisy.slug].figures, by_hand)
+    assert found[noisy.slug].figures["rmse"] == found["UfMstar-Aleatoric"].figures["rmse"]
+    assert found[noisy.slug].figures["nll"] != found["UfMstar-Aleatoric"].figures["nll"]
+
+
+def test_a_tour(networks):
+    tour = open_tour("tour:3?frames=3&size=32x48")
+    found = evaluate(tour, [row("UfM*-DepthOnly"), row("UfM-DepthOnly-100K")], networks)
+    assert all(result.frames["judged"] == 3 for result in found.values())
+    assert all(np.isfinite(result.figures["ece_delta"]) for result in found.values())
+
+
+# ---- confident pixels ----
+
+
+def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(networks, sequence):
+    rows = [row("UfM*-Aleatoric"), row("UfM-Aleatoric"), row("UfM-Aleatoric-1K"), row("Aleatoric"), row("Evidential")]
+    found = evaluate(sequence, rows, networks, confident=0.3)
+    expected, groups = NLLByError(), {name: [] for name in ("Aleatoric", "UfM-Aleatoric-1K")}
+    assert set(found["UfMstar-Aleatoric"].sums) == {"metrics", *(f"nll_by_error:{n}" for n in groups)}
+    assert set(found["Evidential"].sums) == {"metrics", "nll_by_error:Evidential"}
+    network = networks["aleatoric"]
+    for frame, *_ in frames_of(sequence):
+        p = network.one(frame, 0)
+        truth = torch.from_numpy(truth_at(frame, p.intrinsics.numpy(), p.size))
+        judged_here = (truth > 0) & (p.depth > 0)
+        order = p.aleatoric[judged_here].sort().values
+        mask = judged_here & (p.aleatoric <= order[int(np.ceil(0.3 * len(order))) - 1])
+        assert 0.3 <= mask.sum() / judged_here.sum() < 0.31
+        expected.update(p.depth, p.aleatoric, truth, mask)
+    curves = found["Aleatoric"].curves
+    for name, curve in expected.compute().items():
+        assert curves[f"{name}:Aleatoric"] == pytest.approx(curve.tolist(), rel=1e-12, nan_ok=True)
+    # The same pixels for all: with the same depth their errors are the same.
+    key = "error_by_error:Aleatoric"
+    assert found["UfMstar-Aleatoric"].curves[key] == pytest.approx(curves[key], rel=1e-12)
+    assert found["UfM-Aleatoric"].curves[key] == pytest.approx(curves[key], rel=1e-12)
+    assert found["UfMstar-Aleatoric"].curves["nll_by_error:Aleatoric"] != curves["nll_by_error:Aleatoric"]
+
+
+def test_a_row_is_compared_with_references_on_its_own_frames(networks, sequence):
+    rows = [row("Ensemble"), row("UfM*-Ensemble", skip=1), row("UfM-Ensemble-100K", skip=1), row("UfM*-FullEnsemble")]
+    found = evaluate(sequence, rows, networks)
+    assert set(found[rows[1].slug].sums) == {"metrics", "nll_by_error:UfM-Ensemble-100K"}
+    assert set(found[rows[3].slug].sums) == {"metrics", "nll_by_error:Ensemble"}
+
+
+# ---- what is left out ----
+
+
+def test_broken_frames_are_left_out_by_all_rows_alike(networks, tmp_path):
+    path, _ = write_tum(tmp_path, frames=7)
+    truncate(path / "rgb" / f"{10 + 2 / 30:.6f}.png")
+    (path / "depth" / f"{10 + 4 / 30 + 0.005:.6f}.png").write_bytes(b"")
+    sequence = open_sequence(path)
+    names = ["Ensemble", "UfM*-Ensemble", "DepthOnly", "UfM-DepthOnly"]
+    found = evaluate(sequence, [row(name) for name in names], networks)
+    frames = [result.frames for result in found.values()]
+    assert all(counts == frames[0] for counts in frames)
+    assert (frames[0]["selected"], frames[0]["done"], frames[0]["judged"], frames[0]["skipped"]) == (7, 5, 5, 2)
+    assert sum(frames[0]["reasons"].values()) == 2
+    kept = [0, 1, 3, 5, 6]
+    good = replace(sequence, entries=tuple(sequence.entries[i] for i in kept))
+    clean = evaluate(good, [row(name) for name in names], networks)
+    for slug, result in clean.items():
+        assert result.figures == found[slug].figures, "as if they had never been there, turns included"
+
+
+def test_poses_that_are_none_are_left_out(networks, sequence):
+    stretched = sequence.entries[2].T_world_cam.copy()
+    stretched[:3, :3] *= 1.5
+    broken = replace(sequence.entries[2], T_world_cam=stretched)
+    bad = replace(sequence, entries=(*sequence.entries[:2], broken, *sequence.entries[3:]))
+    found = evaluate(bad, [row("Aleatoric"), row("UfM*-Aleatoric"), row("UfM-Aleatoric")], networks)
+    for result in found.values():
+        assert (result.frames["done"], result.frames["skipped"]) == (FRAMES - 1, 1)
+        assert "not orthonormal" in next(iter(result.frames["reasons"]))
+
+
+def test_frames_without_ground_truth_are_used_but_not_judged(networks, sequence):
+    entries = tuple(replace(e, load_depth=None) if i in (1, 2) else e for i, e in enumerate(sequence.entries))
+    found = evaluate(replace(sequence, entries=entries), [row("UfM*-Aleatoric"), row("Aleatoric")], networks)
+    counts = found["Aleatoric"].frames
+    assert (counts["done"], counts["judged"], counts["skipped"]) == (FRAMES, FRAMES - 2, 0)
+    both = {"aleatoric": networks["aleatoric"], "depth_only": base_network("depth_only=ground-truth:32x64")}
+    rows = [row("Aleatoric"), row("UfM*-DepthOnly")]
+    for result in evaluate(replace(sequence, entries=entries), rows, both).values():
+        assert result.frames["reasons"] == {"no depth map": 2}
+
+
+def test_pixels_that_a_row_leaves_out_are_counted(sequence):
+    holes = base_network("depth_only=ground-truth:48x64")
+    whole = holes.one
+
+    def with_holes(frame, n):
+        p = whole(frame, n)
+        depth = p.depth.clone()
+        depth[:12], depth[12:24] = torch.nan, 0.0
+        return replace(p, depth=depth)
+
+    holes.one = with_holes
+    found = evaluate(sequence, [row("DepthOnly"), row("UfM*-DepthOnly")], {"depth_only": holes})
+    for result in found.values():
+        assert result.figures["left_out_share"] == 0.5
+        assert result.figures["pixels"] == FRAMES * 24 * 64
+    assert found["UfMstar-DepthOnly"].figures["nll_left_out_share"] >= 0.5
+
+
+@pytest.mark.parametrize("trouble", ["nothing readable", "no truth", "no frames"])
+def test_a_sequence_that_cannot_be_used(networks, sequence, trouble):
+    def fail():
+        raise FrameError("x.png", "truncated")
+
+    entries, limit = sequence.entries, slice(None)
+    if trouble == "nothing readable":
+        entries = tuple(replace(entry, load_image=fail) for entry in entries)
+    elif trouble == "no truth":
+        entries = tuple(replace(entry, load_depth=None) for entry in entries)
+    else:
+        limit = slice(40, None)
+    told = {"nothing readable": "5 x truncated", "no truth": "no frame has ground truth", "no frames": "selected of 5"}
+    with pytest.raises(SequenceError, match=told[trouble]) as raised:
+        evaluate(replace(sequence, entries=entries), [row("Aleatoric")], networks, limit=limit)
+    assert raised.value.reason == str(raised.value)
+
+
+def test_asked_to_stop_it_stops_between_frames(networks, sequence):
+    seen = []
+    stop = SimpleNamespace(asked=0)
+
+    def asked():
+        stop.asked += 1
+        return stop.asked > 3
+
+    with pytest.raises(Stopped):
+        evaluate(sequence, [row("Aleatoric")], networks, stop=asked, progress=lambda *at: seen.append(at))
+    assert seen == [(n, FRAMES) for n in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "told"),
+    [
+        ([], {}, "one or more"),
+        ([row("Aleatoric"), row("Aleatoric", seed=4)], {}, "different ones"),
+        ([row("Ensemble"), row("Evidential")], {}, "ensemble, evidential is missing"),
+        ([row("Aleatoric")], {"confident": 0.0}, "confident"),
+        ([row("UfM*-Aleatoric", overrides={"etaa": 0.5})], {}, "etaa"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused(networks, sequence, rows, options, told):
+    with pytest.raises(ValueError, match=told):
+        evaluate(sequence, rows, {"aleatoric": networks["aleatoric"]}, **options)
+
+
+def test_sums_hold_all_that_the_figures_are_made_of(networks, sequence):
+    found = evaluate(sequence, [row("UfM*-Aleatoric"), row("Aleatoric")], networks)["UfMstar-Aleatoric"]
+    again = SequenceMetrics()
+    again.load_state_dict(found.sums["metrics"])
+    assert repr(again.compute()) == repr(found.figures)
+    binned = NLLByError()
+    binned.load_state_dict(found.sums["nll_by_error:Aleatoric"])
+    assert repr(binned.compute()["nll_by_error"].tolist()) == repr(found.curves["nll_by_error:Aleatoric"])
+    assert all(value.device == CPU for sums in found.sums.values() for value in sums.values())
