@@ -1,0 +1,264 @@
+"""ufmstar data check: right about good recordings, and about what people do to them; docs/data.md runs."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import layouts
+import layouts_more
+import numpy as np
+import pytest
+from shared_data import require_shared
+
+from ufmstar_torch.cli import main
+from ufmstar_torch.eval.data_check import check_data
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
+from ufmstar_torch.eval.sequences.register import register_depth
+from ufmstar_torch.eval.tour.name import open_tour
+from ufmstar_torch.eval.tour.sequence import export_tour
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "data.md"
+SIZE = (120, 160)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A tour on disk: float depth [m], KITTI rows."""
+    return export_tour(open_tour("tour:7?frames=24&size=120x160&sensor=0"), tmp_path_factory.mktemp("tour") / "home")
+
+
+@pytest.fixture
+def tour(exported, tmp_path):
+    """A copy that may be spoiled."""
+    return shutil.copytree(exported, tmp_path / "home")
+
+
+def spoil_poses(path, convert):
+    rows = np.loadtxt(path / "poses.txt").reshape(-1, 3, 4)
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3] = rows
+    np.savetxt(path / "poses.txt", convert(T)[:, :3].reshape(-1, 12))
+
+
+def spoil_depth(path, convert):
+    for file in (path / "depth").iterdir():
+        np.save(file, convert(np.load(file)).astype(np.float32))
+
+
+def command(capsys, *words):
+    """Exit code and what was printed."""
+    code = main(["data", "check", *map(str, words)])
+    captured = capsys.readouterr()
+    return code, captured.out + captured.err
+
+
+def test_a_good_export_is_fine(exported, capsys):
+    code, out = command(capsys, exported, "--pairs", 2)
+    assert code == 0
+    assert out.splitlines()[0] == "home: layout generic, 24 of 24 frames usable"
+    assert re.search(r"images +160x120, fx 114\.3 fy 114\.3 cx 79\.5 cy 59\.5 px", out)
+    assert re.search(r"depth +160x120, \d\.\d+ to \d\.\d+ m, 100% of the pixels", out)
+    assert re.search(r"geometry +depth warped [1235] frames? on off by 0\.\d% \(2 pairs\)", out)
+    assert out.splitlines()[-1] == "fine"
+
+
+@pytest.mark.parametrize("written", ["world-to-camera", "ned", "opengl"])
+def test_other_conventions_are_named_with_their_option(tour, capsys, written):
+    """Poses as another program writes them; with the option that the check suggests, all is fine."""
+    inverse = {
+        "world-to-camera": np.linalg.inv,
+        "ned": lambda T: T @ np.linalg.inv(layouts.NED_FROM_CAMERA),
+        "opengl": lambda T: T @ np.diag([1.0, -1, -1, 1]),
+    }
+    spoil_poses(tour, inverse[written])
+    code, out = command(capsys, tour, "--pairs", 2)
+    assert code == 1
+    assert f"the poses look {CONVENTIONS[written].told}" in out
+    assert re.findall(r"remedy +(.*)", out) == [f"--poses {written}"]
+    assert out.splitlines()[-1] == "1 problem"
+    code, out = command(capsys, tour, "--pairs", 2, "--poses", written)
+    assert (code, out.splitlines()[-1]) == (0, "fine")
+
+
+def test_depth_ten_times_too_large(tour, capsys):
+    spoil_depth(tour, lambda depth: 10 * depth)
+    code, out = command(capsys, tour, "--pairs", 2)
+    assert code == 1
+    assert "depth looks too large: times 0.1 fits" in out or "depth looks too large: times 0.0" in out
+    assert re.findall(r"remedy +(.*)", out) == ["--depth-scale 0.1"]
+    assert command(capsys, tour, "--pairs", 2, "--depth-scale", 0.1)[0] == 0
+
+
+def test_depth_in_smaller_units_than_metres_can_say(tour):
+    """Depth a tenth as large would need 10 m per unit; positions are what can be changed."""
+    spoil_depth(tour, lambda depth: depth / 10)
+    found = check_data(tour, pairs=2)
+    assert found.remedies[0].startswith("divide the positions of the poses by ")
+    assert float(found.remedies[0].split()[-1]) == pytest.approx(10, rel=0.1)
+
+
+def test_a_trajectory_without_scale(tour):
+    spoil_poses(tour, lambda T: np.concatenate([T[..., :3], T[..., 3:] * [[0.2], [0.2], [0.2], [1]]], axis=-1))
+    found = check_data(tour, pairs=2, trajectory="poses.txt")
+    assert "depth looks too large" in found.problems[0]
+    assert found.remedies[0].startswith("a single camera's trajectory has no scale: divide the positions")
+    assert float(found.remedies[0].split()[-1]) == pytest.approx(0.2, rel=0.1)
+
+
+def test_unregistered_depth(tour):
+    """Depth as a camera 8 cm beside the colour camera, with another focal length, sees it."""
+    K = np.loadtxt(tour / "K.txt")
+    K_depth = K.copy()
+    K_depth[0, 0], K_depth[1, 1] = 1.12 * K[0, 0], 1.12 * K[1, 1]
+    T = np.eye(4)
+    T[0, 3] = 0.08
+    spoil_depth(tour, lambda depth: register_depth(depth, K, K_depth, T, SIZE))
+    found = check_data(tour, pairs=2)
+    assert any("not registered to the images" in problem for problem in found.problems)
+    assert any("--depth-intrinsics" in remedy for remedy in found.remedies)
+
+
+def test_broken_and_missing_frames_are_told(tour, capsys):
+    layouts.truncate(tour / "images" / "000000.png")
+    lines = (tour / "poses.txt").read_text().splitlines()
+    lines[5] = " ".join(["nan"] * 12)
+    (tour / "poses.txt").write_text("\n".join(lines))
+    code, out = command(capsys, tour, "--pairs", 3)
+    assert code == 1
+    assert "23 of 24 frames usable" in out
+    assert re.search(r"skipped +1 x non-finite pose", out)
+    assert re.search(r"PROBLEM +1 of the frames looked at cannot be decoded, first .*000000\.png", out)
+
+
+def test_a_sequence_that_cannot_be_opened(tour, capsys):
+    (tour / "poses.txt").write_text("\n".join((tour / "poses.txt").read_text().splitlines()[:-1]))
+    code, out = command(capsys, tour)
+    assert code == 1
+    assert "cannot be opened: trajectory has 23 poses for 24 images" in out
+
+
+def test_few_usable_frames(tour):
+    T = [np.eye(4)[:3].ravel()] * 8
+    np.savetxt(tour / "slam.txt", [[100 + i, *row] for i, row in enumerate(T)])
+    found = check_data(tour, trajectory="slam.txt", fps=1, time_offset=100, pairs=1)
+    assert found.problems[0] == "only 8 of 24 frames are usable"
+    assert found.skipped == {"no pose within 0.1 s around the image": 16}
+
+
+def test_several_sequences_give_a_line_each(exported, tmp_path, capsys):
+    shutil.copytree(exported, tmp_path / "good" / "a")
+    shutil.copytree(exported, tmp_path / "bad" / "b")
+    spoil_poses(tmp_path / "bad" / "b", np.linalg.inv)
+    code, out = command(capsys, tmp_path, "--pairs", 2)
+    assert code == 1
+    lines = out.splitlines()
+    assert lines[0].startswith("PROBLEM  bad__b: the poses look world-to-camera (inverted)")
+    assert lines[0].endswith("-> --poses world-to-camera")
+    assert re.fullmatch(r"fine     good__a: generic, 24 of 24 frames, depth fits to 0\.\d%", lines[1])
+    assert lines[2] == "1 of 2 sequences are fine"
+    code, out = command(capsys, tmp_path, "--pairs", 2, "--json")
+    reports = json.loads(out)
+    assert [(report["name"], report["ok"]) for report in reports] == [("bad__b", False), ("good__a", True)]
+    assert reports[1]["checked"]["poses"] == "camera-to-world"
+
+
+def test_wrong_usage(tmp_path, exported, capsys):
+    for words, told in (
+        ((tmp_path / "absent",), "no such file or folder"),
+        ((tmp_path,), "has no known layout, and nothing below it has"),
+        ((exported, "--depth-scale", 1000), "depth_scale is in metres per unit"),
+        ((exported, "--poses", "upside-down"), "poses must be one of camera-to-world"),
+        ((exported, "--layout", "kitti"), "layout must be one of auto"),
+        ((exported, "--pairs", 0), "pairs must be at least 1"),
+        ((exported, "--intrinsics", 1, 2, 3), "--intrinsics must be a file, or the four numbers"),
+    ):
+        code, out = command(capsys, *words)
+        assert code == 2
+        assert told in out
+    for words in (["data"], ["data", "mend", "x"], ["data", "check", "x", "--unknown"]):
+        with pytest.raises(SystemExit) as caught:
+            main(words)
+        assert caught.value.code == 2
+
+
+def test_no_depth_and_no_poses(tmp_path, capsys):
+    path, _ = layouts.write_generic(tmp_path / "one", frames=3)
+    shutil.rmtree(path / "depth")
+    code, out = command(capsys, path)
+    assert code == 0
+    assert re.search(r"undecided +nothing was compared: .* has no two readable frames with depth", out)
+    root, _ = layouts_more.write_nyu(tmp_path / "nyu")
+    code, out = command(capsys, root)
+    assert code == 0
+    assert re.search(r"poses +none: single images", out)
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "frames", "worst"),
+    [
+        ("hololens_office", "generic", 100, 0.01),
+        ("rgbd_dataset_freiburg1_xyz", "tum", 40, 0.02),
+        ("rgbd_dataset_freiburg3_teddy", "tum", 50, 0.02),
+        ("tartanair_sample", "tartanair", 30, 0.01),
+    ],
+)
+def test_the_shared_recordings_are_right(name, layout, frames, worst):
+    found = check_data(require_shared(f"data/{name}"), pairs=1)
+    assert (found.layout, found.frames, found.problems, found.undecided) == (layout, frames, (), ())
+    assert found.checked["error"] < worst
+    assert 0.1 < found.depth_range[0] < found.depth_range[1] < 100
+
+
+def write_page_files(folder):
+    """What docs/data.md calls walk, scans, slam.txt and KITTI-360."""
+    K = layouts.resized(500, 500, 320, 240, (480, 640), SIZE)
+    truth = layouts.truth(K, 12, SIZE)
+    for i in range(12):
+        layouts.write_image(folder / "walk" / "images" / f"{i}.png", truth.images[i])
+        layouts.write_depth_png(folder / "walk" / "depth" / f"{i}.png", truth.depths[i], 1000)
+    np.savetxt(folder / "walk" / "K.txt", K)
+    np.savetxt(folder / "walk" / "poses.txt", [T.ravel() for T in truth.T_world_cam])
+    _, _, scannet = layouts.write_scannet(folder / "scans", frames=7)
+    lines = [f"{i} {layouts.quaternion_line(T)}" for i, T in enumerate(scannet.T_world_cam)]
+    (folder / "slam.txt").write_text("\n".join(lines))
+    layouts_more.write_kitti360(folder / "KITTI-360")
+
+
+def test_every_command_and_piece_of_code_on_the_page_runs(tmp_path, monkeypatch, capsys):
+    write_page_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    text = PAGE.read_text()
+    commands = re.findall(r"^ufmstar (data .*)$", "\n".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)), re.M)
+    assert len(commands) == 6
+    printed = {}
+    for words in commands:
+        code = main(words.split())
+        printed[words] = capsys.readouterr().out
+        assert code == (1 if "world-to-camera" in words else 0), printed[words]
+    assert re.findall(r"remedy +(.*)", printed["data check walk --depth-scale 0.01 --poses world-to-camera"]) == [
+        "leave --poses world-to-camera out",
+        "--depth-scale 0.001",
+    ]
+    shown = re.search(r"```\n(walk: layout.*?)```", text, re.DOTALL)[1]
+    for line in shown.splitlines()[2:]:
+        assert re.sub(r" \(\.\.\.\)$", "", line) in printed[commands[1]]
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(code, PAGE.name, "exec"), {})
+    assert capsys.readouterr().out.splitlines() == ["7 scannet []", "[('scene0000_00', 'scannet')]"]
+
+
+def test_the_page_names_every_layout():
+    from ufmstar_torch.eval.sequences.layout import LAYOUTS
+
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGE.read_text(), re.M)) == set(LAYOUTS) - {"auto"}
+
+
+def test_tours_are_checked_without_files():
+    found = check_data("tour:7?frames=3&size=48x64", pairs=1)
+    assert (found.layout, found.frames) == ("tour", 3)
+    with pytest.raises(ValueError, match="poses must be one of"):
+        open_sequence("tour:7", poses="x")
