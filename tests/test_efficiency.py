@@ -16,7 +16,7 @@ from ufmstar_torch.eval.efficiency.contender import Contender
 from ufmstar_torch.eval.efficiency.measure import Plan, measure
 from ufmstar_torch.eval.efficiency.multiview import state_bytes
 from ufmstar_torch.eval.efficiency.power import CPU, GPU, NOT_MEASURABLE, PowerMeter, Rail, Source
-from ufmstar_torch.eval.efficiency.race import DEPTH, EVERY, MULTIVIEW, ONCE, run_race
+from ufmstar_torch.eval.efficiency.race import DEPTH, EVERY, MULTIVIEW, ONCE, PROCESSOR, run_race
 from ufmstar_torch.eval.efficiency.table import efficiency_table, efficiency_tables
 from ufmstar_torch.eval.suite.method import Method
 from ufmstar_torch.eval.suite.row import Row
@@ -116,6 +116,7 @@ def test_further_members_cost_what_they_take_and_parts_take_turns(sequence):
     assert min(race.ms("ensemble", DEPTH)) >= 4
     assert min(race.ms("ensemble", EVERY)) >= 12
     assert np.median(race.added_ms("ensemble", EVERY)) >= 7.5
+    assert np.median(race.ms("ensemble", EVERY, PROCESSOR)) < 12  # they sleep
     # Depth, the member whose turn it is, all of them; and the reverse for odd frames.
     every, expected = [0.2, 1.2, 2.2], []
     for n in range(4):
@@ -215,7 +216,8 @@ def test_a_row_tells_its_latency_and_memory(unpowered):
     assert set(ensemble["latency"]) == {"depth", "network_uncertainty"}
     assert ensemble["stages"] is None
     assert star["stages"]["stages_total"]["count"] == QUICK.frames
-    assert ensemble["ratios_to_depth"]["network_uncertainty"]["count"] == QUICK.frames
+    for clock in ("wall", "processor"):
+        assert ensemble["ratios_to_depth"]["network_uncertainty"][clock]["count"] == QUICK.frames
     memory = star["memory"]
     state = memory["multiview"]
     assert state["smoothing_bytes"] == 4 * SIZE[0] * SIZE[1]

@@ -30,8 +30,11 @@ def line(depth=(27.0, 206.3), dnn=(252.0, 1857.0), mvd=None, memory=None, overhe
     state = sizes.pop("mvd")
     sizes["overhead_percent"] = overhead_percent(sizes["network_uncertainty_bytes"] + state, sizes["depth_bytes"])
     name = "UfM*-Ensemble" if mvd else "Ensemble"
-    ratios = {key: {"q1": s["q1_ms"] / 27, "median": s["median_ms"] / 27, "q3": s["q3_ms"] / 27}
-              for key, (s, _) in parts.items()}  # fmt: skip
+    walls = {
+        key: {name.removesuffix("_ms"): ms / 27 for name, ms in times.items()} for key, (times, _) in parts.items()
+    }
+    doubled = {key: {name: 2 * value for name, value in told.items()} for key, told in walls.items()}
+    ratios = {key: {"wall": walls[key], "processor": doubled[key]} for key in parts}
     row = {
         "row": name, "base": "ensemble", "network": "ResNet50-Monodepth2",
         "latency": {key: value[0] for key, value in parts.items()}, "ratios_to_depth": ratios,
@@ -71,6 +74,10 @@ def test_the_papers_lines_are_printed_as_in_the_paper():
 
 def test_relative_times_are_multiples_of_depth():
     assert cells(line(), relative=True)[0] == "9.33"
+    on_cpu = line()
+    on_cpu["devices"]["units"] = dict.fromkeys(on_cpu["devices"]["units"], CPU)
+    assert cells(on_cpu, relative=True)[3] == "19"  # processor times, where there is no GPU
+    assert "ratios of processor times" in efficiency_table(on_cpu, relative=True)[0]
     assert not re.search(r"\d ms", efficiency_table(line(), relative=True)[0])
 
 

@@ -10,13 +10,14 @@ from typing import Any
 from ufmstar_torch.eval.benchmark_timing import paired_ratio, spread
 from ufmstar_torch.eval.efficiency.contender import Contender
 from ufmstar_torch.eval.efficiency.memory import overhead_percent
-from ufmstar_torch.eval.efficiency.race import DEPTH, EVERY, MULTIVIEW, ONCE, Race, inference_of
+from ufmstar_torch.eval.efficiency.race import DEPTH, EVERY, MULTIVIEW, ONCE, PROCESSOR, WALL, Race, inference_of
 from ufmstar_torch.eval.efficiency.windows import PartEnergy
 from ufmstar_torch.eval.suite.method import ALONE
 from ufmstar_torch.eval.suite.row import Row
 
 NOT_NEEDED = "the method asks nothing of the network but depth"
 NETWORK = "network_uncertainty"
+CLOCKS = (WALL, PROCESSOR)
 
 Energies = Mapping[tuple[str, str], PartEnergy]
 
@@ -39,20 +40,19 @@ def network_line(network: Contender, race: Race, energy: Energies) -> dict[str, 
 def row_line(row: Row, network: Contender, race: Race, energy: Energies) -> dict[str, Any]:
     """One line of the table."""
     base, part, name = row.method.base, inference_of(row), row.label
-    depth_ms = race.ms(base, DEPTH)
     missing = _no_network_part(row, network)
-    latency: dict[str, Any] = {DEPTH: spread(depth_ms)}
+    latency: dict[str, Any] = {DEPTH: spread(race.ms(base, DEPTH))}
     ratios: dict[str, Any] = {}
     spent: dict[str, PartEnergy] = {DEPTH: energy[base, DEPTH]}
     if missing is None:
-        added = race.added_ms(base, part)
-        latency[NETWORK], ratios[NETWORK] = spread(added), paired_ratio(added, depth_ms)
+        latency[NETWORK] = spread(race.added_ms(base, part))
+        ratios[NETWORK] = {c: paired_ratio(race.added_ms(base, part, c), race.ms(base, DEPTH, c)) for c in CLOCKS}
         spent[NETWORK] = energy[base, part].minus(energy[base, DEPTH])
     else:
         latency[NETWORK] = missing
     if row.method.fusion != ALONE:
-        own = race.ms(name, MULTIVIEW)
-        latency[MULTIVIEW], ratios[MULTIVIEW] = spread(own), paired_ratio(own, depth_ms)
+        latency[MULTIVIEW] = spread(race.ms(name, MULTIVIEW))
+        ratios[MULTIVIEW] = {c: paired_ratio(race.ms(name, MULTIVIEW, c), race.ms(base, DEPTH, c)) for c in CLOCKS}
         spent[MULTIVIEW] = energy[name, MULTIVIEW]
     told = {key: value.to_dict() for key, value in spent.items()} | ({} if missing is None else {NETWORK: missing})
     return {

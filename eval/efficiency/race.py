@@ -21,6 +21,8 @@ from ufmstar_torch.eval.suite.method import ALONE, UFM_STAR
 from ufmstar_torch.eval.suite.row import Row
 
 DEPTH, ONCE, EVERY, MULTIVIEW = "depth", "once", "every", "multiview"
+# Clocks: what passes, and what this process computes (over all its threads), which other work does not stretch.
+WALL, PROCESSOR = "wall", "processor"
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Race:
     """What was run and how long it took.
 
     Attributes:
-        watch: wall-clock times by (base or row, part), of the frames after the warm-up.
+        watch: times by (base or row, part), of the frames after the warm-up.
         prepared: by base, every frame.
         inputs: by base and part ("once" or "every"), what the multiview methods were given.
         multiview: by row's label, the state after the last frame.
@@ -56,13 +58,14 @@ class Race:
     multiview: dict[str, Multiview] = field(default_factory=dict)
     staged: dict[str, StagedUfMStar] = field(default_factory=dict)
 
-    def ms(self, owner: str, part: str) -> list[float]:
-        """Times of a part [ms], one per frame; none if it was not run."""
-        return self.watch.wall.get(f"{owner}/{part}", [])
+    def ms(self, owner: str, part: str, clock: str = WALL) -> list[float]:
+        """Times of a part by a clock [ms], one per frame; none if it was not run."""
+        times = self.watch.wall if clock == WALL else self.watch.cpu
+        return times.get(f"{owner}/{part}", [])
 
-    def added_ms(self, base: str, part: str) -> list[float]:
+    def added_ms(self, base: str, part: str, clock: str = WALL) -> list[float]:
         """What a network's inference takes beyond that of depth alone [ms], frame by frame."""
-        return [a - b for a, b in zip(self.ms(base, part), self.ms(base, DEPTH), strict=True)]
+        return [a - b for a, b in zip(self.ms(base, part, clock), self.ms(base, DEPTH, clock), strict=True)]
 
 
 def parts_of(base: str, rows: Iterable[Row]) -> tuple[str, ...]:

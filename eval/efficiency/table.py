@@ -13,7 +13,7 @@ from typing import Any
 from ufmstar_torch.eval.efficiency.lines import NETWORK
 from ufmstar_torch.eval.efficiency.memory import MEGABYTE
 from ufmstar_torch.eval.efficiency.power import CPU, GPU, NOT_MEASURABLE
-from ufmstar_torch.eval.efficiency.race import DEPTH, MULTIVIEW
+from ufmstar_torch.eval.efficiency.race import DEPTH, MULTIVIEW, PROCESSOR, WALL
 from ufmstar_torch.eval.report.latex import latex
 from ufmstar_torch.eval.report.markdown import markdown
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
@@ -31,7 +31,7 @@ def efficiency_table(
     Args:
         measured: what ``measure`` returned, once or several times (for several architectures).
         relative: times as multiples of one inference of depth alone, of the same frame: for a machine that also
-            does other work.
+            does other work. Where all runs on the CPU, these are processor times, which such work does not stretch.
         net: power and energy less those of the idle machine.
     """
     tables = efficiency_tables(measured, relative=relative, net=net)
@@ -54,8 +54,9 @@ def _table(run: Mapping[str, Any], label: str, relative: bool, kind: str) -> Tab
     rows = [row for row in run["rows"] if row["network"] == label]
     bases = dict.fromkeys(row["base"] for row in rows)
     units = run["devices"]["units"]
+    clock = _clock(units) if relative else None
     blocks = [
-        tuple(_line(row, units, relative, kind) for row in rows if row["base"] == base) for base in bases
+        tuple(_line(row, units, clock, kind) for row in rows if row["base"] == base) for base in bases
     ]  # a block per base, as in the paper
     network = run["networks"][next(iter(bases))]
     slug = "".join(c if c.isalnum() else "-" for c in label.lower())
@@ -82,11 +83,16 @@ def _columns(relative: bool) -> tuple[Column, ...]:
     )
 
 
-def _line(row: Mapping[str, Any], units: Mapping[str, str], relative: bool, kind: str) -> Line:
+def _clock(units: Mapping[str, str]) -> str:
+    """Which times the ratios compare; a GPU's work takes no time of the processor's."""
+    return PROCESSOR if set(units.values()) == {CPU} else WALL
+
+
+def _line(row: Mapping[str, Any], units: Mapping[str, str], clock: str | None, kind: str) -> Line:
     cells: list[str] = []
     for unit in UNITS:
         parts = [part for part in (NETWORK, MULTIVIEW) if _counts(row, part) and units[part] == unit]
-        cells += [_latency(row, parts, relative), *_power_and_energy(row, parts, kind)]
+        cells += [_latency(row, parts, clock), *_power_and_energy(row, parts, kind)]
     return Line(row["row"], tuple(map(Cell, (*cells, _energy_overhead(row, kind), *_memory(row)))))
 
 
@@ -98,22 +104,23 @@ def _counts(row: Mapping[str, Any], part: str) -> bool:
 # ---- time and energy ----
 
 
-def _latency(row: Mapping[str, Any], parts: Sequence[str], relative: bool) -> str:
+def _latency(row: Mapping[str, Any], parts: Sequence[str], clock: str | None) -> str:
     """The sum over parts of the medians; "<" the upper quartile where the lower one is not above 0."""
     if not parts:
         return ""
     if any("not_separable" in row["latency"][part] for part in parts):
         return NOT_SEPARABLE
-    spreads = [_spread(row, part, relative) for part in parts]
+    decimals = 1 if clock is None else 2
+    spreads = [_spread(row, part, clock) for part in parts]
     if len(spreads) == 1 and spreads[0][0] <= 0:
-        return f"<{_digits(max(spreads[0][2], _SMALLEST), 2 if relative else 1)}"
-    return _digits(sum(max(0.0, middle) for _, middle, _ in spreads), 2 if relative else 1)
+        return f"<{_digits(max(spreads[0][2], _SMALLEST), decimals)}"
+    return _digits(sum(max(0.0, middle) for _, middle, _ in spreads), decimals)
 
 
-def _spread(row: Mapping[str, Any], part: str, relative: bool) -> tuple[float, float, float]:
-    """Lower quartile, median and upper quartile."""
-    told = row["ratios_to_depth" if relative else "latency"][part]
-    names = ("q1", "median", "q3") if relative else ("q1_ms", "median_ms", "q3_ms")
+def _spread(row: Mapping[str, Any], part: str, clock: str | None) -> tuple[float, float, float]:
+    """Lower quartile, median and upper quartile, in ms or as multiples of depth by a clock."""
+    told = row["latency"][part] if clock is None else row["ratios_to_depth"][part][clock]
+    names = ("q1_ms", "median_ms", "q3_ms") if clock is None else ("q1", "median", "q3")
     low, middle, high = (told[name] for name in names)
     return low, middle, high
 
@@ -202,8 +209,9 @@ def _notes(run: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], relative: 
         notes.append("Power and energy are those beyond the idle machine's.")
     frames, name, threads = run["plan"]["frames"], run["sequence"]["name"], run["plan"]["threads"]
     hardware, gpu = run["machine"]["hardware"]["cpu"], run["machine"]["gpu"]
-    medians = "ratios within a frame" if relative else "frames"
-    place = f"{hardware}, {threads} threads" + ("" if gpu is None else f", and {gpu}")
+    ratios = "processor times" if _clock(run["devices"]["units"]) == PROCESSOR else "times"
+    medians = f"ratios of {ratios} within a frame" if relative else "frames"
+    place = f"{hardware}, {threads} thread{'s' if threads > 1 else ''}" + ("" if gpu is None else f", and {gpu}")
     notes.append(f"Medians of {frames} {medians} of {name}; {place}.")
     notes += [f"{method} is left out: {why}." for method, why in run["left_out"].items()]
     return notes
