@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 _DESCRIPTION = (
-    "Draws tables (Markdown and LaTeX), figures and tidy results (JSON and CSV) from what `ufmstar eval` has left in "
-    "OUT, finished or not, and prints the main table."
+    "Draws tables (Markdown and LaTeX), figures, one page (report.html) and tidy results (JSON and CSV) from what "
+    "`ufmstar eval` has left in OUT, finished or not, and prints the main table."
 )
 
 
@@ -20,7 +20,9 @@ def parse_report(arguments: Sequence[str]) -> argparse.Namespace:
     """
     parser = argparse.ArgumentParser(prog="ufmstar report", description=_DESCRIPTION)
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of `ufmstar eval`")
-    parser.add_argument("--no-figures", action="store_true", help="tables and results alone (needs no matplotlib)")
+    parser.add_argument(
+        "--no-figures", action="store_true", help="tables and results alone (needs no matplotlib)"
+    )
     parser.add_argument("--format", choices=("svg", "png"), default="svg", help="of the figures (default: svg)")
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
     return parser.parse_args(list(arguments))

@@ -14,11 +14,11 @@ from ufmstar_torch.eval.report.tidy import write_tidy
 
 
 def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> list[Path]:
-    """Write tables, figures and the tidy results of an evaluation, finished or not.
+    """Write tables, figures, one page of all and the tidy results of an evaluation, finished or not.
 
     Args:
         out: the folder of ``ufmstar eval``.
-        figures: False = tables and results alone, which needs no matplotlib.
+        figures: False = tables and results alone, without a page; needs no matplotlib.
         pictures: kind of the figures, "svg" or "png".
 
     Returns:
@@ -27,16 +27,18 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> l
     Raises:
         ResultsError: the folder is no evaluation, or its records do not belong together.
         ValueError: another kind of figures, or a file with an example that cannot be read.
-        ImportError: matplotlib is missing.
+        ImportError: matplotlib or Pillow is missing.
         OSError: a file cannot be written.
     """
     results = load_results(out, with_sums=figures)
     files = [*write_tidy(results), *write_tables(results)]
     if figures:
         from ufmstar_torch.eval.report.figures import write_figures
+        from ufmstar_torch.eval.report.page import write_page
         from ufmstar_torch.eval.report.pictures import write_pictures
 
         files += [*write_figures(results, pictures), *write_pictures(results, out)]
+        files.append(write_page(results, out, files))
     return files
 
 
