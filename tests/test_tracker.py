@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.kernels import triangulate_cpu
 from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.triangulate import triangulate
 
@@ -53,6 +54,24 @@ def test_exact_tracks_give_exact_points(seed, count):
     # What a view did not see does not matter.
     spoiled = np.where(seen[..., None], seen_from(points, T), 1e4)
     np.testing.assert_allclose(triangulate(spoiled, seen, T, K).point, found.point, atol=1e-9)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=15, deadline=None)
+def test_the_compiled_twin_agrees(seed):
+    T, points = views(5, seed), world_points(9, seed)
+    rng = np.random.default_rng(seed)
+    seen = rng.random((9, 5)) < 0.7
+    seen[:, :2] = True
+    if np.linalg.norm(T[0, :3, 3] - T[1, :3, 3]) < 0.1:
+        return
+    pixel = seen_from(points, T) + 0.5 * rng.standard_normal((9, 5, 2))
+    skewed = K + np.array([[0, 3.0, 0], [0, 0, 0], [0, 0, 0]])
+    slow, fast = (function(pixel, seen, T, skewed) for function in (triangulate, triangulate_cpu.triangulate))
+    np.testing.assert_allclose(fast.point, slow.point, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(fast.covariance, slow.covariance, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(fast.error, slow.error, rtol=1e-7)
+    np.testing.assert_array_equal(fast.ahead, slow.ahead)
 
 
 def test_the_variance_is_what_noise_makes_of_it():

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 # From the rays' nearest point the reprojection error converges quadratically; three steps reach rounding on all but the
 # worst geometry, which the tests of parallax refuse anyway.
-_STEPS = 3
+STEPS = 3
 # Added to the normal matrix's diagonal, relative to its trace, so that rays without parallax stay solvable; their huge
 # variance then tells.
-_DAMPING = 1e-12
+DAMPING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ def triangulate(
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     across = (np.eye(3) - rays[..., :, None] * rays[..., None, :]) * seen[..., None, None]
     point = _solve(across.sum(1), np.einsum("nwij,wj->ni", across, centre))
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         residual, J, _ = _reprojection(point, pixel, seen, R, centre, K)
         point = point - _solve(np.einsum("nwai,nwaj->nij", J, J), np.einsum("nwai,nwa->ni", J, residual))
     residual, J, z = _reprojection(point, pixel, seen, R, centre, K)
@@ -88,7 +88,7 @@ def _reprojection(
 
 def _damped(normal: NDArray) -> NDArray:
     scale = np.maximum(np.trace(normal, axis1=-2, axis2=-1), np.finfo(np.float64).tiny)
-    return normal + _DAMPING * scale[:, None, None] * np.eye(3)
+    return normal + DAMPING * scale[:, None, None] * np.eye(3)
 
 
 def _solve(normal: NDArray, right: NDArray) -> NDArray:
