@@ -131,14 +131,15 @@ def _verdict(
     sequence: Sequence, path: str | Path, pairs: int, options: Mapping[str, Any]
 ) -> tuple[list[str], list[str], list[str], dict[str, Any]]:
     """Problems, remedies, what is undecided, and the check's figures."""
-    problems, remedies, undecided = [], [], []
+    problems: list[str] = []
+    remedies: list[str] = []
     if len(sequence) < _FEW * len(sequence.names_on_disk):
         problems.append(f"only {len(sequence)} of {len(sequence.names_on_disk)} frames are usable")
         remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --max-pose-gap")
     try:
         found = check_sequence(sequence, pairs)
     except ValueError as error:
-        return problems, remedies, [*undecided, f"nothing was compared: {error}"], {}
+        return problems, remedies, [f"nothing was compared: {error}"], {}
     if found.unreadable:
         problems.append(
             f"{len(found.unreadable)} of the frames looked at cannot be decoded, first {found.unreadable[0]}"
@@ -146,7 +147,7 @@ def _verdict(
         remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
     problems += found.problems
     remedies += _remedies(found, sequence, path, options)
-    return problems, remedies, [*undecided, *found.undecided], _measured(found)
+    return problems, remedies, list(found.undecided), _measured(found)
 
 
 def _remedies(found: SequenceCheck, sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:

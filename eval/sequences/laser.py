@@ -82,9 +82,8 @@ def read_scan(path: Path) -> np.ndarray:
     if values.size == 0 or path.stat().st_size % (4 * _COLUMNS):
         raise FrameError(path, f"is no scan: its size must be a multiple of {4 * _COLUMNS} bytes, and not 0")
     points = values.reshape(-1, _COLUMNS)[:, :3].T.astype(np.float64)
-    usable = np.isfinite(points).all(axis=0)
-    usable[usable] = np.linalg.norm(points[:, usable], axis=0) > _MIN_RANGE
-    return points[:, usable]
+    distance = np.linalg.norm(points, axis=0)
+    return points[:, np.isfinite(distance) & (distance > _MIN_RANGE)]
 
 
 def unroll(points: np.ndarray, T_laser_before: np.ndarray) -> np.ndarray:
