@@ -63,9 +63,10 @@ def new_figure(width: float, height: float, title: str) -> Any:
     """
     require_matplotlib()
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)
+    layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", layout=layout)
     figure.suptitle(title, size=TITLE, weight="bold", color=INK, x=0.012, ha="left")
     return figure
 

@@ -141,8 +141,8 @@ def _by_base(results: Results, dataset: str) -> dict[str, dict[Row, Curves]]:
 
 def _has_curves(curves: Mapping[str, Any]) -> bool:
     """Whether a variance was judged, on any pixel at all (a curve without one is NaN, None in a record)."""
-    levels = curves.get("ece_q_observed")
-    return bool(levels) and all(value is not None and value == value for value in levels)
+    levels = curves.get("ece_q_observed") or ()
+    return len(levels) > 0 and all(value is not None and value == value for value in levels)
 
 
 def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:

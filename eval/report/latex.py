@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import groupby
 
 from ufmstar_torch.eval.report.table import Cell, Line, Table
@@ -25,7 +26,7 @@ def latex(table: Table) -> str:
             r"\begin{table}[t]",
             r"\centering",
             rf"\caption{{{caption}}}",
-            rf"\label{{tab:{table.name}}}",
+            rf"\label{{tab:{re.sub(r'[^A-Za-z0-9.-]+', '-', table.name)}}}",
             rf"\begin{{tabular}}{{l{'c' * len(table.columns)}}}",
             r"\toprule",
             *_groups(table),
