@@ -217,7 +217,7 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     measured = []
 
     def measure(rows, networks, sequence, **how):
-        measured.append(([row.name for row in rows], sequence.name, how["plan"].frames))
+        measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames))
         return {"rows": []}
 
     monkeypatch.setattr(efficiency_step, "measure", measure)

@@ -237,6 +237,7 @@ def test_parts_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path):
 # ---- SLURM ----
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # submitit's debug executor leaves its logs open
 @pytest.mark.usefixtures("no_torchrun")
 def test_jobs_through_submitit(rooms, tmp_path):
     # submitit's debug executor runs a job here, when its result is asked for.
