@@ -262,5 +262,7 @@ def test_a_sequence_that_another_process_is_at_is_left_to_it(rooms, tmp_path):
     folder = EvalFolder.open(job.out, job.about(networks), resume=False, overwrite=False)
     stub = Stub()
     with folder.claim(job.items[0], "other"):
-        assert go(job, stub, resume=True)[0]
+        ended, told = go(job, stub, resume=True)
+    assert ended
+    assert told[-1] == "left to another process that is at it: rooms/ash"
     assert [name for name, _ in stub.asked] == ["birch", "cedar"]

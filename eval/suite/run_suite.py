@@ -162,6 +162,8 @@ def run_job(
         queue = taken if conduct.waits else []
         if queue:
             time.sleep(_POLL_SECONDS)
+        elif taken and not conduct.helps:
+            conduct.tell(f"left to another process that is at it: {', '.join(item.label for item in taken)}")
     return True
 
 
