@@ -91,9 +91,9 @@ class Example:
     def nll(self, row: str) -> NDArray[np.float64]:
         """[h, w] (g - d)^2 / (2 v) + 0.5 ln(2 pi v) [nats], NaN where there is no truth or v = 0."""
         maps = self.rows[row]
-        error = self.error(row).astype(np.float64)
-        usable = np.isfinite(error) & (maps.variance > 0)
+        usable = np.isfinite(self.error(row)) & (maps.variance > 0)
         v = np.where(usable, maps.variance, 1.0).astype(np.float64)
+        error = np.where(usable, maps.depth.astype(np.float64) - self.truth.astype(np.float64), 0.0)
         return np.where(usable, error**2 / (2 * v) + 0.5 * np.log(2 * math.pi * v), np.nan)
 
 

@@ -1,0 +1,358 @@
+"""Pictures of a report: strips, breakdowns, comparisons and rooms show the numbers that they say they show."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from evaluations import rows_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from ufmstar_torch.eval.colours import INVALID_GREY
+from ufmstar_torch.eval.metrics import NLL
+from ufmstar_torch.eval.report.compare import draw_comparison, largest_difference
+from ufmstar_torch.eval.report.example import Example, RowMaps, find_examples
+from ufmstar_torch.eval.report.grid import break_name, draw_grid
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.picture import BREAKDOWN, COMPARE, ROOM, STRIP, file_name, read_index
+from ufmstar_torch.eval.report.pictures import choose, strip_rows, write_pictures
+from ufmstar_torch.eval.report.projection import SIGMAS, View, project, views_of
+from ufmstar_torch.eval.report.rooms import Snapshot, below_ceiling, choose_times, draw_room, find_rooms, painted
+from ufmstar_torch.eval.report.strips import NLL_SCALE, draw_breakdown, draw_strip, figures_of, fit_scales, mean_nll
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import Setting
+
+SHAPE = (12, 16)
+K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
+
+
+def full(value: float) -> np.ndarray[Any, Any]:
+    return np.full(SHAPE, value, np.float32)
+
+
+def halves(left: float, right: float) -> np.ndarray[Any, Any]:
+    values = full(left)
+    values[:, SHAPE[1] // 2 :] = right
+    return values
+
+
+def example(rows: dict[str, RowMaps], truth: np.ndarray[Any, Any] | None = None, **changes: Any) -> Example:
+    image = np.zeros((*SHAPE, 3), np.uint8)
+    return replace(Example("d", "s", "f", image, full(3.0) if truth is None else truth, K, rows), **changes)
+
+
+def pixels(path: Path, colour: np.ndarray[Any, Any]) -> int:
+    """How many pixels of a picture have a colour."""
+    with Image.open(path) as picture:
+        return int((np.asarray(picture.convert("RGB")) == colour.astype(np.uint8)).all(-1).sum())
+
+
+CELL = (1.95 * 110) ** 2 * SHAPE[0] / SHAPE[1]  # pixels of a picture in a strip
+
+
+class TestExample:
+    def test_nll_is_that_of_the_metric(self) -> None:
+        rng = np.random.default_rng(0)
+        truth = np.where(rng.random(SHAPE) < 0.2, 0, rng.uniform(1, 5, SHAPE)).astype(np.float32)
+        variance = rng.uniform(0.01, 1, SHAPE).astype(np.float32)
+        variance[0, 0], variance[1, 1], variance[2, 2] = 0, np.nan, -1
+        depth = rng.uniform(1, 5, SHAPE).astype(np.float32)
+        one = example({"a": RowMaps(depth, variance)}, truth)
+        metric = NLL()
+        metric.update(*(torch.from_numpy(value) for value in (depth, variance, truth)))
+        assert mean_nll(one, "a") == pytest.approx(float(metric.compute()["nll"]), rel=1e-9)
+        judged = (truth > 0) & (variance > 0)
+        np.testing.assert_array_equal(np.isfinite(one.nll("a")), judged)
+        np.testing.assert_array_equal(np.isfinite(one.error("a")), (truth > 0) & (variance >= 0))
+
+    def test_aspect_is_that_of_the_view(self) -> None:
+        squeezed = K @ np.diag([0.5, 1.0, 1.0])
+        assert example({}).aspect == pytest.approx(12 / 16)
+        assert example({}, K=squeezed).aspect == pytest.approx(12 / 32)
+
+    def test_figures_in_words(self) -> None:
+        one = example({"a": RowMaps(full(2.0), full(0.25)), "zero": RowMaps(full(2.0), full(0.0))})
+        nll = 1 / 0.5 + 0.5 * np.log(2 * np.pi * 0.25)
+        assert figures_of(one, "a") == [f"mean NLL {nll:.2f}", "RMSE 1.00 m", "rms σ 0.50 m"]
+        assert figures_of(one, "zero")[0] == "no NLL: V = 0"
+        assert figures_of(replace(one, truth=full(0.0)), "a") == ["no ground truth"]
+
+
+class TestFindExamples:
+    def write(self, folder: Path, name: str, **arrays: Any) -> None:
+        (folder / "examples").mkdir(parents=True, exist_ok=True)
+        np.savez(folder / "examples" / f"{name}.npz", **arrays)
+
+    def frame(self, folder: Path, name: str) -> None:
+        self.write(folder, name, image=np.zeros((*SHAPE, 3), np.uint8), truth=full(3.0), K=K, index=0)
+
+    def test_frames_rows_and_cameras(self, tmp_path: Path) -> None:
+        folder = tmp_path / "tum" / "desk"
+        for name in ("f@1", "f@2"):  # names with the letter that also parts frames from rows
+            self.frame(folder, name)
+        self.write(folder, "f@1@Ensemble", depth=full(2.0), variance=full(0.1), aleatoric=full(0.1))
+        self.write(folder, "f@1@UfMstar-Ensemble@0a1b", depth=full(2.0), variance=full(0.2))
+        self.write(folder, "f@1@DepthOnly", depth=full(2.0))
+        big = np.full((24, 32), 2.0, np.float32)
+        scene = {"image": np.ones((24, 32, 3), np.uint8), "truth": big, "K": 2 * K}
+        self.write(folder, "f@1@UfMstar-DepthOnly", depth=big, variance=big, **scene)
+        found = find_examples(folder, {"Ensemble": "for people"})
+        assert [(e.dataset, e.sequence, e.frame) for e in found] == [("tum", "desk", "f@1")] * 2
+        assert set(found[0].rows) == {"Ensemble", "UfMstar-Ensemble@0a1b"}
+        assert set(found[1].rows) == {"UfMstar-DepthOnly"}
+        assert found[1].truth.shape == (24, 32)
+        assert (found[0].label("Ensemble"), found[0].label("other")) == ("for people", "other")
+
+    def test_bad_files_are_named(self, tmp_path: Path) -> None:
+        folder = tmp_path / "tum" / "desk"
+        self.frame(folder, "a")
+        self.write(folder, "a@Ensemble", depth=full(2.0)[:3], variance=full(2.0))
+        with pytest.raises(ValueError, match=r"a@Ensemble\.npz: depth must have the truth's shape"):
+            find_examples(folder)
+        self.write(folder, "a@Ensemble", variance=full(2.0))
+        with pytest.raises(ValueError, match=r"a@Ensemble\.npz must hold depth"):
+            find_examples(folder)
+        (folder / "examples" / "a@Ensemble.npz").write_bytes(b"nothing")
+        with pytest.raises(ValueError, match=r"a@Ensemble\.npz is not a readable npz"):
+            find_examples(folder)
+
+
+class TestStrips:
+    def test_pixels_have_the_colours_of_the_numbers(self, tmp_path: Path) -> None:
+        rows = {"alone": RowMaps(full(2.0), halves(0.04, 0.64)), "star": RowMaps(full(2.5), full(0.25))}
+        one = example(rows, halves(3.0, 0.0))
+        scales = draw_strip(tmp_path / "s.png", one, list(rows))
+        # Errors 1 and .5 where there is truth; sigmas .2 | .8 and .5: the two .5 share a colour, as they share a scale.
+        for value, area in ((0.2, 0.5), (0.8, 0.5), (1.0, 0.5), (0.5, 1.5)):
+            found = pixels(tmp_path / "s.png", scales.length.rgb(np.array(value)))
+            assert found == pytest.approx(area * CELL, rel=0.12), value
+        nll = one.nll("star")[0, 0]
+        assert pixels(tmp_path / "s.png", NLL_SCALE.rgb(np.array(nll))) == pytest.approx(0.5 * CELL, rel=0.12)
+        # No truth on the right half: of the truth itself, two errors and two NLLs.
+        assert pixels(tmp_path / "s.png", np.full(3, INVALID_GREY)) == pytest.approx(2.5 * CELL, rel=0.12)
+
+    def test_one_scale_for_all_rows(self) -> None:
+        rows = {"a": RowMaps(full(2.0), full(0.01)), "b": RowMaps(full(2.9), full(4.0))}
+        scales = fit_scales(example(rows), ["a", "b"])
+        values = np.concatenate([np.full(192, v) for v in (1.0, 0.1, 0.1, 2.0)])
+        assert scales.length.low == 0
+        assert scales.length.high == pytest.approx(np.percentile(values, 99), rel=1e-5)
+
+    def test_breakdown_adds_up(self, tmp_path: Path) -> None:
+        parts = {"aleatoric": full(0.0625), "disagreement": full(0.1875)}
+        one = example({"star": RowMaps(full(2.0), full(0.25), **parts)})
+        scales = draw_breakdown(tmp_path / "b.png", one, ["star"])
+        for value in (0.25, np.sqrt(np.float32(0.1875)), 0.5, 1.0):  # sqrt A, sqrt M, sigma, error; E is missing
+            colour = scales.length.rgb(np.array(value))
+            assert pixels(tmp_path / "b.png", colour) == pytest.approx(CELL, rel=0.12)
+
+    def test_nothing_to_draw(self, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match="at least one row"):
+            draw_grid(tmp_path / "x.png", [], [], aspect=1.0)
+
+    @given(st.text(alphabet="ab-_ *", max_size=60))
+    def test_broken_names_keep_their_letters(self, name: str) -> None:
+        broken = break_name(name)
+        assert broken.replace("\n", "").replace(" ", "") == name.replace(" ", "")
+        assert max(map(len, broken.split("\n"))) <= 20
+
+
+class TestCompare:
+    @settings(max_examples=20, deadline=None)
+    @given(st.integers(0, 2**32 - 1), st.floats(0.1, 1.0))
+    def test_largest_difference_by_brute_force(self, seed: int, share: float) -> None:
+        rng = np.random.default_rng(seed)
+        difference = rng.integers(-9, 9, (9, 11)).astype(np.float32)
+        difference[rng.random(difference.shape) < 0.1] = np.nan
+        left, top, width, height = largest_difference(difference, share)
+        size = np.nan_to_num(np.abs(difference))
+        assert (width, height) == (max(1, round(11 * share)), max(1, round(9 * share)))
+        sums = {
+            (y, x): size[y : y + height, x : x + width].sum() for y in range(10 - height) for x in range(12 - width)
+        }
+        assert sums[top, left] == max(sums.values())
+        assert (top, left) == next(place for place, total in sums.items() if total == max(sums.values()))
+
+    def test_share_out_of_range(self) -> None:
+        with pytest.raises(ValueError, match="share must lie in"):
+            largest_difference(np.zeros((3, 3)), 0.0)
+
+    def test_the_place_is_found_and_signed(self, tmp_path: Path) -> None:
+        new = full(0.01)
+        new[8:, 11:] = 1.0
+        one = example({"ufm": RowMaps(full(2.0), full(0.01)), "star": RowMaps(full(2.0), new)})
+        left, top, width, height = draw_comparison(tmp_path / "c.png", one, "ufm", "star")
+        assert (left + width, top + height, width, height) == (SHAPE[1], SHAPE[0], 5, 4)
+        with Image.open(tmp_path / "c.png") as picture:
+            colours = np.asarray(picture.convert("RGB")).astype(int)
+        # RdBu_r: red where UfM* says more; nowhere does it say less.
+        assert ((colours[..., 0] > 80) & (colours[..., 1] < 20) & (colours[..., 2] < 50)).sum() > 500
+
+
+class TestProjection:
+    def test_axis_aligned(self) -> None:
+        view = View(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "from above")
+        found = project(view, np.array([[1.0, 2.0, 3.0]]), np.diag([0.04, 9.0, 0.25])[None])
+        np.testing.assert_allclose(found.centre, [[1.0, 3.0]])
+        np.testing.assert_allclose(found.axes, [[0.5 * SIGMAS, 0.2 * SIGMAS]])
+        assert abs(found.angle[0]) == pytest.approx(90)
+
+    def test_a_line_at_thirty_degrees(self) -> None:
+        along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
+        view = View(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), "")
+        found = project(view, np.zeros((1, 3)), np.outer(along, along)[None])
+        assert found.angle[0] == pytest.approx(30)
+        np.testing.assert_allclose(found.axes, [[SIGMAS, 0.0]], atol=1e-7)
+
+    @settings(max_examples=25, deadline=None)
+    @given(st.integers(0, 2**32 - 1))
+    def test_the_ellipse_reaches_as_far_as_the_gaussian(self, seed: int) -> None:
+        """In every direction n of the picture its extent is that of the marginal: sigmas sqrt(n^T P S P^T n)."""
+        rng = np.random.default_rng(seed)
+        R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        view = View(R[0], R[1], "")
+        A = rng.normal(size=(4, 3, 3))
+        covariance = A @ A.transpose(0, 2, 1)
+        found = project(view, rng.normal(size=(4, 3)), covariance)
+        for direction in np.linspace(0, np.pi, 7):
+            n = np.cos(direction) * view.right + np.sin(direction) * view.up
+            wanted = SIGMAS * np.sqrt(np.einsum("i,kij,j->k", n, covariance, n))
+            off = direction - np.radians(found.angle)
+            a, b = found.axes.T
+            np.testing.assert_allclose(np.hypot(a * np.cos(off), b * np.sin(off)), wanted, rtol=1e-9)
+
+    @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
+    def test_views_find_up(self, up: tuple[float, float, float]) -> None:
+        above = np.array(up)
+        forward = np.cross(above, [0.3, 0.5, 0.1])
+        forward /= np.linalg.norm(forward)
+        T = np.eye(4)
+        T[:3, :3] = np.stack([np.cross(forward, above), -above, forward], axis=1)
+        top, oblique = views_of(T[None], elevation=35.0)
+        np.testing.assert_allclose(top.towards, above, atol=1e-12)
+        np.testing.assert_allclose(top.up, forward, atol=1e-12)
+        assert oblique.towards @ above == pytest.approx(np.sin(np.radians(35)))
+        assert oblique.towards @ forward == pytest.approx(-np.cos(np.radians(35)))
+
+    def test_a_camera_that_looks_straight_down(self) -> None:
+        T = np.eye(4)[None].repeat(2, 0)
+        T[0, :3, :3] = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+        T[1, :3, 1] = 0  # no up on average either
+        T[0, :3, 1] = 0
+        for view in views_of(T):
+            np.testing.assert_allclose(np.linalg.norm([view.right, view.up, view.towards], axis=1), 1, atol=1e-12)
+
+
+def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float = 0.3) -> Snapshot:
+    covariance = np.eye(3)[None].repeat(len(m), 0) * sigma**2
+    return Snapshot(frame, np.array(mean).reshape(-1, 3), covariance, np.array(m), np.eye(4), np.zeros((1, 3)))
+
+
+class TestRooms:
+    def test_the_nearest_is_painted_last(self) -> None:
+        view = View(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "")  # seen from -y
+        ellipses, order = painted(view, snapshot("f", [[1, -2, 0], [2, 5, 0], [3, 0, 0]], [0, 0, 0]))
+        assert order.tolist() == [1, 2, 0]
+        assert ellipses.centre[:, 0].tolist() == [2, 3, 1]
+
+    def test_the_ceiling_is_taken_off(self) -> None:
+        up = np.array([0.0, 0.0, 1.0])
+        one = snapshot("f", [[0, 0, 0.2], [0, 0, 1.0]], [1.0, 2.0])
+        higher = replace(one, path=np.array([[0, 0, 0.9]]))
+        assert below_ceiling(one, up, [one]).disagreement.tolist() == [1.0]
+        assert below_ceiling(one, up, [one, higher]).disagreement.tolist() == [1.0, 2.0]
+
+    def test_same_scale_at_all_times_and_colours_of_root_m(self, tmp_path: Path) -> None:
+        times = [snapshot("0", [[0, 0, 2]], [0.25]), snapshot("1", [[0, 0, 2], [2, 0, 2]], [0.25, 4.0])]
+        scale = draw_room(tmp_path / "r.png", times, "room")
+        assert scale.high == pytest.approx(np.percentile([0.5, 0.5, 2.0], 99))
+        with Image.open(tmp_path / "r.png") as picture:
+            drawn = np.asarray(picture.convert("RGB")).astype(int)
+        wanted = 0.85 * scale.rgb(np.array(0.5)).astype(float) + 0.15 * 255  # on white
+        halves_ = np.array_split(drawn, 2, axis=1)
+        for half in halves_:
+            assert (np.abs(half - wanted).max(-1) <= 2).sum() > 300
+
+    def test_snapshots_are_found_in_order(self, tmp_path: Path) -> None:
+        (tmp_path / "room").mkdir()
+        maps = {"mean_world": np.zeros((0, 3)), "covariance_world": np.zeros((0, 3, 3)), "disagreement": np.zeros(0)}
+        for name in ("UfMstar-Ensemble_frame_10", "UfMstar-Ensemble_frame_9", "UfMstar-MCD@ab_frame_1"):
+            np.savez(tmp_path / "room" / f"{name}.npz", **maps, T_world_cam=np.eye(4))
+        rooms = find_rooms(tmp_path)
+        assert {row: [s.frame for s in found] for row, found in rooms.items()} == {
+            "UfMstar-Ensemble": ["frame_9", "frame_10"],
+            "UfMstar-MCD@ab": ["frame_1"],
+        }
+        with pytest.raises(ValueError, match="at least one Gaussian"):
+            draw_room(tmp_path / "x.png", rooms["UfMstar-Ensemble"], "empty")
+        np.savez(tmp_path / "room" / "UfMstar-MCD_1.npz", mean_world=np.zeros((0, 3)))
+        with pytest.raises(ValueError, match=r"UfMstar-MCD_1\.npz must hold a mixture; covariance_world"):
+            find_rooms(tmp_path)
+
+    def test_times_are_spread_and_end_with_the_last(self) -> None:
+        times = [snapshot(str(n), [[0, 0, 0]], [0.0]) for n in range(9)]
+        assert [t.frame for t in choose_times(times, 3)] == ["0", "4", "8"]
+        assert choose_times(times[:2], 3) == times[:2]
+
+
+class TestChoice:
+    def test_frames_of_many_sequences_first(self) -> None:
+        names = [("a", "1"), ("a", "2"), ("a", "3"), ("b", "1"), ("c", "1"), ("c", "2")]
+        found = choose([example({}, sequence=s, frame=f) for s, f in names], 4)
+        assert [(e.sequence, e.frame) for e in found] == [("a", "3"), ("a", "2"), ("b", "1"), ("c", "2")]
+
+    def test_rows_of_a_strip(self) -> None:
+        rows = rows_of("UfM-MCD", "Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-FullEnsemble")
+        noisy = Row(rows[4].method, Setting(skip=2))
+        assert strip_rows([*rows, noisy], "ensemble") == [rows[1], rows[3], rows[4]]
+        assert strip_rows(rows[:3], "ensemble") == [rows[1], rows[2]]
+
+    def test_names_of_files_never_collide(self) -> None:
+        assert file_name("a", "b/c") != file_name("a", "b c")
+        assert set(file_name("<x>", "../..", "é")) <= set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJ0123456789-_.")
+
+
+class TestWritePictures:
+    def test_all_kinds_with_their_words(self, tmp_path: Path) -> None:
+        rows = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
+        folder = tmp_path / "work" / "tour" / "seq"
+        for name in ("examples", "room"):
+            (folder / name).mkdir(parents=True)
+        np.savez(folder / "examples" / "7.npz", image=np.zeros((*SHAPE, 3), np.uint8), truth=full(3.0), K=K)
+        for n, row in enumerate(rows):
+            maps = {"depth": full(2.0 + 0.1 * n), "variance": full(0.1 + n)}
+            np.savez(folder / "examples" / f"7@{row.slug}.npz", **maps)
+        room = {
+            "mean_world": np.ones((2, 3)),
+            "covariance_world": np.eye(3)[None].repeat(2, 0),
+            "disagreement": [0, 1.0],
+        }
+        np.savez(folder / "room" / f"{rows[2].slug}_7.npz", **room, T_world_cam=np.eye(4))
+        records = tuple(Record("s", "tour", "seq", "FastDepth", row.method.name) for row in rows)
+        results = Results(tmp_path, {"suite": "s"}, records)
+        files = write_pictures(results, tmp_path)
+        pictures = read_index(tmp_path / "figures")
+        assert [p.kind for p in pictures] == [STRIP, BREAKDOWN, COMPARE, ROOM]
+        assert files == [*(tmp_path / "figures" / p.file for p in pictures), tmp_path / "figures" / "pictures.json"]
+        nll = mean_nll(find_examples(folder)[0], "Ensemble")
+        assert f"Ensemble (mean NLL {nll:.2f})" in pictures[0].alt
+        assert "2 Gaussians" in pictures[3].alt
+        files[0].unlink()
+        assert [p.kind for p in read_index(tmp_path / "figures")] == [BREAKDOWN, COMPARE, ROOM]
+        index = json.loads(files[-1].read_text())
+        index["pictures"][1].pop("alt")
+        files[-1].write_text(json.dumps(index))
+        with pytest.raises(ValueError, match="not an index of pictures"):
+            read_index(tmp_path / "figures")
+
+    def test_nothing_kept_nothing_drawn(self, tmp_path: Path) -> None:
+        results = Results(tmp_path, {"suite": "s"}, (Record("s", "d", "q", "N", "Ensemble"),))
+        assert write_pictures(results, tmp_path) == []
