@@ -13,6 +13,8 @@ from torch import Tensor
 
 from ufmstar_torch.eval.files import write_json_atomic
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+from ufmstar_torch.eval.packed_sums import pack
+from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.suite.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.row import Row
@@ -28,7 +30,7 @@ def rows_of(*names: str) -> list[Row]:
     return [Row(Method.parse(name)) for name in names]
 
 
-def draw_maps(row: Row, sequence: str, pixels: int = 3000) -> Maps:
+def draw_maps(row: Row, sequence: str, pixels: int = 800) -> Maps:
     """Depth, variance and truth [pixels]; rows of a sequence share depth and truth, noise on poses shortens sigma."""
     rng = np.random.default_rng(sum(map(ord, sequence)))
     truth = rng.uniform(1.0, 6.0, pixels)
@@ -77,7 +79,8 @@ def write_sequence(
     }
     for row in rows:
         judged, sums = judge(draw_maps(row, sequence), references)
-        torch.save(sums, folder / f"{row.slug}.pt")
+        packed = {name: {key: pack(value) for key, value in states.items()} for name, states in sums.items()}
+        torch.save(packed, folder / f"{row.slug}.pt")
         record_of(suite, dataset, sequence, row, judged, network).save(folder / f"{row.slug}.json")
 
 
@@ -100,6 +103,20 @@ def record_of(suite: str, dataset: str, sequence: str, row: Row, judged: Record,
         ms={"network": 9.0 * members, "uncertainty": {ALONE: 0.2, UFM: 14.0, UFM_STAR: 10.0}[row.method.fusion]},
         provenance={"device": "cpu"},
     )
+
+
+def in_memory(
+    figures: Mapping[tuple[Row, tuple[str, str]], Mapping[str, float]], suite: str = "own", **more: Any
+) -> Results:
+    """Results with the figures given by row and (data set, sequence), in that order, and no curves."""
+    records = [
+        record_of(suite, *where, row, Record("", "", "", "", "", figures=dict(values)))
+        for (row, where), values in figures.items()
+    ]
+    rows = dict.fromkeys(row for row, _ in figures)
+    listed = [{"method": row.method.name, "setting": row.setting.to_dict()} for row in rows]
+    about = {"format": 1, "suite": suite, "title": "Own suite", "rows": listed}
+    return Results(out=Path("nowhere"), about=about, records=tuple(records), **more)
 
 
 def write_about(out: Path, suite: str, title: str, rows: Sequence[Row], sequences: Sequence[tuple[str, str]]) -> None:

@@ -1,0 +1,309 @@
+"""Figures of a report: what their lines, bars and points say, read back from the artists."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluations import confident, draw_maps, in_memory, judge, record_of, rows_of, write_evaluation
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ufmstar_torch.eval.report.figure_style import (
+    label_ends,
+    new_figure,
+    save_figure,
+    short_name,
+    spread_apart,
+    style_of,
+)
+from ufmstar_torch.eval.report.figures import write_figures
+from ufmstar_torch.eval.report.figures_calibration import (
+    MOST_SEQUENCES,
+    chosen_sequences,
+    draw_calibration,
+    draw_sequence_calibration,
+)
+from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
+from ufmstar_torch.eval.report.figures_entropy import ONE_METRE, density, draw_entropy, entropy_range
+from ufmstar_torch.eval.report.figures_error import draw_error
+from ufmstar_torch.eval.report.figures_sweep import change, draw_changes, draw_sweep, level, points, sweeps
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.names import NLL
+from ufmstar_torch.eval.report.sums import Merged
+from ufmstar_torch.eval.report.write import write_report
+from ufmstar_torch.eval.suite.method import BASES, Method
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import Setting
+
+ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")
+ALONE, UFM, UFM_STAR, DEPTH, STAR_OF_DEPTH = ROWS
+SEQUENCES = ("a", "b")
+
+
+@pytest.fixture(scope="module")
+def results() -> Results:
+    """Judged maps of two sequences of one data set; the merged ones are those of the first."""
+    records, merged = [], {}
+    for sequence in SEQUENCES:
+        variances = {row: draw_maps(row, sequence)[1] for row in (ALONE, UFM)}
+        references = {row.method.name: confident(v) for row, v in variances.items() if v is not None}
+        for row in ROWS:
+            judged, _ = judge(draw_maps(row, sequence), references)
+            records.append(record_of("own", "rooms", sequence, row, judged))
+            merged.setdefault(("rooms", row), Merged(judged.figures, judged.curves))
+    empty = in_memory({(row, ("rooms", "a")): {} for row in ROWS})
+    return replace(empty, records=tuple(records), merged=merged)
+
+
+def drawn(axes: Any) -> dict[str, Any]:
+    """Lines by the name that their row has."""
+    return {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
+
+
+def words(axes: Any) -> list[str]:
+    return [text.get_text() for text in axes.texts]
+
+
+class TestCalibration:
+    def test_lines_are_the_curves_over_all_pixels(self, results):
+        figure = draw_calibration(results, "rooms")
+        shown = [axes for axes in figure.axes if axes.get_visible()]
+        assert [axes.get_title(loc="left") for axes in shown] == ["Ensemble", "DepthOnly", "", ""]
+        delta, quantile = drawn(shown[0]), drawn(shown[2])
+        assert list(delta) == list(quantile) == ["alone", "UfM-100K", "UfM*"]
+        for row in (ALONE, UFM, UFM_STAR):
+            curves = results.merged["rooms", row].curves
+            np.testing.assert_array_equal(quantile[short_name(row.method)].get_ydata(), curves["ece_q_observed"])
+            pixels = np.array(curves["ece_delta_pixels"])
+            kept = pixels > 0.001 * pixels.sum()
+            line = delta[short_name(row.method)]
+            np.testing.assert_array_equal(line.get_ydata(), np.array(curves["ece_delta_accuracy"], float)[kept])
+            assert line.get_color() == style_of(row.method).colour
+        assert list(drawn(shown[1])) == ["UfM*"]  # a network of depth alone has no variance of its own
+        assert set(words(shown[0])) == {"alone", "UfM-100K", "UfM*", "exactly right"}
+
+    def test_single_sequences_from_best_to_worst(self, results):
+        records = {r.sequence: r for r in results.of(UFM_STAR)}
+        by_error = sorted(SEQUENCES, key=lambda s: records[s].figures["ece_delta"])
+        assert chosen_sequences(results, "rooms", "ensemble") == by_error
+        figure = draw_sequence_calibration(results, "rooms", "ensemble")
+        first = records[by_error[0]]
+        line = drawn(figure.axes[len(SEQUENCES)])["UfM*"]
+        np.testing.assert_array_equal(line.get_ydata(), first.curves["ece_q_observed"])
+        assert figure.axes[0].get_title(loc="left").startswith(f"{by_error[0]}\nECE_δ ")
+        assert figure.axes[0].get_title(loc="left").endswith(f"→ {first.figures['ece_delta']:.3f}")
+
+    def test_at_most_a_dozen_evenly_chosen(self):
+        curve = {"ece_q_observed": [0.5]}
+        many = in_memory({(UFM_STAR, ("d", f"{i:03d}")): {"ece_delta": i / 100} for i in range(45)})
+        many = replace(many, records=tuple(replace(r, curves=curve) for r in many.records))
+        names = chosen_sequences(many, "d", "ensemble")
+        assert len(names) == MOST_SEQUENCES
+        assert (names[0], names[-1], names) == ("000", "044", sorted(names))
+
+    def test_nothing_without_a_variance(self, results):
+        alone = replace(results, merged={("rooms", DEPTH): results.merged["rooms", DEPTH]})
+        assert draw_calibration(alone, "rooms") is None
+        assert chosen_sequences(results, "elsewhere", "ensemble") == []
+
+
+class TestError:
+    def test_a_panel_per_reference(self, results):
+        figure = draw_error(results, "rooms")
+        shown = [axes for axes in figure.axes if axes.get_visible()]
+        assert [axes.get_title(loc="left") for axes in shown] == [
+            "Ensemble: where Ensemble is confident",
+            "Ensemble: where UfM-Ensemble-100K is confident",
+        ]
+        for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
+            for row in (ALONE, UFM, UFM_STAR):
+                line = drawn(axes)[row.method.name]
+                expected = results.merged["rooms", row].curves[f"nll_by_error:{reference}"]
+                np.testing.assert_array_equal(line.get_ydata(), expected)
+                np.testing.assert_array_equal(line.get_xdata(), np.arange(5, 100, 10))
+        assert words(shown[0]) == ["alone", "UfM-100K", "UfM*"]
+
+    def test_none_where_nothing_was_judged_so(self):
+        assert draw_error(in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}), "d") is None
+
+
+class TestEntropy:
+    def test_histograms_and_means(self, results):
+        figure = draw_entropy(results, "ensemble")
+        axes = figure.axes[0]
+        means = [line.get_xdata()[0] for line in axes.lines]
+        merged = [results.merged["rooms", row] for row in (ALONE, UFM, UFM_STAR)]
+        assert means == [m.figures["entropy"] for m in merged]
+        assert {line.get_linestyle() for line in axes.lines} == {"--"}
+        assert means[0] < means[1] < means[2]  # the drawn sigma is the shorter the more overconfident the method
+        for m in merged:
+            heights, edges = density(m)
+            assert (heights * np.diff(edges)).sum() == pytest.approx(1.0)  # no pixel lies outside here
+        assert words(axes) == [
+            f"{name}: mean {mean:.2f}" for name, mean in zip(("alone", "UfM-100K", "UfM*"), means, strict=True)
+        ]
+
+    def test_pixels_without_a_variance_are_told(self):
+        curves = {"entropy_counts": [25.0, 0.0, 75.0, 0.0], "entropy_edges": [-1.0, 0.0, 1.0]}
+        merged = Merged({"entropy": 0.5}, curves)
+        heights, _ = density(merged)
+        assert heights.tolist() == [0.0, 0.75]  # the share of all pixels, those without a variance among them
+        found = replace(in_memory({(UFM_STAR, ("d", "s")): {}}), merged={("d", UFM_STAR): merged})
+        assert words(draw_entropy(found, "ensemble").axes[0]) == ["UfM*: mean 0.50\n(25 % with hardly any V)"]
+
+    def test_range_holds_the_pixels(self):
+        edges = np.linspace(-8, 8, 65)
+        counts = np.zeros(66)
+        counts[1 + 20], counts[1 + 30] = 500, 500  # [-3, -2.75) and [-.5, -.25)
+        merged = Merged({}, {"entropy_counts": counts.tolist(), "entropy_edges": edges.tolist()})
+        assert entropy_range([merged]) == (-3.5, 0.25)
+
+    def test_one_metre(self):
+        assert pytest.approx(0.5 * math.log(2 * math.pi * math.e * 1.0**2)) == ONE_METRE
+
+
+def noisy(value: float, seed: int = 0) -> Row:
+    return Row(UFM_STAR.method, Setting(rotation_noise=value, seed=seed) if value else Setting())
+
+
+@pytest.fixture(scope="module")
+def swept() -> Results:
+    """NLL = level of the sequence + noise / 10, with two seeds at 2 degrees that differ by .2."""
+    values = {noisy(5.0): 0.5, noisy(0.0): 0.0, noisy(2.0, 1): 0.1, noisy(2.0, 2): 0.3, ALONE: 2.0}
+    levels = {"a": 1.0, "b": 4.0, "c": 10.0}
+    pairs = [(row, s) for row in values for s in levels]
+    return in_memory({(row, ("d", s)): {"nll": levels[s] + values[row], "ece_delta": 0.1} for row, s in pairs})
+
+
+class TestSweeps:
+    def test_points_rise_and_seeds_are_averaged_first(self, swept):
+        assert sweeps(swept) == [("ensemble", "rotation_noise")]
+        found = points(swept, UFM_STAR.method, "rotation_noise")
+        assert [point.value for point in found] == [0.0, 2.0, 5.0]
+        assert [len(point.rows) for point in found] == [1, 2, 1]
+        mean = level(swept, found[1], NLL)
+        assert (mean.value, mean.sequences) == (pytest.approx(5.2), 3)
+        deviation = math.sqrt((4.0**2 + 1.0**2 + 5.0**2) / 2)
+        assert mean.half == pytest.approx(4.302652729749464 * deviation / math.sqrt(3))
+
+    def test_the_change_is_in_pairs(self, swept):
+        found = change(swept, points(swept, UFM_STAR.method, "rotation_noise")[2], noisy(0.0), NLL)
+        assert (found.value, found.half) == (pytest.approx(0.5), pytest.approx(0.0, abs=1e-9))
+
+    def test_lines_bands_and_the_base_alone(self, swept):
+        figure = draw_sweep(swept, "ensemble", "rotation_noise")
+        above, below = figure.axes[0], figure.axes[3]
+        line, dashed = drawn(above)["UfM*-Ensemble"], drawn(above)["alone"]
+        np.testing.assert_allclose(line.get_xdata(), [0, 2, 5])
+        np.testing.assert_allclose(line.get_ydata(), [5.0, 5.2, 5.5])
+        assert (dashed.get_linestyle(), set(dashed.get_ydata())) == ("--", {7.0})
+        half = level(swept, points(swept, UFM_STAR.method, "rotation_noise")[0], NLL).half
+        band = above.collections[0].get_paths()[0].vertices
+        assert band[:, 1].min() == pytest.approx(5.0 - half)
+        np.testing.assert_allclose(drawn(below)["UfM*-Ensemble"].get_ydata(), [0, 0.2, 0.5], atol=1e-12)
+        assert figure.axes[-1].get_xlabel() == "rotation noise [°]"
+
+    def test_left_out_images_are_paired_with_the_base_on_the_same(self):
+        values = {0: (1.0, 3.0), 4: (2.0, 3.5), 16: (2.5, 2.6)}
+        figures = {}
+        for skip, (star, alone) in values.items():
+            figures[Row(UFM_STAR.method, Setting(skip=skip)), ("d", "s")] = {"nll": star}
+            figures[Row(ALONE.method, Setting(skip=skip)), ("d", "s")] = {"nll": alone}
+        figure = draw_sweep(in_memory(figures), "ensemble", "skip")
+        assert list(drawn(figure.axes[0])["alone"].get_ydata()) == [3.0, 3.5, 2.6]
+        np.testing.assert_allclose(drawn(figure.axes[3])["UfM*-Ensemble"].get_ydata(), [-2.0, -1.5, -0.1])
+
+    def test_changes_of_every_setting(self):
+        either = Row(UFM_STAR.method, Setting({"segment.prune": "either"}))
+        level_ = {"a": 1.0, "b": 4.0, "c": 10.0}
+        figures = {(UFM_STAR, ("d", s)): {"nll": v} for s, v in level_.items()}
+        figures |= {(either, ("d", s)): {"nll": v + 0.1 + v / 1000} for s, v in level_.items()}
+        figure = draw_changes(in_memory(figures), "ensemble")
+        axes = figure.axes[0]
+        point = axes.lines[1]  # after the line at 0
+        assert point.get_xdata()[0] == pytest.approx(0.105)
+        assert point.get_markerfacecolor() == style_of(either.method).colour  # beyond its interval: filled
+        assert [label.get_text() for label in axes.get_yticklabels()] == ["pruning rule either"]
+        assert draw_changes(in_memory({(UFM_STAR, ("d", "a")): {"nll": 1.0}}), "ensemble") is None
+
+    def test_two_values_are_no_sweep(self):
+        rows = [UFM_STAR, Row(UFM_STAR.method, Setting({"eta": 0.7}))]
+        assert sweeps(in_memory({(row, ("d", "s")): {"nll": 1.0} for row in rows})) == []
+
+
+class TestCost:
+    def test_bars_are_the_times(self, results):
+        axes = draw_latency(results).axes[0]
+        widths = [(bar.get_x(), bar.get_width()) for bar in axes.patches]
+        assert widths[:4] == [(0, 90.0), (90.0, pytest.approx(0.2)), (0, 9.0), (9.0, 14.0)]
+        assert [label.get_text() for label in axes.get_yticklabels()] == [row.method.name for row in ROWS]
+
+    def test_shares_of_the_stages(self, results):
+        times = dict(zip(STAGES, (0.5, 3.0, 1.0, 1.5, 0.5, 3.0, 0.5), strict=True))
+        stages = {"stages": {name: {"median_ms": ms} for name, ms in times.items()}}
+        row = {"row": "UfM*-Ensemble", "network": "FastDepth", "stages": stages}
+        axes = draw_stages(replace(results, efficiency={"rows": [row, {**row, "stages": None}]})).axes[0]
+        assert [bar.get_width() for bar in axes.patches] == pytest.approx([5, 30, 10, 15, 5, 30, 5])
+        assert "10.0 ms" in words(axes)
+        assert draw_stages(results) is None
+
+    def test_points_of_the_trade(self, results):
+        figure = draw_tradeoff(results)
+        by_memory = [(line.get_xdata()[0], line.get_ydata()[0]) for line in figure.axes[0].lines]
+        mean = np.mean([r.figures["ece_delta"] for r in results.of(UFM_STAR)])
+        assert by_memory[2] == pytest.approx((64 * 400 / 1e6, mean))
+        by_time = [line.get_xdata()[0] for line in figure.axes[1].lines]
+        assert by_time == pytest.approx([90.2, 23.0, 19.0, 19.0])
+        assert "Ensemble UfM*" in words(figure.axes[0])
+
+
+class TestStyle:
+    @given(st.lists(st.floats(0, 1), max_size=9), st.floats(0.01, 0.3))
+    def test_names_keep_apart_and_in_order(self, wanted, gap):
+        found = spread_apart(wanted, gap, 0, 1)
+        assert len(found) == len(wanted)
+        order = sorted(range(len(wanted)), key=lambda i: wanted[i])
+        kept = min(gap, 1 / max(len(wanted) - 1, 1))
+        assert all(found[j] - found[i] >= kept - 1e-9 for i, j in pairwise(order))
+        assert all(-1e-9 <= place <= 1 + 1e-9 for place in found)
+
+    def test_places_far_enough_apart_stay(self):
+        assert spread_apart([0.8, 0.1, 0.5], 0.2, 0, 1) == pytest.approx([0.8, 0.1, 0.5])
+        assert spread_apart([0.5, 0.5], 0.2, 0, 1) == pytest.approx([0.4, 0.6])
+
+    def test_every_kind_of_method_has_a_look_of_its_own(self):
+        kinds = ["Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM-FullEnsemble", "UfM*-Ensemble"]
+        kinds += ["UfM*-FullEnsemble", "UfM*-Ensemble-fixed-param"]
+        styles = [style_of(Method.parse(name)) for name in kinds]
+        assert len({s.colour for s in styles}) == len({s.marker for s in styles}) == len(kinds)
+        assert {style_of(Method(base)) for base in BASES} == {styles[0]}  # the same whatever the network
+
+    def test_the_same_figure_gives_the_same_file_and_no_global_state(self, tmp_path):
+        import matplotlib
+
+        before, pyplot = dict(matplotlib.rcParams), "matplotlib.pyplot" in sys.modules
+        for name in ("one.svg", "two.svg"):
+            figure = new_figure(3, 2, "title")
+            axes = figure.subplots()
+            axes.plot([0, 1], [0, 1])
+            label_ends(axes, [(1.0, "line", "red")])
+            save_figure(figure, tmp_path / name)
+        assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
+        assert dict(matplotlib.rcParams) == before
+        assert ("matplotlib.pyplot" in sys.modules) == pyplot
+
+
+def test_the_files_say_what_they_are(tmp_path):
+    out = write_evaluation(tmp_path / "o", ROWS[:1] + ROWS[2:3], [("rooms", "one two")], suite="own")
+    names = {path.relative_to(out).as_posix() for path in write_report(out, pictures="png")}
+    kinds = {"calibration-rooms", "calibration-sequences-rooms-ensemble", "error-rooms", "entropy-ensemble", "latency"}
+    assert {f"figures/{kind}.png" for kind in kinds} <= names
+    assert all((out / name).stat().st_size > 1000 for name in names if name.endswith(".png"))
+    with pytest.raises(ValueError, match="figures must be svg or png, got 'jpg'"):
+        write_figures(in_memory({}), "jpg")
