@@ -12,6 +12,10 @@ from ufmstar_torch.eval.ground_truth import truth_at
 from ufmstar_torch.eval.run_job import job_from
 from ufmstar_torch.eval.run_options import parse_run, run_parser
 from ufmstar_torch.eval.sequences import FrameError, check_sequence, find_sequences, open_sequence
+from ufmstar_torch.eval.suite.cache import PredictionCache
+from ufmstar_torch.eval.suite.evaluate import SequenceError, evaluate_sequence
+from ufmstar_torch.eval.suite.method import Method
+from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.nyu import NyuFrames
 
@@ -118,6 +122,18 @@ def test_a_run_that_compares_views_refuses_it(written, tmp_path):
     words = [str(written[0]), "--depth", "ground-truth", "--out", str(tmp_path / "out")]
     with pytest.raises(ValueError, match="single images without poses, which UfM\\* needs"):
         job_from(parse_run(run_parser(), words))
+
+
+def test_an_evaluation_refuses_rows_that_compare_views(written):
+    rows = [Row(Method.parse(name)) for name in ("Aleatoric", "UfM*-Aleatoric")]
+    with pytest.raises(SequenceError, match=r"single images without poses, on which UfM\*-Aleatoric cannot compare"):
+        evaluate_sequence(
+            open_sequence(written[0]),
+            rows,
+            {"aleatoric": None},
+            cache=PredictionCache(None),
+            device=torch.device("cpu"),
+        )
 
 
 def test_the_check_says_so(written):

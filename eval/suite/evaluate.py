@@ -20,6 +20,7 @@ from ufmstar_torch.eval.sequences.frame import Sequence
 from ufmstar_torch.eval.suite.cache import PredictionCache
 from ufmstar_torch.eval.suite.examples import Examples, ExampleWriter
 from ufmstar_torch.eval.suite.frame_pass import FramePass
+from ufmstar_torch.eval.suite.method import ALONE
 from ufmstar_torch.eval.suite.networks import BaseNetwork
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.row_run import RowRun
@@ -102,6 +103,9 @@ def evaluate_sequence(
         raise SequenceError(f"no frame is selected of {len(sequence)}")
     if all(sequence.entries[index].load_depth is None for index in indices):
         raise SequenceError("no frame has ground truth")
+    comparing = [row.method.name for row in rows if row.method.fusion != ALONE]
+    if comparing and not sequence.posed:
+        raise SequenceError(f"single images without poses, on which {', '.join(comparing)} cannot compare views")
     frames = FramePass(sequence, rows, networks, cache, device, confident)
     writer = None if examples is None else ExampleWriter(examples, len(indices))
     progress(0, len(indices))
