@@ -222,13 +222,15 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, list[
     folder = out / "figures"
     folder.mkdir()
     (folder / "calibration-scannet.svg").write_text('<svg width="90pt" height="45.0pt" xmlns="x"><g/></svg>')
+    (folder / "calibration-sequences-tum-x.svg").write_text('<svg width="8pt" height="8pt" xmlns="x"><g/></svg>')
     for name in ("strip.png", "stale.png"):
         Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(folder / name)
     index = [
         Picture(name, STRIP, f"{HOSTILE} {name}", "caption", f"alt {HOSTILE}") for name in ("strip.png", "stale.png")
     ]
     index_file = write_index(folder, index)
-    files = [out / "results.csv", folder / "calibration-scannet.svg", folder / "strip.png", index_file]
+    drawn = [folder / name for name in ("calibration-sequences-tum-x.svg", "calibration-scannet.svg", "strip.png")]
+    files = [out / "results.csv", *drawn, index_file]
     results = load_results(out, with_sums=False)
     return results, files, write_page(results, out, files)
 
@@ -257,11 +259,11 @@ class TestPage:
 
     def test_pictures_have_words_and_only_what_was_written_is_shown(self, page: Page) -> None:
         images = page.all("img")
-        assert [i["src"].split(";")[0] for i in images if i["src"]] == ["data:image/svg+xml", "data:image/webp"]
+        assert [i["src"].split(";")[0] for i in images if i["src"]] == [*["data:image/svg+xml"] * 2, "data:image/webp"]
         assert all(i["alt"] for i in images)
         assert (images[0]["width"], images[0]["height"]) == ("120", "60")  # 90 x 45 points
-        assert (images[1]["width"], images[1]["height"]) == ("30", "20")
-        assert images[1]["alt"] == f"alt {HOSTILE}"
+        assert (images[2]["width"], images[2]["height"]) == ("30", "20")
+        assert images[2]["alt"] == f"alt {HOSTILE}"
 
     def test_headings_ids_and_contents(self, page: Page) -> None:
         ids = [a["id"] for _, a in page.elements if "id" in a]
@@ -309,13 +311,13 @@ class TestPage:
         for sentence in [*headlines(results), *caveats(results)]:
             plain = re.sub(r"(?<![\w.–-])-(?=\d)", "−", sentence)
             assert plain in page.text
-        board = next(t for t in page.tables if t and t[0][:3] == ["UfM*", "beside", "sequences"])
-        assert [row[:3] for row in board[1:]] == [
-            ["UfM*-Ensemble", "Ensemble", "3"],
-            ["UfM*-Ensemble", "UfM-Ensemble-100K", "3"],
+        board = next(t for t in page.tables if t and t[0][0] == "UfM*, beside")
+        assert [row[0] for row in board[1:]] == [
+            "UfM*-Ensemble beside Ensemble, 3 sequences",
+            "UfM*-Ensemble beside UfM-Ensemble-100K, 3 sequences",
         ]
         verdicts = [c.verdict for c in next(iter(comparisons(results).values()))]
-        assert [cell.split(" ")[0] for cell in board[1][3:]] == verdicts
+        assert [cell.split(" ")[0] for cell in board[1][1:]] == verdicts
         assert "2 × pose is not finite" in page.text
         assert "later" in page.text
         assert "ufmstar eval --suite paper-table-1 --root scannet=DIR --root tum=DIR" in page.text
@@ -334,7 +336,7 @@ class TestPage:
         (tmp_path / "figures").mkdir()
         small = Page(write_page(results, tmp_path, files, most_bytes=10).read_text(encoding="utf-8"))
         assert small.all("img") == []
-        assert "2 pictures did not fit into this page: calibration-scannet.svg, strip.png." in small.text
+        assert "3 pictures did not fit into this page: calibration-scannet.svg, calibration-seq" in small.text
 
     def test_embedding_refuses_other_files(self, tmp_path: Path) -> None:
         (tmp_path / "a.svg").write_text("<svg/>")

@@ -96,6 +96,7 @@ def test_rooms_in_the_world(folder, networks, sequence):
     np.testing.assert_array_equal(stored["weight"], mixture.weight[0][used])
     np.testing.assert_array_equal(stored["disagreement"], mixture.disagreement[0][used])
     np.testing.assert_array_equal(stored["T_world_cam"], sequence[5].T_world_cam)
+    np.testing.assert_array_equal(stored["path"], [frame.T_world_cam[:3, 3] for frame in sequence])
 
 
 def test_a_broken_frame_hands_its_place_to_the_next(networks, tmp_path):

@@ -80,8 +80,9 @@ def _document(results: Results, parts: Sequence[Part], embedder: Embedder) -> st
     sections = [tag("section", tag("h2", part.title, id=name), part.body, aria_labelledby=name) for name, part in named]
     body = tag(
         "div",
+        _head(results),
         tag("nav", tag("h2", "Contents"), contents, aria_label="contents"),
-        tag("main", _head(results), sections, _footer(embedder)),
+        tag("main", sections, _footer(embedder)),
         class_="frame",
     )
     head = tag(

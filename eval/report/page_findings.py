@@ -13,6 +13,7 @@ from ufmstar_torch.eval.report.findings import (
     Comparison,
     best_rows,
     comparisons,
+    count,
     headlines,
 )
 from ufmstar_torch.eval.report.html_table import framed
@@ -61,13 +62,14 @@ _HOW = (
 def _board(found: Mapping[tuple[Row, Row], Sequence[Comparison]], title: str) -> Markup:
     """A line for each pair of rows, a verdict for each figure."""
     shown = [q for q in DIFFERENCES if any(c.quantity is q for made in found.values() for c in made)]
-    heads = ["UfM*", "beside", "sequences", *(q.heading for q in shown)]
+    heads = ["UfM*, beside", *(q.heading for q in shown)]
     lines = []
     for (row, reference), made in found.items():
         by_figure = {c.quantity.key: c for c in made}
-        sequences = max(c.difference.sequences for c in made)
-        names = [tag("th", row_label(row), scope="row"), tag("td", row_label(reference)), tag("td", str(sequences))]
-        lines.append(tag("tr", names, [_verdict(by_figure.get(q.key)) for q in shown]))
+        sequences = count(max(c.difference.sequences for c in made), "sequence")
+        beside = tag("span", f"beside {row_label(reference)}, {sequences}", class_="beside")
+        name = tag("th", row_label(row), " ", beside, scope="row")
+        lines.append(tag("tr", name, [_verdict(by_figure.get(q.key)) for q in shown]))
     head = tag("thead", tag("tr", [tag("th", name, scope="col") for name in heads]))
     return framed(tag("table", tag("caption", title), head, tag("tbody", lines), class_="board"), title, ())
 

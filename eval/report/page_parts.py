@@ -88,8 +88,14 @@ def figure_parts(files: Iterable[Path], embedder: Embedder) -> list[Part]:
     parts = []
     for kind in [*(k for k in _FIGURES if k in by_kind), *(k for k in by_kind if k not in _FIGURES)]:
         title, words = _FIGURES.get(kind, ("Further diagrams", ""))
-        drawn = (figure(embedder, path, f"{title}: {_spoken(path)}") for path in by_kind[kind])
-        body = [shown for shown in drawn if shown is not None]
+        # Single sequences come last, folded: they are many, and tall.
+        paths = sorted(by_kind[kind], key=_is_of_sequences)
+        drawn = ((path, figure(embedder, path, f"{title}: {_spoken(path)}")) for path in paths)
+        body = [
+            folded(_spoken(path).removeprefix(kind).strip(), shown) if _is_of_sequences(path) else shown
+            for path, shown in drawn
+            if shown is not None
+        ]
         if body:
             parts.append(Part(title, [paragraph(words), *body] if words else body))
     return parts
@@ -183,6 +189,10 @@ def _skipped(results: Results) -> list[tuple[str, str, str, str, str]]:
 
 def _kind(path: Path) -> str:
     return path.stem.replace("_", "-").split("-")[0]
+
+
+def _is_of_sequences(path: Path) -> bool:
+    return path.stem.replace("_", "-").split("-")[1:2] == ["sequences"]
 
 
 def _spoken(path: Path) -> str:

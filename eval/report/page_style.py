@@ -20,9 +20,11 @@ body {
   margin: 0; background: var(--paper); color: var(--ink);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", "Liberation Sans", sans-serif;
 }
-.frame { display: grid; grid-template-columns: 13.5rem minmax(0, 1fr); gap: 2rem; max-width: 88rem; margin: 0 auto;
+.frame { display: grid; grid-template-columns: 13.5rem minmax(0, 1fr); gap: 0 2rem;
+  grid-template-areas: "nav head" "nav main"; grid-template-rows: auto 1fr; max-width: 88rem; margin: 0 auto;
   padding: 0 1.5rem; }
-nav { position: sticky; top: 0; align-self: start; max-height: 100vh; overflow: auto; padding: 2.2rem 0;
+header { grid-area: head; padding-top: 2rem; min-width: 0; }
+nav { grid-area: nav; position: sticky; top: 0; align-self: start; max-height: 100vh; overflow: auto; padding: 2.2rem 0;
   font-size: .9rem; }
 nav h2 { font-size: .78rem; letter-spacing: .06em; text-transform: uppercase; color: var(--faint); margin: 0 0 .5rem;
   border: 0; padding: 0; }
@@ -30,7 +32,7 @@ nav ol { list-style: none; margin: 0; padding: 0; }
 nav a { display: block; padding: .22rem 0 .22rem .7rem; color: var(--ink); text-decoration: none;
   border-left: 2px solid var(--line); }
 nav a:hover, nav a:focus-visible { border-color: var(--accent); color: var(--accent); }
-main { padding: 2rem 0 4rem; min-width: 0; }
+main { grid-area: main; padding: 0 0 4rem; min-width: 0; }
 h1 { font-size: clamp(1.6rem, 4.5vw, 2.3rem); line-height: 1.18; margin: 0 0 .4rem; text-wrap: balance; }
 h2 { font-size: 1.4rem; line-height: 1.25; margin: 3.2rem 0 .8rem; padding-top: .9rem;
   border-top: 1px solid var(--line); }
@@ -49,7 +51,8 @@ code { font: .88em ui-monospace, "SF Mono", Menlo, Consolas, "Liberation Mono", 
 .verdict { font-weight: 600; white-space: nowrap; }
 .better { color: var(--good); } .worse { color: var(--bad); } .open, .single { color: var(--even); }
 table.board td { border-left: 1px solid var(--line); }
-.board .verdict { display: block; }
+.board .verdict, .beside { display: block; }
+.beside { color: var(--faint); font-size: .88em; }
 .table { margin: 1rem 0 1.6rem; }
 .scroll { overflow-x: auto; background: var(--card); border: 1px solid var(--line); border-radius: .5rem; }
 .scroll:focus-visible, summary:focus-visible, .zoom:focus-visible { outline: 2px solid var(--accent);
@@ -88,10 +91,11 @@ dialog img { display: block; max-width: none; cursor: zoom-out; }
 footer { border-top: 1px solid var(--line); margin-top: 3rem; padding-top: 1rem; color: var(--faint);
   font-size: .88rem; }
 @media (max-width: 62rem) {
-  .frame { grid-template-columns: minmax(0, 1fr); gap: 0; padding: 0 1rem; }
-  nav { position: static; max-height: none; padding: 1.2rem 0 0; }
-  nav ol { columns: 12rem; column-gap: 1.2rem; }
-  main { padding-top: 1.2rem; }
+  .frame { grid-template-columns: minmax(0, 1fr); grid-template-areas: "head" "nav" "main"; padding: 0 1rem; }
+  header { padding-top: 1.2rem; }
+  nav { position: static; max-height: none; padding: 0; }
+  nav ol { columns: 9.5rem; column-gap: 1rem; }
+  nav li { break-inside: avoid; }
 }
 @media (max-width: 34rem) {
   /* A strip of five pictures is not readable at the width of a phone: it scrolls. */

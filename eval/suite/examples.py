@@ -6,7 +6,8 @@ Written while a sequence is evaluated, below its folder::
     examples/FRAME@ROW.npz  depth [m], and where the row has them variance, aleatoric, epistemic, disagreement [m^2],
                             each [h, w] float32; image, truth and K too where the row's are others than the frame's
     room/ROW_FRAME.npz      UfM*'s mixture after the frame in the world: mean_world [K, 3] [m], covariance_world
-                            [K, 3, 3] [m^2], weight [K] [px], disagreement [K] [m^2]; T_world_cam [4, 4]
+                            [K, 3, 3] [m^2], weight [K] [px], disagreement [K] [m^2]; T_world_cam [4, 4]; path [n, 3]
+                            where the camera has been until then [m]
 """
 
 from __future__ import annotations
@@ -85,6 +86,7 @@ class ExampleWriter:
         self._examples = examples
         self._frames = _Schedule([(n + 0.5) / examples.frames for n in range(examples.frames)], total)
         self._rooms = _Schedule(ROOM_SHARES if examples.room else (), total)
+        self._paths: dict[str, list[NDArray[np.float64]]] = {}
 
     def after(self, done: int, finished: FinishedFrame | None, runs: Sequence[RowRun]) -> None:
         """After each frame.
@@ -99,6 +101,9 @@ class ExampleWriter:
         """
         if finished is None:
             return
+        for run in runs:
+            if self._examples.room and isinstance(run.estimator, Gaussians) and run.last is not None:
+                self._paths.setdefault(run.row.slug, []).append(np.asarray(run.last[1])[:3, 3].copy())
         if self._frames.due(done):
             self._write_frame(finished)
         if self._rooms.due(done):
@@ -132,7 +137,8 @@ class ExampleWriter:
         for run in runs:
             if isinstance(run.estimator, Gaussians) and run.last is not None:
                 name, T_world_cam = run.last
-                arrays = {**_room(run.estimator), "T_world_cam": T_world_cam}
+                path = np.array(self._paths[run.row.slug])
+                arrays = {**_room(run.estimator), "T_world_cam": T_world_cam, "path": path}
                 _write(folder / f"{run.row.slug}_{name}.npz", arrays)
 
 
