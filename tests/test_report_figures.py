@@ -118,8 +118,8 @@ class TestError:
         figure = draw_error(results, "rooms")
         shown = [axes for axes in figure.axes if axes.get_visible()]
         assert [axes.get_title(loc="left") for axes in shown] == [
-            "Ensemble: where Ensemble is confident",
-            "Ensemble: where UfM-Ensemble-100K is confident",
+            "Ensemble: where it is confident",
+            "Ensemble: where UfM-100K is confident",
         ]
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):
@@ -259,6 +259,11 @@ class TestCost:
         mean = np.mean([r.figures["ece_delta"] for r in results.of(UFM_STAR)])
         assert by_memory[2] == pytest.approx((64 * 400 / 1e6, mean))
         by_time = [line.get_xdata()[0] for line in figure.axes[1].lines]
+        # Without the network's time (its predictions came from the cache) there is no time per frame.
+        untimed = [replace(r, ms={"uncertainty": 1.0}) if r.method == "Ensemble" else r for r in results.records]
+        cached = replace(results, records=tuple(untimed))
+        assert [line.get_xdata()[0] for line in draw_tradeoff(cached).axes[1].lines] == pytest.approx([23, 19, 19])
+        assert "network not timed + 1.0 ms" in {text.strip() for text in words(draw_latency(cached).axes[0])}
         assert by_time == pytest.approx([90.2, 23.0, 19.0, 19.0])
         assert "Ensemble UfM*" in words(figure.axes[0])
 

@@ -38,7 +38,9 @@ def value_of(record: Record, key: str) -> float:
     """A figure of a record by ``Quantity.key``; NaN where it has none."""
     group, _, name = key.rpartition(".")
     if key == "ms.total":
-        return math.fsum(record.ms.values()) if record.ms else math.nan
+        parts = [record.ms.get(part) for part in ("network", "uncertainty")]
+        # Predictions from the cache were not timed: without them there is no sum.
+        return math.nan if None in parts else math.fsum(float(part) for part in parts if part is not None)
     value = {"": record.figures, "state": record.state, "ms": record.ms, "frames": record.frames}[group].get(name)
     return math.nan if value is None else float(value)
 

@@ -55,6 +55,11 @@ def short_name(method: Method) -> str:
     return f"{name}{'-Full' if method.full else ''}{cap}{' fixed-param' if method.fixed_param else ''}"
 
 
+def counted(sequences: int) -> str:
+    """ "1 sequence", "6 sequences"."""
+    return f"{sequences} sequence{'' if sequences == 1 else 's'}"
+
+
 def new_figure(width: float, height: float, title: str) -> Any:
     """A figure with a title [inches].
 

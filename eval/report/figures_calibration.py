@@ -9,7 +9,7 @@ import numpy as np
 
 from ufmstar_torch.eval.plots import FAINT
 from ufmstar_torch.eval.report.aggregate import value_of
-from ufmstar_torch.eval.report.figure_style import finish, label_ends, new_figure, short_name, style_of
+from ufmstar_torch.eval.report.figure_style import counted, finish, label_ends, new_figure, short_name, style_of
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.suite.method import BASES, UFM_STAR
 from ufmstar_torch.eval.suite.record import Record
@@ -28,7 +28,7 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
         return None
     columns = min(len(bases), PER_LINE)
     lines = -(-len(bases) // columns)
-    title = f"Calibration on {dataset}, all pixels of {len(results.sequences(dataset))} sequence(s)"
+    title = f"Calibration on {dataset}, all pixels of {counted(len(results.sequences(dataset)))}"
     figure = new_figure(0.5 + 3.4 * columns, 0.4 + 6.0 * lines, title)
     axes = figure.subplots(2 * lines, columns, squeeze=False)
     for place in axes.flat:

@@ -10,12 +10,13 @@ from ufmstar_torch.eval.plots import FAINT, INK
 from ufmstar_torch.eval.report.aggregate import mean_of
 from ufmstar_torch.eval.report.figure_style import TICK, finish, new_figure, short_name, spread_apart, style_of
 from ufmstar_torch.eval.report.load import Results
-from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, UNCERTAINTY_MS, Quantity
+from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
 from ufmstar_torch.eval.suite.method import BASES
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.setting import DEFAULT
 
 NETWORK_COLOUR = "#bdbdbd"
+MOST_NAMES = 10  # more points have a legend instead
 # The stages of a step of UfM*, from dark to light, as a print in grey needs it.
 STAGES = {
     "check": "#4d4d4d", "segment": "#0072B2", "correspond": "#009E73", "fuse": "#D55E00", "append": "#CC79A7",
@@ -38,11 +39,12 @@ def draw_latency(results: Results) -> Any | None:
     longest = 0.0
     for y, (row, network, uncertainty) in enumerate(timed):
         n, u = (0.0 if math.isnan(mean.value) else mean.value for mean in (network, uncertainty))
+        told = "network not timed" if math.isnan(network.value) else f"{n:.1f}"
         axes.barh(y, n, color=NETWORK_COLOUR, height=0.66)
         axes.barh(y, u, left=n, color=style_of(row.method).colour, height=0.66)
-        axes.text(n + u, y, f"  {n:.1f} + {u:.1f} ms", size=TICK, va="center", color=INK)
+        axes.text(n + u, y, f"  {told} + {u:.1f} ms", size=TICK, va="center", color=INK)
         longest = max(longest, n + u)
-    axes.set_xlim(0, 1.22 * longest)
+    axes.set_xlim(0, 1.3 * longest)
     axes.set_ylim(len(timed) - 0.4, -0.6)
     axes.set_yticks(range(len(timed)), [row.method.name for row, _, _ in timed])
     finish(axes, x="network (grey) + uncertainty (coloured) [ms], mean over sequences of the median frame")
@@ -96,31 +98,45 @@ def _draw_stages(axes: Any, y: int, times: Mapping[str, float]) -> None:
 
 def draw_tradeoff(results: Results, dataset: str | None = None) -> Any | None:
     """ECE_delta against the bytes that are kept between frames, and against the time per frame; None without points."""
-    costs = (STATE, Quantity("ms.total", "time per frame", "", 1, None, "ms"))
     points = {row: mean_of(results.of(row, dataset), ECE_DELTA) for row in _rows(results)}
     points = {row: mean for row, mean in points.items() if not math.isnan(mean.value)}
-    panels = [[(row, mean_of(results.of(row, dataset), cost).value) for row in points] for cost in costs]
-    panels = [[(row, 0.0 if math.isnan(x) else x) for row, x in panel] for panel in panels]
-    if not points or not any(x for _, x in panels[0]):
+    kept = {row: mean_of(results.of(row, dataset), STATE).value for row in points}
+    kept = {row: 0.0 if math.isnan(x) else x for row, x in kept.items()}  # a method alone keeps nothing
+    took = {row: mean_of(results.of(row, dataset), TOTAL_MS).value for row in points}
+    took = {row: x for row, x in took.items() if not math.isnan(x)}
+    if not any(kept.values()):
         return None
     where = dataset or "all sequences"
     figure = new_figure(11.0, 4.8, f"Calibration against cost on {where}")
-    for axes, panel, cost in zip(figure.subplots(1, 2), panels, costs, strict=True):
-        for row, x in panel:
+    words = ("kept between frames [MB]", "time per frame [ms]")
+    for axes, panel, word in zip(figure.subplots(1, 2, sharey=True), (kept, took), words, strict=True):
+        for row, x in panel.items():
             mean = points[row]
             half = 0.0 if math.isnan(mean.half) else mean.half
             axes.errorbar(
                 x, mean.value, yerr=half, color=style_of(row.method).colour, marker=_BASE_MARKERS[row.method.base],
                 markersize=6, linewidth=1, elinewidth=0.5, capsize=0,
             )  # fmt: skip
-        _cost_axis(axes, [x for _, x in panel])
-        finish(
-            axes,
-            x=f"{'kept between frames' if cost is STATE else cost.name} [{cost.unit}]",
-            y="ECE_δ ↓ (bar: 95 % interval)",
-        )
-        _name_points(axes, [(x, points[row].value, row) for row, x in panel])
+        _cost_axis(axes, list(panel.values()))
+        finish(axes, x=word, y="ECE_δ ↓ (bar: 95 % interval)")
+        if len(points) <= MOST_NAMES:
+            _name_points(axes, [(x, points[row].value, row) for row, x in panel.items()])
+    if len(points) > MOST_NAMES:
+        figure.legend(handles=_legend(list(points)), loc="outside right upper", frameon=False, fontsize=TICK)
     return figure
+
+
+def _legend(rows: Sequence[Row]) -> list[Any]:
+    """Colours are methods, marks are networks."""
+    from matplotlib.lines import Line2D
+
+    plain: dict[str, Any] = {"linestyle": "", "markersize": 6}
+    methods = {short_name(row.method): style_of(row.method).colour for row in rows}
+    bases = dict.fromkeys(row.method.base for row in rows)
+    return [
+        *(Line2D([], [], marker="o", color=colour, label=name, **plain) for name, colour in methods.items()),
+        *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **plain) for base in bases),
+    ]
 
 
 def _cost_axis(axes: Any, values: Sequence[float]) -> None:
@@ -130,7 +146,7 @@ def _cost_axis(axes: Any, values: Sequence[float]) -> None:
         if min(values) > 0:
             axes.set_xscale("log")
         else:
-            axes.set_xscale("symlog", linthresh=min(positive) / 2, linscale=0.4)
+            axes.set_xscale("symlog", linthresh=min(positive) / 2, linscale=0.8)
     else:
         axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")

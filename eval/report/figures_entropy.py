@@ -19,7 +19,7 @@ from ufmstar_torch.eval.suite.setting import DEFAULT
 
 # Entropy [nats] of a Gaussian with a standard deviation of 1 m.
 ONE_METRE = 0.5 * math.log(2 * math.pi * math.e)
-_SIGMAS = (0.001, 0.01, 0.1, 1.0, 10.0, 100.0)
+_DECADES = (0.001, 0.01, 0.1, 1.0, 10.0, 100.0)
 
 
 def draw_entropy(results: Results, base: str) -> Any | None:
@@ -64,7 +64,7 @@ def _draw(axes: Any, rows: Mapping[Row, Merged]) -> None:
         colour = style_of(row.method).colour
         heights, edges = density(merged)
         axes.stairs(heights, edges, color=colour, linewidth=1.5, label=short_name(row.method))
-        if row.method.fusion == UFM_STAR:
+        if row.method.fusion == UFM_STAR and not row.method.full:
             axes.stairs(heights, edges, color=colour, alpha=0.15, fill=True)
         mean = merged.figures["entropy"]
         axes.axvline(mean, color=colour, linestyle="--", linewidth=1.1)
@@ -82,7 +82,10 @@ def _below(merged: Merged) -> str:
 def _sigma_axis(axes: Any, low: float, high: float) -> None:
     """The same axis in metres of a standard deviation, above."""
     twin = axes.secondary_xaxis("top", functions=(lambda h: h - ONE_METRE, lambda s: s + ONE_METRE))
-    shown = [sigma for sigma in _SIGMAS if low <= math.log(sigma) + ONE_METRE <= high]
+    decades = [sigma for sigma in _DECADES if low <= math.log(sigma) + ONE_METRE <= high]
+    finer = [factor * sigma for sigma in _DECADES for factor in (1, 2, 5)]
+    within = [sigma for sigma in finer if low <= math.log(sigma) + ONE_METRE <= high]
+    shown = decades if len(decades) > 2 else within
     twin.set_xticks([math.log(sigma) for sigma in shown], [f"σ = {sigma:g} m" for sigma in shown])
     twin.tick_params(labelsize=TICK - 1, color=FAINT, labelcolor=INK)
     twin.spines["top"].set_visible(False)

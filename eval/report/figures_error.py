@@ -10,7 +10,7 @@ import numpy as np
 from ufmstar_torch.eval.report.figure_style import finish, label_ends, new_figure, short_name, style_of
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.sums import BY_ERROR
-from ufmstar_torch.eval.suite.method import BASES, UFM_STAR, Method
+from ufmstar_torch.eval.suite.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.setting import DEFAULT
 
@@ -30,7 +30,7 @@ def draw_error(results: Results, dataset: str) -> Any | None:
         place.set_visible(False)
     for line, (base, found) in zip(axes, panels.items(), strict=True):
         for place, (reference, curves) in zip(line, found.items(), strict=False):
-            _draw(place, f"{BASES[base][0]}: where {reference} is confident", curves)
+            _draw(place, f"{BASES[base][0]}: where {_spoken(reference)} is confident", curves)
     return figure
 
 
@@ -60,6 +60,12 @@ def _panels(results: Results, dataset: str, base: str) -> dict[str, _Curves]:
                 found.setdefault(reference, {})[row] = values
     own = {name: curves for name, curves in found.items() if Method.parse(name).base == base}
     return {name: own[name] for name in sorted(own, key=lambda name: (name.startswith("UfM"), name))}
+
+
+def _spoken(reference: str) -> str:
+    """A reference beside the name of its base: "it" alone, "UfM-100K"."""
+    method = Method.parse(reference)
+    return "it" if method.fusion == ALONE else short_name(method)
 
 
 def _bases(results: Results) -> list[str]:

@@ -15,6 +15,7 @@ from ufmstar_torch.eval.report.figure_style import (
     ALONE_STYLE,
     LABEL,
     TICK,
+    counted,
     finish,
     label_ends,
     new_figure,
@@ -85,7 +86,7 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     methods = [m for m in _methods(results, base) if m.fusion != ALONE and len(points(results, m, name)) > 1]
     paired = any(Row(method) in results.rows for method in methods)
     word, unit = SETTINGS.get(name, (setting_name(name), ""))
-    title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {len(results.sequences())} sequence(s)"
+    title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {counted(len(results.sequences()))}"
     figure = new_figure(4.0 * len(SHOWN), 6.0 if paired else 3.4, title)
     axes = figure.subplots(1 + paired, len(SHOWN), squeeze=False, sharex=True)
     for column, quantity in enumerate(SHOWN):
@@ -172,7 +173,7 @@ def draw_changes(results: Results, base: str) -> Any | None:
     if not lines:
         return None
     shown = [q for q in DIFFERENCES if q.key not in ("ause_rmse",)]
-    title = f"What each setting changes: {BASES[base][0]}, in pairs on {len(results.sequences())} sequence(s)"
+    title = f"What each setting changes: {BASES[base][0]}, in pairs on {counted(len(results.sequences()))}"
     figure = new_figure(2.8 + 2.3 * len(shown), 1.3 + 0.24 * len(lines), title)
     axes = figure.subplots(1, len(shown), squeeze=False, sharey=True)[0]
     for place, quantity in zip(axes, shown, strict=True):

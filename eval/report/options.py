@@ -20,9 +20,7 @@ def parse_report(arguments: Sequence[str]) -> argparse.Namespace:
     """
     parser = argparse.ArgumentParser(prog="ufmstar report", description=_DESCRIPTION)
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of `ufmstar eval`")
-    parser.add_argument(
-        "--no-figures", action="store_true", help="tables and results alone (needs no matplotlib)"
-    )
+    parser.add_argument("--no-figures", action="store_true", help="tables and results alone (needs no matplotlib)")
     parser.add_argument("--format", choices=("svg", "png"), default="svg", help="of the figures (default: svg)")
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
     return parser.parse_args(list(arguments))

@@ -34,6 +34,8 @@ class Cell:
         """A mean with its interval; intervals below .01 are left out, and those of a single sequence."""
         if math.isnan(mean.value):
             return cls()
+        if decimals is None:
+            decimals = significant(mean.value)
         value = number(mean.value, decimals, signed=signed)
         wide = mean.half >= SMALL_INTERVAL or (signed and mean.half > 0)
         return cls(value, number(mean.half, decimals) if wide else "", bold)
@@ -93,11 +95,16 @@ def number(value: float, decimals: int | None, *, signed: bool = False) -> str:
     """A number as printed: never "-0.00", and large ones with an exponent; decimals None = three significant digits."""
     sign = "+" if signed else ""
     if decimals is None:
-        decimals = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+        decimals = significant(value)
     if abs(value) >= 1e6:
         return f"{value:{sign}.2e}"
     text = f"{value:{sign}.{decimals}f}"
     return text.replace("-", "+" if signed else "") if float(text) == 0 else text
+
+
+def significant(value: float) -> int:
+    """Decimals with which a number has three significant digits."""
+    return max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
 
 
 def mark_best(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
