@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from evaluations import NETWORK, draw_maps, in_memory, rows_of, write_evaluation
 from hypothesis import given
 from hypothesis import strategies as st
 from shared_data import require_shared
+from test_efficiency_table import line as measured_line
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.metrics import SequenceMetrics
@@ -23,9 +25,10 @@ from ufmstar_torch.eval.report.load import Results, ResultsError, load_results, 
 from ufmstar_torch.eval.report.markdown import markdown
 from ufmstar_torch.eval.report.names import ECE_DELTA, NLL, SPEARMAN, row_label
 from ufmstar_torch.eval.report.paper import BY_SUITE, TABLE_1, TABLE_2, TABLE_2_NETWORKS, TABLE_3, TABLE_4, Quoted
+from ufmstar_torch.eval.report.paper_efficiency import paper_efficiency_tables
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, mark_best, number
 from ufmstar_torch.eval.report.tables import difference_table, extra_table, main_table, sequence_tables
-from ufmstar_torch.eval.report.write import summary, write_report
+from ufmstar_torch.eval.report.write import summary, write_report, write_tables
 from ufmstar_torch.eval.suite.method import Method
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.setting import Setting
@@ -107,6 +110,27 @@ class TestThePapersNumbers:
         source = require_shared("paper/ufmstar.tex").read_text()
         told = re.findall(r"Lat\.: (\S+) ms.*?Mem\.: (\S+) MB", source, re.DOTALL)
         assert told == [(ms.value, mb.value) for ms, mb in TABLE_2_NETWORKS.values()]
+
+    def test_table_2_in_print(self):
+        ours = paper_efficiency_tables(["FastDepth (8 bit)"])
+        assert [table.title for table in ours] == ["The paper's table 2, FastDepth"]
+        cells = parsed(markdown(ours[0]))["UfM-Aleatoric-100K"]
+        assert list(cells.values()) == ["&lt;1", "3.9", "1", "60", "1.6", "95", "66", "&lt;0.01", "4.0", "20.2"]
+        assert parsed(markdown(ours[0]))["Ensemble"]["MVD mem. [MB]"] == "–"
+        assert len(paper_efficiency_tables(["Depth Anything V2"])) == 2  # none of its two: both
+        for table in paper_efficiency_tables(TABLE_2):
+            TestLatex.check(latex(table).removeprefix("%"))
+
+    def test_table_2_stands_below_what_was_measured(self, tmp_path):
+        found = in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}, efficiency=measured_line())
+        written = write_tables(replace(found, out=tmp_path))
+        assert {tmp_path / "tables" / "efficiency.md", tmp_path / "tables" / "efficiency.tex"} <= set(written)
+        text = (tmp_path / "tables" / "efficiency.md").read_text()
+        ours, theirs = text.split("### ")[1:]
+        assert ours.startswith("Efficiency of uncertainty, ResNet50-Monodepth2")
+        assert theirs.startswith("The paper's table 2, ResNet50-Monodepth2")
+        assert list(parsed(ours)["Ensemble"]) == list(parsed(theirs)["Ensemble"])  # column below column
+        assert parsed(theirs)["Ensemble"]["GPU Energy [mJ]"] == "1857"
 
     def test_every_method_of_theirs_is_one_of_ours(self):
         for table in (*BY_SUITE.values(), *TABLE_2.values()):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ufmstar_torch.eval.files import write_atomic
 from ufmstar_torch.eval.report.latex import latex
 from ufmstar_torch.eval.report.load import Results, load_results
 from ufmstar_torch.eval.report.markdown import markdown
+from ufmstar_torch.eval.report.paper_efficiency import paper_efficiency_tables
 from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.report.tables import difference_table, extra_table, is_empty, main_table, sequence_tables
 from ufmstar_torch.eval.report.tidy import write_tidy
@@ -44,7 +47,8 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> l
 
 def write_tables(results: Results) -> list[Path]:
     """Write ``tables/NAME.md`` and ``tables/NAME.tex``: main, extra and differences over all sequences and, where
-    there are several data sets, over those of each, and ``sequences-DATASET`` for single sequences.
+    there are several data sets, over those of each, ``sequences-DATASET`` for single sequences, and ``efficiency``
+    with the paper's table 2 below ours where it was measured.
 
     Returns:
         Their paths.
@@ -63,6 +67,8 @@ def write_tables(results: Results) -> list[Path]:
             files[f"{table.name}{suffix}"] = [table]
     for dataset in results.datasets:
         files[f"sequences-{dataset}"] = sequence_tables(results, dataset)
+    if results.efficiency is not None:
+        files["efficiency"] = _efficiency(results.efficiency)
     written = []
     for name, tables in files.items():
         told = [table for table in tables if not is_empty(table)]
@@ -70,6 +76,13 @@ def write_tables(results: Results) -> list[Path]:
             if told:
                 written.append(_write_text(folder / f"{name}.{suffix}", "\n".join(map(render, told))))
     return written
+
+
+def _efficiency(measured: Mapping[str, Any]) -> list[Table]:
+    """Ours, and the paper's below."""
+    from ufmstar_torch.eval.efficiency.table import efficiency_tables
+
+    return [*efficiency_tables(measured), *paper_efficiency_tables(row["network"] for row in measured["rows"])]
 
 
 def summary(results: Results) -> str:
