@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -161,3 +162,28 @@ def write_evaluation(
         values = {"sequence": sequence, "reason": reason, "rows": [row.slug for row in rows]}
         (folder / "failed.json").write_text(json.dumps(values))
     return out
+
+
+def parsed(text: str) -> dict[str, dict[str, str]]:
+    """Cells of a Markdown table by the first cell of their row and by heading, without the marks of bold type."""
+    lines = [line.strip("|").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    head, _, *rows = [[cell.strip() for cell in line] for line in lines]
+    plain = [[cell.replace("**", "").replace("\\", "") for cell in row] for row in rows]
+    return {row[0]: dict(zip(head[1:], row[1:], strict=True)) for row in plain}
+
+
+def check_latex(text: str) -> None:
+    """Assert that it can be set: braces, environments, columns and characters."""
+    bare = re.sub(r"\\[\\{}$&%#_]", "", text)
+    assert bare.count("{") == bare.count("}")
+    assert bare.count("$") % 2 == 0
+    assert "%" not in bare
+    assert re.findall(r"\\begin\{(\w+)\}", text) == ["table", "tabular"]
+    assert re.findall(r"\\end\{(\w+)\}", text) == ["tabular", "table"]
+    columns = len(re.search(r"\\begin\{tabular\}\{(\w+)\}", text)[1])
+    body = text[text.index(r"\toprule") : text.index(r"\bottomrule")]
+    rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+    for line in rows:
+        spans = [int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", line)]
+        assert len(re.findall(r"(?<!\\)&", line)) + 1 + sum(spans) == columns, line
+    assert not re.search(r"[^\x00-\x7f]", text), "pdflatex knows no other characters without packages"

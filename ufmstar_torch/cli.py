@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -177,7 +178,10 @@ def report(arguments: Sequence[str]) -> int:
         if options.debug:
             traceback.print_exc()
         return _told(f"ufmstar report: failed: {_one_line(error)}", FAILED)
-    print(f"{options.out}: {', '.join(str(file.relative_to(options.out)) for file in files)}")
+    folders = Counter(file.parent for file in files if file.parent != options.out)
+    told = [file.name for file in files if file.parent == options.out]
+    told += [f"{folder.name}/ ({count} files)" for folder, count in folders.items()]
+    print(f"{options.out}: {', '.join(told)}")
     return OK
 
 
