@@ -140,6 +140,12 @@ class TestFindings:
         assert any("a lead that may be chance" in s for s in best_rows(results) if s.startswith("Best NLL"))
         assert "Best AUSE: 0.300 m, shared by Ensemble and UfM*-Ensemble." in best_rows(results)
 
+    def test_a_difference_that_prints_as_zero_is_open(self) -> None:
+        star = [figures(f["nll"] - 1e-4) for f in ALONE]
+        (made,) = comparisons(results_of({"Ensemble": ALONE, "UfM*-Ensemble": star})).values()
+        assert made[0].difference.beyond
+        assert made[0].verdict == "open"
+
     def test_one_sequence_decides_nothing(self) -> None:
         results = results_of({"Ensemble": ALONE[:1], "UfM*-Ensemble": [figures(1.0)]})
         first, losses = headlines(results)

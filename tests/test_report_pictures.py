@@ -29,6 +29,7 @@ from ufmstar_torch.eval.report.strips import NLL_SCALE, draw_breakdown, draw_str
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.setting import Setting
+from ufmstar_torch.eval.suite.worklist import WorkItem
 
 SHAPE = (12, 16)
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
@@ -323,7 +324,8 @@ class TestChoice:
 class TestWritePictures:
     def test_all_kinds_with_their_words(self, tmp_path: Path) -> None:
         rows = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
-        folder = tmp_path / "work" / "tour" / "seq"
+        sequence = "a/b: c"  # no name for a folder
+        folder = tmp_path / "work" / WorkItem("tour", sequence, path="", layout="").folder
         for name in ("examples", "room"):
             (folder / name).mkdir(parents=True)
         np.savez(folder / "examples" / "7.npz", image=np.zeros((*SHAPE, 3), np.uint8), truth=full(3.0), K=K)
@@ -336,7 +338,7 @@ class TestWritePictures:
             "disagreement": [0, 1.0],
         }
         np.savez(folder / "room" / f"{rows[2].slug}_7.npz", **room, T_world_cam=np.eye(4))
-        records = tuple(Record("s", "tour", "seq", "FastDepth", row.method.name) for row in rows)
+        records = tuple(Record("s", "tour", sequence, "FastDepth", row.method.name) for row in rows)
         results = Results(tmp_path, {"suite": "s"}, records)
         files = write_pictures(results, tmp_path)
         pictures = read_index(tmp_path / "figures")
@@ -345,6 +347,7 @@ class TestWritePictures:
         nll = mean_nll(find_examples(folder)[0], "Ensemble")
         assert f"Ensemble (mean NLL {nll:.2f})" in pictures[0].alt
         assert "2 Gaussians" in pictures[3].alt
+        assert all(p.title.startswith(sequence) for p in pictures)
         files[0].unlink()
         assert [p.kind for p in read_index(tmp_path / "figures")] == [BREAKDOWN, COMPARE, ROOM]
         index = json.loads(files[-1].read_text())

@@ -167,8 +167,11 @@ def _load(
             camera = scene["K"].astype(np.float64).tobytes() + repr(scene["truth"].shape).encode()
             scenes.setdefault(camera, scene)
             rows.setdefault(camera, {})[row] = RowMaps(**maps)
-    names = (folder.parent.name, folder.name, frame)
-    return [Example(*names, **scenes[camera], rows=of_camera, labels=labels) for camera, of_camera in rows.items()]
+    found = []
+    for camera, of_camera in rows.items():
+        image, truth, K = (scenes[camera][name] for name in _SCENE)
+        found.append(Example(folder.parent.name, folder.name, frame, image, truth, K, of_camera, labels))
+    return found
 
 
 def _require(file: Path, stored: Mapping[str, NDArray], names: tuple[str, ...]) -> None:

@@ -54,8 +54,8 @@ def findings_part(results: Results) -> Part:
 
 _HOW = (
     "Means of the reference → of UfM*, over the sequences that both have. Better and worse are beyond chance: the 95 % "
-    "interval of the difference on the same sequences leaves out 0. Open: it does not. The intervals stand under "
-    "Paired differences."
+    "interval of the difference on the same sequences leaves out 0. Open: it does not, or the difference prints as 0. "
+    "The intervals stand under Paired differences."
 )
 
 

@@ -36,6 +36,7 @@ main { grid-area: main; padding: 0 0 4rem; min-width: 0; }
 h1 { font-size: clamp(1.6rem, 4.5vw, 2.3rem); line-height: 1.18; margin: 0 0 .4rem; text-wrap: balance; }
 h2 { font-size: 1.4rem; line-height: 1.25; margin: 3.2rem 0 .8rem; padding-top: .9rem;
   border-top: 1px solid var(--line); }
+main > section:first-child h2 { margin-top: 1rem; }
 h3 { font-size: 1.06rem; margin: 1.8rem 0 .5rem; }
 p, li, dd { max-width: 46rem; overflow-wrap: anywhere; }
 a { color: var(--accent); }
@@ -101,7 +102,7 @@ footer { border-top: 1px solid var(--line); margin-top: 3rem; padding-top: 1rem;
   /* A strip of five pictures is not readable at the width of a phone: it scrolls. */
   figure .scroll img { max-width: none; width: max(100%, 44rem); }
   th, td { padding: .3rem .5rem; }
-  tbody th { white-space: normal; min-width: 6.5rem; max-width: 8.5rem; overflow-wrap: anywhere; }
+  tbody th { white-space: normal; min-width: 7.7rem; max-width: 9.5rem; overflow-wrap: anywhere; }
   dl { grid-template-columns: 1fr; gap: .1rem; } dd { margin-bottom: .6rem; }
 }
 @media print {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from ufmstar_torch.eval.report.strips import draw_breakdown, draw_strip, mean_nl
 from ufmstar_torch.eval.suite.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.setting import DEFAULT
+from ufmstar_torch.eval.suite.worklist import WorkItem
 
 # So that a report of a hundred sequences stays one that can be read, and mailed.
 MOST_FRAMES, MOST_ROOMS = 4, 3
@@ -67,9 +69,9 @@ def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
 def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Picture]:
     labels = {slug: row_label(row) for slug, row in rows.items()}
     examples = [
-        example
+        replace(example, dataset=dataset, sequence=sequence)
         for dataset, sequence in results.sequences()
-        for example in find_examples(results.out / "work" / dataset / sequence, labels)
+        for example in find_examples(_place(results, dataset, sequence), labels)
     ]
     for example in choose(examples, MOST_FRAMES):
         there = [row for slug, row in rows.items() if slug in example.rows]
@@ -90,7 +92,7 @@ def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator
 def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Picture]:
     drawn = 0
     for dataset, sequence in results.sequences():
-        rooms = find_rooms(results.out / "work" / dataset / sequence)
+        rooms = find_rooms(_place(results, dataset, sequence))
         # One row of each room is enough: the suite's first UfM* with its default settings.
         slug = next((s for s, row in rows.items() if s in rooms and row.setting == DEFAULT), None)
         if slug is None or drawn == MOST_ROOMS:
@@ -114,6 +116,11 @@ def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[
             f"The room of {sequence} from above and obliquely, {' then '.join(map(str, counts))} Gaussians, coloured "
             f"by disagreement from 0 to {scale.high:.2g} m.",
         )
+
+
+def _place(results: Results, dataset: str, sequence: str) -> Path:
+    """The folder of a sequence, whose name need not be fit for one."""
+    return results.out / "work" / WorkItem(dataset, sequence, path="", layout="").folder
 
 
 def _strip(folder: Path, example: Example, rows: Sequence[Row], base: str) -> Picture:
