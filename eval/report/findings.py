@@ -51,9 +51,14 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """ "better" or "worse" beyond the interval, "open" within it, "one sequence" where there is none."""
+        """One of "better" and "worse" (beyond the interval), "open" (within it) and "one sequence" (no interval).
+
+        A difference that prints as 0 is open too, however narrow its interval.
+        """
         if self.difference.sequences < 2:
             return ALONE_SEQUENCE
+        if float(number(self.difference.value, self.quantity.decimals)) == 0:
+            return OPEN
         found = better(self.difference, self.quantity)
         return OPEN if found is None else BETTER if found else WORSE
 
