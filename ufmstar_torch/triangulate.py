@@ -65,7 +65,7 @@ def triangulate(
         point=point + origin,
         covariance=np.linalg.inv(_damped(information)),
         error=np.sqrt(np.square(residual).sum((1, 2)) / np.maximum(2 * seen.sum(1), 1)),
-        ahead=((z > 0) | ~seen).all(1),
+        ahead=np.asarray(((z > 0) | ~seen).all(1), dtype=bool),
     )
 
 
