@@ -11,7 +11,9 @@ only check.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -76,12 +78,16 @@ def table(title: str, found: list[Figures]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_sources(parser)
+    parser.add_argument("--save", type=Path, help="file for the figures of every clip, as JSON")
+    arguments = parser.parse_args()
     groups: dict[str, list[Figures]] = {}
-    for clip in clips(parser.parse_args()):
+    for clip in clips(arguments):
         title = "Depth only" if clip.aleatoric is None else "Ensemble"
         groups.setdefault(title, []).append(figures(clip))
     for title, found in groups.items():
         table(title, found)
+    if arguments.save is not None:
+        arguments.save.write_text(json.dumps(groups))
 
 
 if __name__ == "__main__":
