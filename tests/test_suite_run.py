@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from layouts_more import write_nyu
 from suite_runs import NAMES, Stub, go, job_on, kept, write_rooms
 
 from ufmstar_torch.eval.output_folder import FolderError
@@ -147,6 +148,23 @@ def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
     assert go(job, evaluate_sequence)[0]
     assert failures(folder_of(job), job.items) == {"rooms/ash": "no frame has ground truth"}
     assert len(kept(job.out)) == 4
+
+
+def test_images_without_poses_are_for_networks_alone(tmp_path):
+    root, _ = write_nyu(tmp_path / "nyu")
+    job = job_on(root, tmp_path / "out")
+    ended, told = go(job, evaluate_sequence)
+    assert ended
+    folder, (item,) = folder_of(job), job.items
+    done = sorted(path.stem for path in folder.place(item).glob("*.json") if path.stem != "failed")
+    assert done == ["DepthOnly"]
+    failure = folder.failure(item)
+    assert "no poses" in failure["reason"]
+    assert failure["rows"] == ["UfM-DepthOnly", "UfM-DepthOnly-100K", "UfMstar-DepthOnly"]
+    assert sum("failed" in line for line in told) == 1
+    again, told = go(job, evaluate_sequence, resume=True)
+    assert again
+    assert sum("failed" in line for line in told) == 1, "it is told each time"
 
 
 def test_another_sequence_of_the_name_is_refused(tmp_path):

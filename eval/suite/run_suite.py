@@ -17,6 +17,7 @@ from ufmstar_torch.eval.suite.cache import PredictionCache
 from ufmstar_torch.eval.suite.confident import references
 from ufmstar_torch.eval.suite.evaluate import RowResult, SequenceError, Stopped, evaluate_sequence
 from ufmstar_torch.eval.suite.examples import Examples
+from ufmstar_torch.eval.suite.method import ALONE
 from ufmstar_torch.eval.suite.networks import BaseNetwork, NetworkChoice
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.row import Row
@@ -30,6 +31,8 @@ Evaluate = Callable[..., list[RowResult]]
 _BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 _POLL_SECONDS = 0.2
 DIED = "the process that evaluated it was killed (for want of memory?)"
+# Of a sequence of single images.
+_NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
 
 
 @dataclass(frozen=True)
@@ -199,11 +202,15 @@ def _take(job: EvalJob, folder: EvalFolder, networks: Mapping[str, BaseNetwork],
     if not missing:
         folder.succeeded(item)
         return
+    # Images without poses are for the networks alone; what compares views stays undone, and is told.
+    possible = [row for row in job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+    left_out = [row for row in missing if row not in possible]
+    todo = [row for row in missing if row in possible]
     examples = Examples(folder.place(item)) if job.keeps_examples(item) else None
     try:
         results = turn.evaluate(
             sequence,
-            with_references(missing, job.suite.rows),
+            with_references(todo, possible) if todo else missing,
             networks,
             cache=turn.cache,
             device=torch.device(job.device),
@@ -220,9 +227,12 @@ def _take(job: EvalJob, folder: EvalFolder, networks: Mapping[str, BaseNetwork],
     for result in results:
         if result.row in missing:
             folder.keep(item, _record(job, item, networks, result, provenance), result)
-    folder.succeeded(item)
     frames = results[0].frames.get("done", 0) if results else 0
-    turn.conduct.tell(f"{item.label}: {len(missing)} rows, {frames} frames, {time.monotonic() - started:.1f} s")
+    turn.conduct.tell(f"{item.label}: {len(todo)} rows, {frames} frames, {time.monotonic() - started:.1f} s")
+    if left_out:
+        _fail(folder, item, ValueError(_NO_POSES.format(len(left_out))), left_out, turn)
+    else:
+        folder.succeeded(item)
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:

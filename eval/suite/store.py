@@ -33,7 +33,7 @@ MANIFEST, LOCK, CLAIM, FAILED, CACHE = "eval.json", "eval.lock", ".claim", "fail
 _WAIT_SECONDS = 60.0  # for another process that is just making eval.json
 # What a report leaves; removed by --overwrite.
 _REPORT = ("efficiency.json", "results.json", "results.csv", "table.csv", "report.html")
-_REPORT_PARTS = {"tables": (".md", ".tex"), "figures": (".png", ".svg")}
+_REPORT_PARTS = {"tables": (".md", ".tex"), "figures": (".png", ".svg", ".json")}
 
 
 @dataclass
