@@ -133,6 +133,10 @@ def _obstacle(row: Row, networks: Mapping[str, Contender]) -> str | None:
         return f"it runs several members, {networks[base].label} has one"
     if setting.skip or setting.rotation_noise or setting.translation_noise:
         return "left out frames and noise on poses are no matter of efficiency"
+    if setting.anchors:
+        return (
+            "anchors are not measured here: the benchmark times the tracker, `ufmstar eval` what UfM* takes with them"
+        )
     return None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from ufmstar_torch.eval.suite.setting import Setting
 FORMAT = 1
 FAILED = "failed.json"
 # What stands in ``Setting.to_dict()`` beside the overrides of the config.
-OWN = ("rotation_noise", "translation_noise", "skip", "seed")
+OWN = tuple(f.name for f in fields(Setting) if f.name != "overrides")
 
 
 class ResultsError(ValueError):

@@ -91,6 +91,12 @@ SETTINGS = {
     "ema_alpha": ("smoothing α", ""),
     "prior_weight": ("prior weight π₀", "px/m³"),
     "prior_mean": ("prior mean μ₀", "m²"),
+    "anchors": ("anchored by", ""),
+    "anchor_count": ("anchors a frame at most", ""),
+    "anchor_half_life": ("half-life of evidence", "frames"),
+    "anchor_shrinkage": ("shrinkage κ", "anchors"),
+    "track_noise": ("track noise", "px"),
+    "corrected": ("depth corrected", ""),
     "overlap_weighted": ("fusion weighted by overlap", ""),
     "disagreement": ("disagreement", ""),
     "regression": ("regression", ""),
@@ -106,6 +112,10 @@ SETTINGS = {
 }
 
 
+# Values in words.
+_VALUES = {"tracked": "tracked corners", "truth": "ground truth"}
+
+
 def setting_name(name: str) -> str:
     """A setting's name for people; the config's own where it has none."""
     return SETTINGS.get(name, (name.rpartition(".")[2].replace("_", " "), ""))[0]
@@ -116,7 +126,7 @@ def setting_value(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return "on" if value else "off"
     unit = SETTINGS.get(name, ("", ""))[1]
-    text = f"{value:g}" if isinstance(value, int | float) else str(value)
+    text = f"{value:g}" if isinstance(value, int | float) else _VALUES.get(str(value), str(value))
     return f"{text}{unit}" if unit == "°" else f"{text} {unit}".strip()
 
 

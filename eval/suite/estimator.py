@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.suite.method import ALONE, UFM
+from ufmstar_torch.eval.suite.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.suite.predicted import Predicted
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.ufm import UfM, UfMConfig
@@ -24,7 +25,7 @@ class Estimate:
     """A row's answer for one frame: maps [h, w] on the CPU.
 
     Attributes:
-        depth: as predicted [m].
+        depth: as predicted, or corrected by what anchors say, where the row is about that [m].
         variance: total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
         valid: bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
         aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
@@ -43,18 +44,19 @@ class Estimator(ABC):
     """Turns the predictions of a sequence, one after the other, into variances."""
 
     @abstractmethod
-    def update(self, predicted: Predicted, T_world_cam: Tensor) -> Estimate:
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """Take in the next frame.
 
         Args:
             predicted: [h, w] maps on the estimator's device.
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
+            anchors: [1, N] of the frame, where the row's setting has some.
         """
 
     @abstractmethod
     def state(self) -> dict[str, float]:
         """What is kept for the next frame: "bytes" and "count" of points or components, "smoothing_bytes" of the map
-        kept for smoothing [B]; {} if nothing is."""
+        kept for smoothing [B]; {} if nothing is. With anchors also "anchors", those used of the frame."""
 
 
 def make_estimator(row: Row, device: torch.device) -> Estimator:
@@ -66,11 +68,14 @@ def make_estimator(row: Row, device: torch.device) -> Estimator:
     method = row.method
     if row.setting.overrides and method.fusion in (ALONE, UFM):
         raise ValueError(f"{row.label}: settings of UfM* go with UfM* only")
+    if row.setting.anchors and method.fusion != UFM_STAR:
+        raise ValueError(f"{row.label}: anchors go with UfM* only")
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         return Pointwise(method.max_points, device, uses_variances=method.uses_aleatoric)
-    return Gaussians(ufm_star_config(row), device, uses_variances=method.uses_aleatoric)
+    config = ufm_star_config(row)
+    return Gaussians(config, device, uses_variances=method.uses_aleatoric, corrected=row.setting.corrected)
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:
@@ -85,7 +90,7 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     Raises:
         ValueError: an override has an unknown name or an impossible value; the message names it.
     """
-    values: dict[str, Any] = UfMStarConfig(on_bad_frame="skip").to_dict()
+    values: dict[str, Any] = UfMStarConfig(on_bad_frame="skip", anchored=bool(row.setting.anchors)).to_dict()
     if row.method.fixed_param:
         values["segment"]["scale_with_image"] = False
     try:
@@ -130,8 +135,8 @@ class Alone(Estimator):
 
     uses_variances: bool
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor) -> Estimate:
-        """See :meth:`Estimator.update`; the pose does not matter."""
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
+        """See :meth:`Estimator.update`; pose and anchors do not matter."""
         a, e = _variances(predicted, self.uses_variances)
         parts = [part for part in (a, e) if part is not None]
         valid = (predicted.depth > 0) & predicted.depth.isfinite()
@@ -158,7 +163,7 @@ class Pointwise(Estimator):
         self.ufm = UfM(UfMConfig(max_points=max_points, on_bad_frame="skip"), device=device)
         self._uses_variances = uses_variances
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor) -> Estimate:
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """See :meth:`Estimator.update`."""
         a, e = _variances(predicted, self._uses_variances)
         out = self.ufm(predicted.depth[None], T_world_cam, predicted.intrinsics, _one(a), _one(e))
@@ -178,24 +183,36 @@ class Gaussians(Estimator):
         config: its settings.
         device: of the mixture.
         uses_variances: False leaves A and E aside.
+        corrected: answer with the depth corrected by the anchors' bias, and the variance that remains.
     """
 
-    def __init__(self, config: UfMStarConfig, device: torch.device, *, uses_variances: bool) -> None:
+    def __init__(
+        self, config: UfMStarConfig, device: torch.device, *, uses_variances: bool, corrected: bool = False
+    ) -> None:
         self.ufm = UfMStar(config, device=device)
-        self._uses_variances = uses_variances
+        self._uses_variances, self._corrected = uses_variances, corrected
+        self._anchors = 0
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor) -> Estimate:
+    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """See :meth:`Estimator.update`."""
         a, e = _variances(predicted, self._uses_variances)
-        out = self.ufm(predicted.depth[None], T_world_cam[None], predicted.intrinsics[None], _one(a), _one(e))
-        return _estimate(predicted.depth, out.variance[0], out.valid[0], a, e, out.disagreement[0])
+        K = predicted.intrinsics[None]
+        out = self.ufm(predicted.depth[None], T_world_cam[None], K, _one(a), _one(e), anchors=anchors)
+        self._anchors = int(out.statistics.anchors_used[0])
+        depth, variance = out.corrected() if self._corrected else (predicted.depth[None], out.variance)
+        return _estimate(depth[0], variance[0], out.valid[0], a, e, out.disagreement[0])
 
     def state(self) -> dict[str, float]:
-        """Bytes and number of the occupied components, and the bytes of the moving average beside them."""
+        """Bytes and number of the occupied components, with what anchors taught of them; the bytes of the moving
+        average beside them."""
         mixture, smoothed = self.ufm.mixture, self.ufm.smoothed
         count = int(mixture.components.sum())
         smoothing = smoothed.numel() * smoothed.element_size()
-        return {"bytes": count * mixture.bytes_per_component(), "count": count, "smoothing_bytes": smoothing}
+        found = {"bytes": count * mixture.bytes_per_component(), "count": count, "smoothing_bytes": smoothing}
+        if not self.ufm.config.anchored:
+            return found
+        learnt = (count + 1) * self.ufm.overall_evidence.numel() * self.ufm.overall_evidence.element_size()
+        return {**found, "bytes": found["bytes"] + learnt, "anchors": self._anchors}
 
 
 def _variances(predicted: Predicted, used: bool) -> tuple[Tensor | None, Tensor | None]:

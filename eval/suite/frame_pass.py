@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
+from ufmstar_torch.eval.suite.anchor_source import anchor_sources
 from ufmstar_torch.eval.suite.cache import PredictionCache, PredictionKey, frame_digest, sequence_digest
 from ufmstar_torch.eval.suite.confident import confident_pixels, references
 from ufmstar_torch.eval.suite.estimator import Estimate
@@ -21,6 +22,7 @@ from ufmstar_torch.eval.suite.networks import BaseNetwork
 from ufmstar_torch.eval.suite.predicted import Predicted, together
 from ufmstar_torch.eval.suite.row import Row
 from ufmstar_torch.eval.suite.row_run import RowRun
+from ufmstar_torch.eval.suite.setting import TRACKED
 from ufmstar_torch.frame import FRAME_FAULTS, check_frame
 
 ALL = "all"  # members, where a prediction is kept
@@ -58,7 +60,10 @@ class FramePass:
         self._networks = {row.method.base: networks[row.method.base] for row in rows}
         self._references = {row: references(row, rows) for row in rows}
         self._digest = sequence_digest(sequence)
-        self.runs = [RowRun(row, device, [other.method.name for other in self._references[row]]) for row in rows]
+        self._tracked = any(row.setting.anchors == TRACKED for row in rows)
+        anchors = anchor_sources(rows)
+        named = {row: [other.method.name for other in found] for row, found in self._references.items()}
+        self.runs = [RowRun(row, device, named[row], anchors.get(row)) for row in rows]
 
     def take(self, number: int, index: int) -> FinishedFrame | None:
         """Take in a frame of the sequence.
@@ -82,7 +87,7 @@ class FramePass:
             for run in active:
                 run.skip(error.reason)
             return None
-        estimates = {run.row: run.estimate(frame, predicted[run.row]) for run in active}
+        estimates = {run.row: run.estimate(frame, predicted[run.row], truths[run.row]) for run in active}
         if frame.depth is not None:
             self._judge(active, estimates, truths)
         cameras = {row: one.intrinsics.numpy() for row, one in predicted.items()}
@@ -95,7 +100,8 @@ class FramePass:
             FrameError: they cannot.
         """
         frame = self._sequence[index]
-        if frame.image is None and any(network.needs_image for network in self._networks.values()):
+        wanted = self._tracked or any(network.needs_image for network in self._networks.values())
+        if frame.image is None and wanted:
             raise FrameError(frame.name, "no image")
         if frame.depth is None and not all(network.needs_image for network in self._networks.values()):
             raise FrameError(frame.name, "no depth map")

@@ -7,12 +7,15 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.run_clock import Stopwatch
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.suite.anchor_source import AnchorSource
 from ufmstar_torch.eval.suite.estimator import Estimate, make_estimator
 from ufmstar_torch.eval.suite.perturb import perturbed, selects
 from ufmstar_torch.eval.suite.predicted import Predicted
@@ -29,6 +32,7 @@ class RowRun:
         row: which.
         device: of its estimator.
         references: names of the methods on whose confident pixels its NLL is binned by error.
+        anchors: where its anchors come from; None = it has none.
 
     Attributes:
         done: frames that it has used so far.
@@ -39,8 +43,11 @@ class RowRun:
         ValueError: see ``make_estimator``.
     """
 
-    def __init__(self, row: Row, device: torch.device, references: list[str]) -> None:
+    def __init__(
+        self, row: Row, device: torch.device, references: list[str], anchors: AnchorSource | None = None
+    ) -> None:
         self.row = row
+        self._anchors = anchors
         self.estimator = make_estimator(row, device)
         self.done = 0
         self.last: tuple[str, Any] | None = None
@@ -50,7 +57,7 @@ class RowRun:
         self._by_error: dict[str, NLLByError] = {}
         self._reasons: Counter[str] = Counter()
         self._judged = self._selected = 0
-        self._ms: dict[str, list[float]] = {"network": [], "uncertainty": []}
+        self._ms: dict[str, list[float]] = {"network": [], "anchors": [], "uncertainty": []}
         self._state = _StateLog()
 
     def selects(self, number: int) -> bool:
@@ -62,11 +69,15 @@ class RowRun:
         self._selected += 1
         self._reasons[reason] += 1
 
-    def estimate(self, frame: Frame, predicted: Predicted) -> Estimate:
-        """Take in the next frame."""
+    def estimate(self, frame: Frame, predicted: Predicted, truth: NDArray[np.float32]) -> Estimate:
+        """Take in the next frame; its ground truth [h, w] is for anchors of it alone."""
         T = perturbed(frame.T_world_cam, self.row.setting, frame.index)
+        anchors = None
+        if self._anchors is not None:
+            anchors, ms = self._anchors.of(frame, T, predicted, truth)
+            self._ms["anchors"] += [] if ms is None else [ms]
         with self._clock.stage("uncertainty"):
-            estimate = self.estimator.update(predicted, torch.from_numpy(T))
+            estimate = self.estimator.update(predicted, torch.from_numpy(T), anchors)
         self._ms["uncertainty"].append(self._clock.take()["uncertainty"])
         if predicted.ms is not None:
             self._ms["network"].append(predicted.ms)
@@ -150,6 +161,8 @@ class _StateLog:
             if name in self._last:
                 mean = self._sum[name] / self._frames
                 found |= {f"{name}_mean": mean, f"{name}_max": self._most[name], f"{name}_end": self._last[name]}
+        if "anchors" in self._last:
+            found["anchors_mean"] = self._sum["anchors"] / self._frames
         if "smoothing_bytes" in self._last:
             found["smoothing_bytes"] = self._last["smoothing_bytes"]
         return found

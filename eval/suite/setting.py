@@ -1,4 +1,4 @@
-"""What an ablation changes about a row: settings of UfM*, noise on the poses, frames left out."""
+"""What an ablation changes about a row: settings of UfM*, noise on the poses, frames left out, anchors."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import Any
+
+TRACKED, TRUTH = "tracked", "truth"
+_ANCHORS = ("", TRACKED, TRUTH)
 
 
 @dataclass(frozen=True)
@@ -20,10 +23,15 @@ class Setting:
         rotation_noise: standard deviation of each component of a rotation vector that is added to a pose [deg].
         translation_noise: the same of each component of the position [m].
         skip: images left out between two that are used; the paper's skip interval, 0 = consecutive ones.
-        seed: of the noise.
+        seed: of everything that is drawn: noise, and which anchors are taken.
+        anchors: what UfM* is anchored by (``UfMStarConfig.anchored`` follows): "" nothing; "tracked": corners of the
+            images, triangulated with the row's poses; "truth": ground truth at pixels drawn at random, the upper bound.
+        anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
+        track_noise: standard deviation of noise on tracked positions [px of the image]; see ``anchor_source``.
+        corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
 
     Raises:
-        ValueError: a number is out of range.
+        ValueError: a value is out of range, or they do not go together.
     """
 
     overrides: Mapping[str, Any] = field(default_factory=dict)
@@ -31,9 +39,13 @@ class Setting:
     translation_noise: float = 0.0
     skip: int = 0
     seed: int = 0
+    anchors: str = ""
+    anchor_count: int | None = None
+    track_noise: float = 0.0
+    corrected: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("rotation_noise", "translation_noise"):
+        for name in ("rotation_noise", "translation_noise", "track_noise"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
@@ -41,17 +53,39 @@ class Setting:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 0:
                 raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}")
+        self._check_anchors()
         object.__setattr__(self, "overrides", MappingProxyType(dict(sorted(self.overrides.items()))))
+
+    def _check_anchors(self) -> None:
+        if self.anchors not in _ANCHORS:
+            told = " or ".join(f'"{name}"' for name in _ANCHORS)
+            raise ValueError(f"anchors must be {told}, got {self.anchors!r}")
+        count = self.anchor_count
+        if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 0):
+            raise ValueError(f"anchor_count must be a whole number of at least 0, got {count!r}")
+        if not isinstance(self.corrected, bool):
+            raise ValueError(f"corrected must be true or false, got {self.corrected!r}")
+        if not self.anchors and (count is not None or self.corrected):
+            raise ValueError("anchor_count and corrected go with anchors")
+        if self.track_noise and self.anchors != TRACKED:
+            raise ValueError('track_noise goes with anchors = "tracked"')
+        if "anchored" in self.overrides:
+            raise ValueError('anchored follows from anchors: set anchors = "tracked" or "truth"')
 
     def __hash__(self) -> int:
         return hash(self.slug)
 
     def to_dict(self) -> dict[str, Any]:
         """What differs from the default, flat: {} for the row as it is."""
-        own = {name: getattr(self, name) for name in ("rotation_noise", "translation_noise", "skip")}
-        changed = {name: value for name, value in own.items() if value}
-        noisy = self.rotation_noise or self.translation_noise
-        return {**dict(self.overrides), **changed, **({"seed": self.seed} if noisy else {})}
+        own = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}
+        changed = {name: getattr(self, name) for name, plain in own.items() if getattr(self, name) != plain}
+        return {**dict(self.overrides), **changed, **({"seed": self.seed} if self.draws else {})}
+
+    @property
+    def draws(self) -> bool:
+        """Whether anything is drawn at random, so that the seed matters."""
+        noisy = self.rotation_noise or self.translation_noise or self.track_noise
+        return bool(noisy) or self.anchors == TRUTH or self.anchor_count is not None
 
     @property
     def slug(self) -> str:

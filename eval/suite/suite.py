@@ -116,7 +116,7 @@ def default_of(name: str) -> Any:
     value: Any = UfMStarConfig()
     for part in name.split("."):
         if not is_dataclass(value) or part not in {f.name for f in fields(value)}:
-            known = ", ".join(("rotation_noise", "translation_noise", "skip"))
+            known = ", ".join(own for own in _OWN if own != "seed")
             raise ValueError(f"no setting is called {name!r}: expected {known}, or UfM*'s own, as ema_alpha")
         value = getattr(value, part)
     if is_dataclass(value):
@@ -135,7 +135,7 @@ def configured(setting: Setting) -> UfMStarConfig:
         default_of(name)
         group, _, field = name.rpartition(".")
         (nested.setdefault(group, {}) if group else nested)[field] = value
-    config = UfMStarConfig()
+    config = UfMStarConfig(anchored=bool(setting.anchors))
     groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}
     return config.replace(**{name: value for name, value in nested.items() if not _group(value)}, **groups)
 
@@ -145,6 +145,8 @@ def check_row(row: Row) -> None:
     if row.setting.overrides and row.method.fusion != UFM_STAR:
         told = ", ".join(row.setting.overrides)
         raise ValueError(f"row {row.method.name}: {told} is of UfM*, which the row does without")
+    if row.setting.anchors and row.method.fusion != UFM_STAR:
+        raise ValueError(f"row {row.method.name}: anchors are of UfM*, which the row does without")
     configured(row.setting)
 
 

@@ -10,7 +10,7 @@ methods = ["Ensemble", "UfM*-Ensemble"]    # as the paper names them
 
 [[rows]]
 methods = ["UfM*-Ensemble"]
-setting = { "segment.min_pixels" = 2000 }  # of UfM*, or rotation_noise [deg], translation_noise [m], skip, seed
+setting = { "segment.min_pixels" = 2000 }  # of UfM*, or of ``Setting``: rotation_noise [deg], skip, anchors ...
 each = { ema_alpha = [0.1, 0.25, 1.0] }    # one row for every value
 ```
 """

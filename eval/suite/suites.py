@@ -8,12 +8,13 @@ from typing import Any
 
 from ufmstar_torch.eval.suite.method import ALONE, BASES, MANY, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.suite.row import Row
-from ufmstar_torch.eval.suite.setting import DEFAULT
+from ufmstar_torch.eval.suite.setting import DEFAULT, TRACKED, TRUTH
 from ufmstar_torch.eval.suite.suite import Suite, default_of, rows_of, setting_from
 
 # The paper's five, in its order; "depth_only" is of its third table.
 _PAPER = ("ensemble", "mc_dropout", "batch_ensemble", "evidential", "aleatoric")
 _RESNET = "ResNet50-Monodepth2"
+_ANCHORED: Mapping[str, Any] = {"anchors": TRACKED}
 _OUTDOORS = ("scannet", "tartanair", "kitti360")
 
 # Of the paper's figures of noise and overlap. Its text does not print the noise's values: degrees and metres that go
@@ -21,6 +22,9 @@ _OUTDOORS = ("scannet", "tartanair", "kitti360")
 ROTATIONS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
 TRANSLATIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
 SKIPS = (0, 1, 2, 4, 8, 16, 32)
+# Of anchors: how many, noise where they are tracked [px], and the noise on poses that goes with them.
+COUNTS = (0, 5, 20, 100, 300)
+TRACK_NOISES = (1.0, 2.0, 4.0, 8.0)
 
 # The two readings of what is too small: SPGF's own, and the paper's words.
 _SPGF = {"segment.min_pixels": 200, "segment.min_rows": 16}
@@ -145,6 +149,26 @@ def _entropy(base: str) -> Suite:
     return replace(_paper("paper-figure-entropy", "Predictive entropy by data set", rows), datasets=_OUTDOORS)
 
 
+def _anchors(base: str) -> Suite:
+    overlap = {"disagreement": "overlap"}
+    anchored = (_ANCHORED, {**overlap, **_ANCHORED}, {**_ANCHORED, "corrected": True}, {"anchors": TRUTH})
+    rows = [Row(Method(base)), *_points(base, [{}, overlap, *anchored])]
+    return Suite("anchors", "UfM* without and with anchors, and what disagreement compares", tuple(rows))
+
+
+def _ablation_anchors(base: str) -> Suite:
+    """Noise on poses with anchors and without, and what is particular to anchors."""
+    noises = [{"rotation_noise": v} for v in ROTATIONS if v] + [{"translation_noise": v} for v in TRANSLATIONS if v]
+    points: list[Mapping[str, Any]] = [{}, _ANCHORED]
+    points += [{"anchors": TRUTH, "anchor_count": count} for count in COUNTS]
+    points += [{**_ANCHORED, "anchor_count": count} for count in (5, 20)]
+    points += [{**_ANCHORED, "track_noise": v} for v in TRACK_NOISES]
+    points += [{**_ANCHORED, "anchor_half_life": v} for v in (10.0, 100.0)]
+    points += [{**_ANCHORED, "anchor_shrinkage": v} for v in (1.0, 20.0)]
+    points += [{**more, **noise} for noise in noises for more in ({}, _ANCHORED)]
+    return Suite("ablation-anchors", "Ablation: anchors", tuple(_points(base, points)), sweep=_varied(points))
+
+
 def _no_alternating(base: str) -> Suite:
     if base not in MANY:
         raise ValueError(f"ablation-no-alternating is of networks that take turns: {', '.join(MANY)}; got {base!r}")
@@ -165,7 +189,7 @@ def _ablation(what: str) -> Callable[[str], Suite]:
 
 def _ablations(base: str) -> Suite:
     """The rows of every ablation, each once."""
-    made = [make(base) for make in (_ablation(what) for what in _SETTINGS)]
+    made = [make(base) for make in (_ablation(what) for what in _SETTINGS)] + [_ablation_anchors(base)]
     made += [_overlap(base), _pose_noise(base), *([_no_alternating(base)] if base in MANY else [])]
     rows = dict.fromkeys(row for suite in made for row in suite.rows)
     sweep = dict.fromkeys(name for suite in made for name in suite.sweep)
@@ -211,6 +235,8 @@ _FIGURES: dict[str, tuple[Callable[[str], Suite], str]] = {
     "paper-figure-pose-noise": (_pose_noise, "ensemble"),
     "paper-figure-overlap": (_overlap, "aleatoric"),
     "paper-figure-entropy": (_entropy, "ensemble"),
+    "anchors": (_anchors, "depth_only"),
+    "ablation-anchors": (_ablation_anchors, "depth_only"),
     "ablation-no-alternating": (_no_alternating, "ensemble"),
     **{f"ablation-{what}": (_ablation(what), "ensemble") for what in _SETTINGS},
     "ablations": (_ablations, "ensemble"),

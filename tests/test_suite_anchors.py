@@ -1,0 +1,282 @@
+"""Rows with anchors: what a setting may say, and that the evaluation does what a loop written by hand does."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_suite import CPU, base_network, evaluate, row, write_network
+
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.eval.ground_truth import truth_at
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report.load import setting_of
+from ufmstar_torch.eval.report.names import row_label
+from ufmstar_torch.eval.sequences.frame import Entry
+from ufmstar_torch.eval.suite.anchor_source import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
+from ufmstar_torch.eval.suite.estimator import make_estimator, ufm_star_config
+from ufmstar_torch.eval.suite.perturb import perturbed
+from ufmstar_torch.eval.suite.predicted import Predicted
+from ufmstar_torch.eval.suite.setting import DEFAULT, Setting
+from ufmstar_torch.eval.suite.suite import configured, default_of, rows_of, setting_from
+from ufmstar_torch.eval.suite.suite_file import suite_from_file
+from ufmstar_torch.eval.suite.suites import suite_named
+from ufmstar_torch.eval.tour.name import open_tour
+from ufmstar_torch.tracker import LandmarkTracker
+
+NAME = "UfM*-DepthOnly"
+ON = UfMStarConfig(on_bad_frame="skip", anchored=True)
+FIGURES = ("delta1", "rmse", "nll", "ece_delta", "ece_q", "spearman")
+
+
+@pytest.fixture(scope="module")
+def tour():
+    """Ten decoded frames: rendering them again for every test would take most of the time."""
+    return in_memory(open_tour("tour:300003?frames=16&size=96x128&sensor=0"), slice(10))
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory):
+    file = write_network(tmp_path_factory.mktemp("anchors") / "depth.safetensors", "depth")
+    return {"depth_only": base_network(f"depth_only=trained:{file}")}
+
+
+class Biased:
+    """The truth, but what is farther than 2 m is put 40 % too far; as much of a BaseNetwork as is asked of it."""
+
+    digest, passes, needs_image, cacheable = "biased", 1, False, False
+
+    def turn(self, position):
+        return 0
+
+    def one(self, frame, n):
+        depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
+        return Predicted(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
+
+
+def in_memory(sequence, part):
+    frames = [sequence[i] for i in range(len(sequence))[part]]
+    entries = (Entry(f.name, f.T_world_cam, lambda f=f: f.image.copy(), lambda f=f: f.depth.copy()) for f in frames)
+    return replace(sequence, entries=tuple(entries), names_on_disk=tuple(f.name for f in frames))
+
+
+def by_hand(sequence, network, anchors_of, *, config=ON, setting=DEFAULT, corrected=False):
+    """Metrics and the mean number of anchors used: ``anchors_of(frame, T, predicted, truth)``."""
+    ufm, metrics, used = UfMStar(config), SequenceMetrics(), []
+    for frame in list(sequence)[:: setting.skip + 1]:
+        T, p = perturbed(frame.T_world_cam, setting, frame.index), network.one(frame, 0)
+        truth = truth_at(frame, p.intrinsics.numpy(), p.size)
+        out = ufm(p.depth[None], torch.from_numpy(T)[None], p.intrinsics[None], anchors=anchors_of(frame, T, p, truth))
+        depth, variance = out.corrected() if corrected else (out.depth, out.variance)
+        metrics.update(depth[0], variance[0], torch.from_numpy(truth), out.valid[0])
+        used.append(int(out.statistics.anchors_used[0]))
+    return metrics.compute(), float(np.mean(used))
+
+
+def tracked_by(tracker):
+    return lambda frame, T, p, truth: tracker.update(frame.image, T, frame.intrinsics).anchors(
+        frame.intrinsics, p.intrinsics
+    )
+
+
+def assert_agrees(result, expected, used):
+    assert [result.figures[f] for f in FIGURES] == pytest.approx([expected[f] for f in FIGURES], rel=1e-9, nan_ok=True)
+    assert result.state["anchors_mean"] == pytest.approx(used)
+
+
+# ---- settings ----
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"anchors": "lidar"}, "anchors must be"),
+        ({"anchors": "tracked", "anchor_count": -1}, "anchor_count must be a whole number"),
+        ({"anchors": "tracked", "anchor_count": True}, "anchor_count must be a whole number"),
+        ({"anchors": "tracked", "anchor_count": 2.5}, "anchor_count must be a whole number"),
+        ({"anchors": "tracked", "corrected": 1}, "corrected must be true or false"),
+        ({"anchor_count": 5}, "go with anchors"),
+        ({"corrected": True}, "go with anchors"),
+        ({"anchors": "truth", "track_noise": 1.0}, 'goes with anchors = "tracked"'),
+        ({"anchors": "tracked", "track_noise": -1.0}, "track_noise must be a finite number"),
+        ({"anchored": True}, "anchored follows from anchors"),
+    ],
+)
+def test_impossible_settings_are_refused(values, told):
+    with pytest.raises(ValueError, match=told):
+        setting_from(values)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"anchors": "tracked"},
+        {"anchors": "tracked", "corrected": True},
+        {"anchors": "tracked", "anchor_count": 0, "seed": 0},
+        {"anchors": "truth", "seed": 3},
+        {"anchors": "tracked", "track_noise": 2.0, "rotation_noise": 1.0, "seed": 1},
+        {"disagreement": "overlap", "anchors": "tracked", "anchor_half_life": 10.0},
+    ],
+)
+def test_a_setting_survives_its_flat_form_and_json(values):
+    setting = setting_from(values)
+    assert setting.to_dict() == values
+    assert setting_of(json.loads(json.dumps(setting.to_dict()))) == setting
+    assert configured(setting).anchored
+    assert ufm_star_config(row(NAME, anchors="tracked")) == ON
+
+
+def test_the_seed_matters_only_where_something_is_drawn():
+    assert Setting(anchors="tracked", seed=4).slug == Setting(anchors="tracked").slug != ""
+    assert Setting(anchors="truth", seed=4).slug != Setting(anchors="truth").slug
+    assert Setting(anchors="tracked", anchor_count=0).slug != Setting(anchors="tracked").slug
+    assert [default_of(n) for n in ("anchors", "anchor_count", "track_noise", "corrected")] == ["", None, 0.0, False]
+
+
+@pytest.mark.parametrize("name", ["DepthOnly", "UfM-DepthOnly-100K"])
+def test_anchors_go_with_ufm_star_only(name):
+    with pytest.raises(ValueError, match=r"anchors go with UfM\* only"):
+        make_estimator(row(name, anchors="tracked"), CPU)
+    with pytest.raises(ValueError, match=r"anchors are of UfM\*"):
+        suite_named("anchors").__class__("x", "x", rows_of([name], Setting(anchors="truth")))
+
+
+def test_suites_and_words(tmp_path):
+    suite = suite_named("anchors")
+    assert [row_label(r) for r in suite.rows] == [
+        "DepthOnly",
+        NAME,
+        f"{NAME}, disagreement overlap",
+        f"{NAME}, anchored by tracked corners",
+        f"{NAME}, disagreement overlap, anchored by tracked corners",
+        f"{NAME}, anchored by tracked corners, depth corrected on",
+        f"{NAME}, anchored by ground truth",
+    ]
+    assert suite_named("anchors", "ensemble").bases == ("ensemble",)
+    counts = {r.setting.anchor_count for r in suite_named("ablation-anchors").rows if r.setting.anchors == "truth"}
+    assert counts == {0, 5, 20, 100, 300}
+    (tmp_path / "mine.toml").write_text(
+        f'[[rows]]\nmethods = ["{NAME}"]\nsetting = {{ anchors = "tracked" }}\neach = {{ anchor_count = [0, 5] }}\n'
+    )
+    rows = suite_from_file(tmp_path / "mine.toml").rows
+    assert [r.setting for r in rows] == [Setting(anchors="tracked", anchor_count=n) for n in (0, 5)]
+
+
+# ---- against a loop by hand ----
+
+
+@pytest.mark.parametrize("corrected", [False, True])
+def test_tracked_rows_equal_the_tracker_and_ufm_star_by_hand(tour, networks, corrected):
+    wanted = row(NAME, anchors="tracked", corrected=corrected)
+    found = evaluate(tour, [row(NAME), wanted], networks)[wanted.slug]
+    expected, used = by_hand(tour, networks["depth_only"], tracked_by(LandmarkTracker()), corrected=corrected)
+    assert used > 3
+    assert_agrees(found, expected, used)
+    assert found.ms["anchors"] > 0
+    plain = UfMStar(UfMStarConfig(on_bad_frame="skip"))
+    assert found.state["bytes_end"] > found.state["count_end"] * plain.mixture.bytes_per_component()
+
+
+def test_the_tracker_sees_the_noisy_poses_and_the_chosen_images(tour, networks):
+    noise = {"rotation_noise": 0.3, "translation_noise": 0.01, "seed": 5}
+    noisy, sparse = row(NAME, anchors="tracked", **noise), row(NAME, anchors="tracked", skip=1)
+    found = evaluate(tour, [row(NAME, anchors="tracked"), noisy, sparse], networks)
+    for one in (noisy, sparse):
+        by = tracked_by(LandmarkTracker())
+        assert_agrees(found[one.slug], *by_hand(tour, networks["depth_only"], by, setting=one.setting))
+    # And not the exact ones.
+    tracker = LandmarkTracker()
+    exact = by_hand(
+        tour,
+        networks["depth_only"],
+        lambda frame, T, p, truth: tracked_by(tracker)(frame, frame.T_world_cam, p, truth),
+        setting=noisy.setting,
+    )
+    assert exact[0]["ece_delta"] != pytest.approx(found[noisy.slug].figures["ece_delta"], rel=1e-6)
+
+
+def test_no_anchors_at_most_is_plain_ufm_star(tour, networks):
+    rows = [row(NAME), *(row(NAME, anchors=kind, anchor_count=0) for kind in ("tracked", "truth"))]
+    plain, *none = evaluate(tour, rows, networks).values()
+    for result in none:
+        assert result.figures == pytest.approx(plain.figures, rel=0, abs=0, nan_ok=True)
+        assert result.state["anchors_mean"] == 0
+    assert "anchors_mean" not in plain.state
+
+
+def test_ground_truth_helps_a_network_whose_views_agree_on_what_is_wrong(tour):
+    rows = [row(NAME), row(NAME, anchors="truth"), row(NAME, anchors="truth", corrected=True)]
+    plain, anchored, corrected = (r.figures for r in evaluate(tour, rows, {"depth_only": Biased()}).values())
+    assert anchored["nll"] < 3 < plain["nll"]
+    assert anchored["ece_delta"] < 0.75 * plain["ece_delta"]
+    assert anchored["spearman"] > plain["spearman"] + 0.3
+    assert anchored["rmse"] == plain["rmse"]
+    assert corrected["rmse"] < 0.25 * plain["rmse"]
+
+
+# ---- what is drawn ----
+
+
+def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
+    frame, p = tour[4], Biased().one(tour[4], 0)
+    truth = truth_at(frame, p.intrinsics.numpy(), p.size)
+
+    def drawn(count, seed=0):
+        source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)
+        found, ms = source.of(frame, frame.T_world_cam, p, truth)
+        assert ms is None
+        return found
+
+    few, many, default = drawn(20), drawn(300), drawn(None)
+    assert [a.depth.shape[1] for a in (few, many, default)] == [20, 300, 100]
+    u, v = many.pixel[0].long().unbind(-1)
+    assert torch.equal(many.depth[0].float(), torch.from_numpy(truth)[v, u])
+    torch.testing.assert_close(many.variance.sqrt(), TRUTH_SIGMA * many.depth)
+    assert torch.equal(few.pixel, many.pixel[:, :20])
+    assert not torch.equal(drawn(20, seed=1).pixel, few.pixel)
+    # All over the image.
+    assert (u.double().std() / p.size[1], v.double().std() / p.size[0]) == pytest.approx((0.289, 0.289), abs=0.04)
+
+
+def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
+    frames = list(tour)
+    tracks, clean, noisy, stated = [Tracks() for _ in range(2)], [], [], []
+    for frame in frames:
+        p = Biased().one(frame, 0)
+        pair = []
+        for size, own in zip((0.0, 0.5), tracks, strict=True):
+            source = AnchorSource(Setting(anchors="tracked", track_noise=size), own)
+            anchors, ms = source.of(frame, frame.T_world_cam, p, np.zeros(p.size, np.float32))
+            assert isinstance(anchors, Anchors)
+            assert ms > 0
+            pair.append(anchors)
+        assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know of the noise"
+        clean.append(torch.cat([pair[0].pixel, pair[0].depth[..., None]], -1)[0])
+        noisy.append(torch.cat([pair[1].pixel, pair[1].depth[..., None]], -1)[0])
+        stated.append(pair[0].variance[0].sqrt())
+    change = torch.cat(noisy) - torch.cat(clean)
+    assert len(change) > 60
+    assert change[:, :2].std() == pytest.approx(0.5, rel=0.2)
+    assert (change[:, 2] / torch.cat(stated)).std() == pytest.approx(0.5, rel=0.25)
+
+
+def test_rows_of_the_same_poses_share_a_tracker():
+    alike = [row(NAME, anchors="tracked"), row(NAME, anchors="tracked", anchor_count=5, corrected=True)]
+    others = [row(NAME, anchors="tracked", rotation_noise=1.0, seed=seed) for seed in (0, 1)]
+    sources = anchor_sources([row(NAME), *alike, *others, row(NAME, anchors="tracked", skip=1)])
+    assert row(NAME) not in sources
+    assert sources[alike[0]]._tracks is sources[alike[1]]._tracks
+    assert len({id(source._tracks) for source in sources.values()}) == 4
+
+
+def test_tracking_needs_images(tour):
+    blind = replace(tour, entries=tuple(replace(entry, load_image=None) for entry in tour.entries))
+    networks = {"depth_only": Biased()}
+    found = evaluate(blind, [row(NAME), row(NAME, anchors="truth")], networks)
+    assert all(result.frames["judged"] == 10 for result in found.values())
+    with pytest.raises(Exception, match="no image"):
+        evaluate(blind, [row(NAME, anchors="tracked")], networks)
