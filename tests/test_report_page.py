@@ -335,6 +335,17 @@ class TestPage:
         wanted = "--network ensemble=trained:DIR/m0.safetensors,DIR/m1.safetensors --out OUT"
         assert command(about) == f"ufmstar eval --suite depth-only --root tum=DIR {wanted}"
 
+    def test_the_command_has_what_was_chosen(self) -> None:
+        network = {"model": "trained", "files": [{"name": "m.safetensors", "member": 0}]}
+        about = {"suite": "depth-only", "datasets": ["tum"], "networks": {"aleatoric": network}}
+        begin = "ufmstar eval --suite depth-only --root tum=DIR --network aleatoric=trained:DIR/m.safetensors#0"
+        for settings, words in (
+            ({"frames": [None, None, None], "confident": 0.5}, "--confident 0.5"),
+            ({"frames": [0, 8, None], "trajectory": "slam.txt", "depth_scale": 0.001},
+             "--frames 0:8: --trajectory slam.txt --depth-scale 0.001"),
+        ):  # fmt: skip
+            assert command({**about, "settings": settings}) == f"{begin} {words} --out OUT"
+
     def test_pictures_that_do_not_fit_are_named(
         self, evaluation: tuple[Results, list[Path], Path], tmp_path: Path
     ) -> None:

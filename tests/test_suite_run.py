@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 from dataclasses import replace
 
@@ -12,12 +13,13 @@ import numpy as np
 import pytest
 import torch
 from layouts_more import write_nyu
-from suite_runs import NAMES, Stub, go, job_on, kept, write_rooms
+from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 
 from ufmstar_torch.eval.output_folder import FolderError
 from ufmstar_torch.eval.report.load import load_results
 from ufmstar_torch.eval.suite.cache import CacheError
 from ufmstar_torch.eval.suite.evaluate import SequenceError, evaluate_sequence
+from ufmstar_torch.eval.suite.options import eval_parser, job_from, parse_eval
 from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.run_suite import DIED, failures, with_references
 from ufmstar_torch.eval.suite.store import EvalFolder
@@ -165,6 +167,27 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     again, told = go(job, evaluate_sequence, resume=True)
     assert again
     assert sum("failed" in line for line in told) == 1, "it is told each time"
+
+
+def test_poses_of_another_program(tmp_path):
+    """A trajectory in each sequence's folder, its own format: judged as if the poses were the sequence's own."""
+    root = write_rooms(tmp_path / "own", ["ash", "birch"], frames=3)
+    for name in ("ash", "birch"):
+        shutil.copy(root / name / "poses.txt", root / name / "slam.txt")
+        (root / name / "poses.txt").write_text("not a pose\n")
+    words = ["--suite", "depth-only", "--network", TRUTH, "--root", f"rooms={root}", "--out", str(tmp_path / "out")]
+    job = job_from(parse_eval(eval_parser(), [*words, "--trajectory", "slam.txt"]))
+    go(job)
+    write_rooms(tmp_path / "plain", ["ash", "birch"], frames=3)
+    go(job_on(tmp_path / "plain", tmp_path / "expected"))
+    assert len(kept(job.out)) == 8
+    assert kept(job.out) == kept(tmp_path / "expected")
+    assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
+    with pytest.raises(FolderError, match="settings"):
+        go(job_from(parse_eval(eval_parser(), words)), resume=True)
+    for wrong, told in (("--poses sideways", "--poses must be one of"), ("--fps 0", "fps must be positive")):
+        with pytest.raises(ValueError, match=told):
+            job_from(parse_eval(eval_parser(), [*words, *wrong.split()]))
 
 
 def test_another_sequence_of_the_name_is_refused(tmp_path):

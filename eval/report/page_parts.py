@@ -163,9 +163,24 @@ def command(about: Mapping[str, Any]) -> str:
     parts = ["ufmstar eval", f"--suite {about['suite']}"]
     parts += [f"--root {dataset}=DIR" for dataset in about.get("datasets") or []]
     for base, network in (about.get("networks") or {}).items():
-        files = ",".join(f"DIR/{file['name']}" for file in network.get("files") or [] if file.get("name"))
+        files = ",".join(f"DIR/{_chosen(file)}" for file in network.get("files") or [] if file.get("name"))
         parts.append(f"--network {base}={network.get('model', 'MODEL')}:{files or 'DIR'}")
+    for name, value in (about.get("settings") or {}).items():
+        told = _slice(value) if name == "frames" else value
+        if told not in ("::", None):
+            parts.append(f"--{name.replace('_', '-')} {told}")
     return " ".join([*parts, "--out OUT"])
+
+
+def _chosen(file: Mapping[str, Any]) -> str:
+    """A file of weights, and the member of it that was taken."""
+    member = file.get("member")
+    return str(file["name"]) if member is None else f"{file['name']}#{member}"
+
+
+def _slice(limits: Sequence[int | None]) -> str:
+    """START:STOP:STEP; "::" is all."""
+    return ":".join("" if limit is None else str(limit) for limit in limits)
 
 
 def glossary_part() -> Part:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,8 @@ _DESCRIPTION = """The rows of a table or figure of the paper, on sequences of yo
 Every sequence is finished for itself: whatever ends the program, --resume computes what is missing. Several processes
 may share the work: --processes on one computer, torchrun or --slurm on several, --shard by hand."""
 _MANY = "repeatable"
+# Those of ``open_sequence``; what is not given stays as the layout has it.
+_OPENING = ("trajectory", "poses", "depth_scale", "fps", "time_offset", "max_pose_gap", "scans")
 _GROUPS: dict[str, tuple[tuple[str, Any, Any, str], ...]] = {
     "what": (
         ("--suite", str, None, "name of a suite (see --list), or a TOML file of your own"),
@@ -41,6 +44,15 @@ _GROUPS: dict[str, tuple[tuple[str, Any, Any, str], ...]] = {
         ("--seed", int, 0, "of the draw"),
         ("--sequence-list", str, None, "file with the names of the sequences to take, one a line"),
         ("--frames", str, None, "START:STOP:STEP, which frames of a sequence, counted from 0 as Python does"),
+    ),
+    "how the sequences are opened, all of them alike": (
+        ("--trajectory", str, None, "poses of another program (TUM or KITTI format): a file in each sequence's folder"),
+        ("--poses", str, None, "how they are written: camera-to-world (default), world-to-camera, ned or opengl"),
+        ("--depth-scale", float, None, "metres per unit of the depth maps"),
+        ("--fps", float, None, "frames per second of images without timestamps"),
+        ("--time-offset", float, None, "added to the images' times [s]"),
+        ("--max-pose-gap", float, None, "between the poses that are interpolated [s]; default: 0.1"),
+        ("--scans", int, None, "laser scans before and after a frame's own that are added to it (KITTI-360)"),
     ),
     "output": (
         ("--out", str, None, "folder for everything that is written"),
@@ -157,6 +169,7 @@ def job_from(options: Mapping[str, Any]) -> EvalJob:
     networks = {choice.base: choice for choice in choices}
     if len(networks) < len(choices):
         raise ValueError(f"--network: every base once, got {', '.join(choice.base for choice in choices)}")
+    opening = _opening(options)
     names = options["sequence_list"]
     items = find_work(
         options["root"],
@@ -167,7 +180,7 @@ def job_from(options: Mapping[str, Any]) -> EvalJob:
     return EvalJob(
         suite=suite.with_bases(networks),
         networks=networks,
-        items=tuple(items),
+        items=tuple(replace(item, opening=opening) for item in items),
         out=Path(options["out"]),
         missing_bases=tuple(base for base in suite.bases if base not in networks),
         frames=parse_slice(options["frames"]),
@@ -177,3 +190,19 @@ def job_from(options: Mapping[str, Any]) -> EvalJob:
         examples=options["examples"],
         samples=options["samples"],
     )
+
+
+def _opening(options: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    """What was given of how sequences are opened.
+
+    Raises:
+        ValueError: a value out of range.
+    """
+    from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
+    from ufmstar_torch.eval.sequences.options import Options
+
+    given = {name: options[name] for name in _OPENING if options[name] is not None}
+    if given.get("poses", OURS) not in CONVENTIONS:
+        raise ValueError(f"--poses must be one of {', '.join(CONVENTIONS)}, got {given['poses']!r}")
+    Options(**{name: value for name, value in given.items() if name != "poses"})
+    return tuple(given.items())

@@ -78,6 +78,7 @@ class EvalJob:
     def about(self, networks: Mapping[str, BaseNetwork]) -> dict[str, Any]:
         """eval.json."""
         suite, f = self.suite, self.frames
+        opening = {name: value for item in self.items for name, value in item.opening}
         return {
             "suite": suite.name,
             "title": suite.title,
@@ -87,7 +88,7 @@ class EvalJob:
             "datasets": sorted({item.dataset for item in self.items}),
             "sequences": [{"dataset": item.dataset, "sequence": item.sequence} for item in self.items],
             "missing_bases": list(self.missing_bases),
-            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident},
+            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **opening},
             "versions": versions(),
             "machine": hardware(),
         }

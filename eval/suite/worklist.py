@@ -7,8 +7,9 @@ import random
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ufmstar_torch.eval.sequences.frame import Sequence as Frames
 from ufmstar_torch.eval.suite.cache import sequence_digest
@@ -28,12 +29,14 @@ class WorkItem:
         sequence: its name, unique within the data set.
         path: what ``open_sequence`` takes, ``tour:SEED`` included.
         layout: likewise.
+        opening: further options of ``open_sequence``, by name.
     """
 
     dataset: str
     sequence: str
     path: str
     layout: str
+    opening: tuple[tuple[str, Any], ...] = field(default=(), compare=False)
 
     @property
     def folder(self) -> Path:
@@ -53,7 +56,7 @@ class WorkItem:
         """
         from ufmstar_torch.eval.sequences.layout import open_sequence
 
-        return open_sequence(self.path, self.layout)
+        return open_sequence(self.path, self.layout, **dict(self.opening))
 
 
 @dataclass(frozen=True)
