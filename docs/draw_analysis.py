@@ -98,7 +98,7 @@ def draw_factors(groups: dict[str, list[dict[str, dict[str, float]]]]) -> Figure
         axis.set_yticklabels(names, fontsize=8)
         axis.grid(alpha=0.3, axis="x")
     axes[0].invert_yaxis()
-    axes[0].legend(fontsize=8, loc="lower left")
+    axes[0].legend(fontsize=8, loc="lower right")
     return figure
 
 
