@@ -217,17 +217,18 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     measured = []
 
     def measure(rows, networks, sequence, **how):
-        measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames))
+        measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames, how["plan"].threads))
         return {"rows": []}
 
     monkeypatch.setattr(efficiency_step, "measure", measure)
     monkeypatch.setattr(efficiency_step, "contenders", lambda networks: networks)
     monkeypatch.setattr(launch, "job_from", lambda options: _about_efficiency(own(options)))
     own = job_from
-    words = words_for(rooms, tmp_path / "out", "--no-report")
-    assert ufmstar(*words)[0] == 0
+    words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1")
+    code, _, err = ufmstar(*words)
+    assert (code, "measuring time, energy and memory" in err) == (0, True)
     assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
-    assert measured == [(["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"], "ash", 1)]
+    assert measured == [(["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"], "ash", 1, 1)]
     assert ufmstar(*words, "--resume")[0] == 0
     assert len(measured) == 1
 

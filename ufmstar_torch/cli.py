@@ -272,18 +272,19 @@ def _evaluate(options: Mapping[str, Any]) -> int:
     with Bars() as bars, stop_signals(bars.say) as stop:
         ended = evaluate_suite(options, stop=stop, tell=bars.say, progress=bars.frames)
     if ended.tells:
-        return _tell(ended, draws=not options["no_report"])
+        return _tell(ended, options["threads"], draws=not options["no_report"])
     return OK if ended.finished else INTERRUPTED
 
 
-def _tell(ended: Ended, *, draws: bool) -> int:
+def _tell(ended: Ended, threads: int | None, *, draws: bool) -> int:
     """The table, the measurements and pictures that belong to it, and what is broken; the exit code."""
     from ufmstar_torch.eval.suite.outcome import draw, measure, table
 
-    print(table(ended))
+    print(table(ended), flush=True)
     if ended.finished:
-        for step in (measure, *([draw] if draws else [])):
-            told = step(ended)
+        if ended.job.suite.efficiency:
+            print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
+        for told in (measure(ended, threads), draw(ended) if draws else None):
             if told is not None:
                 print(told)
     for label, reason in ended.failed.items():

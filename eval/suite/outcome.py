@@ -20,18 +20,23 @@ def table(ended: Ended) -> str:
     return "\n".join(lines)
 
 
-def measure(ended: Ended) -> str | None:
+def measure(ended: Ended, threads: int | None = None) -> str | None:
     """Measure what a suite about efficiency asks for, unless it is there; a line if it cannot be had.
+
+    Args:
+        ended: the evaluation.
+        threads: of the CPU; None = all.
 
     Raises:
         OSError: the file cannot be written.
     """
+    from ufmstar_torch.eval.efficiency.measure import Plan
     from ufmstar_torch.eval.suite.efficiency_step import EFFICIENCY, measure_job
 
     if not ended.job.suite.efficiency or (ended.job.out / EFFICIENCY).exists():
         return None
     try:
-        measure_job(ended.job)
+        measure_job(ended.job, Plan(threads=threads))
     except ValueError as error:
         return f"no {EFFICIENCY}: {' '.join(str(error).split())}"
     return None
