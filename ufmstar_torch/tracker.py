@@ -246,7 +246,8 @@ class LandmarkTracker:
         variance = config.pixel_noise**2 * np.maximum(excess, 1) * np.einsum("i,nij,j->n", axis, found.covariance, axis)
         safe = np.maximum(depth, 1e-9)
         fine = found.ahead & (depth > 0) & (found.error <= config.max_error)
-        fine &= np.sqrt(variance) <= config.max_relative_sigma * safe
+        # Hopeless geometry can make the covariance indefinite.
+        fine &= (variance >= 0) & (variance <= np.square(config.max_relative_sigma * safe))
         return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
 
 
