@@ -208,11 +208,12 @@ class Gaussians(Estimator):
         mixture, smoothed = self.ufm.mixture, self.ufm.smoothed
         count = int(mixture.components.sum())
         smoothing = smoothed.numel() * smoothed.element_size()
-        found = {"bytes": count * mixture.bytes_per_component(), "count": count, "smoothing_bytes": smoothing}
+        bytes_ = count * mixture.bytes_per_component()
+        found: dict[str, float] = {"bytes": bytes_, "count": count, "smoothing_bytes": smoothing}
         if not self.ufm.config.anchored:
             return found
         learnt = (count + 1) * self.ufm.overall_evidence.numel() * self.ufm.overall_evidence.element_size()
-        return {**found, "bytes": found["bytes"] + learnt, "anchors": self._anchors}
+        return {**found, "bytes": bytes_ + learnt, "anchors": self._anchors}
 
 
 def _variances(predicted: Predicted, used: bool) -> tuple[Tensor | None, Tensor | None]:
