@@ -68,7 +68,7 @@ def write_sequence(
     out: Path, suite: str, dataset: str, sequence: str, rows: Iterable[Row], network: str = NETWORK
 ) -> None:
     """Records and sums of the rows on one sequence."""
-    folder = out / "work" / dataset / sequence
+    folder = out / "records" / dataset / sequence
     folder.mkdir(parents=True, exist_ok=True)
     rows = list(rows)
     references = {
@@ -157,7 +157,7 @@ def write_evaluation(
     for dataset, sequence in sequences:
         write_sequence(out, suite, dataset, sequence, rows)
     for (dataset, sequence), reason in failed.items():
-        folder = out / "work" / dataset / sequence
+        folder = out / "records" / dataset / sequence
         folder.mkdir(parents=True)
         values = {"sequence": sequence, "reason": reason, "rows": [row.slug for row in rows]}
         (folder / "failed.json").write_text(json.dumps(values))

@@ -87,7 +87,7 @@ def go(job, evaluate=None, *, resume=False, overwrite=False, **conduct):
 def kept(out):
     """What does not depend on who computed it, or when: figures, curves and sums by file."""
     found = {}
-    for path in sorted((out / "work").rglob("*.json")):
+    for path in sorted((out / "records").rglob("*.json")):
         values = json.loads(path.read_text())
         if path.name != "failed.json":
             sums = torch.load(path.with_suffix(".pt"), weights_only=True)

@@ -325,7 +325,7 @@ class TestWritePictures:
     def test_all_kinds_with_their_words(self, tmp_path: Path) -> None:
         rows = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
         sequence = "a/b: c"  # no name for a folder
-        folder = tmp_path / "work" / WorkItem("tour", sequence, path="", layout="").folder
+        folder = tmp_path / "records" / WorkItem("tour", sequence, path="", layout="").folder
         for name in ("examples", "room"):
             (folder / name).mkdir(parents=True)
         np.savez(folder / "examples" / "7.npz", image=np.zeros((*SHAPE, 3), np.uint8), truth=full(3.0), K=K)

@@ -309,11 +309,11 @@ class TestLoading:
 
     def test_records_that_do_not_belong_together(self, tmp_path):
         write_evaluation(tmp_path, [ALONE], SCENES[:1])
-        record = tmp_path / "work" / "scannet" / SCENES[0][1] / "Ensemble.json"
+        record = tmp_path / "records" / "scannet" / SCENES[0][1] / "Ensemble.json"
         good = json.loads(record.read_text())
 
         def refused(change: dict[str, object], match: str, name: str = "scene0001_00") -> None:
-            path = tmp_path / "work" / "scannet" / name / "Ensemble.json"
+            path = tmp_path / "records" / "scannet" / name / "Ensemble.json"
             path.parent.mkdir(exist_ok=True)
             path.write_text(json.dumps({**good, **change}))
             with pytest.raises(ResultsError, match=match):
@@ -328,7 +328,7 @@ class TestLoading:
 
     def test_sums_that_are_gone_or_broken(self, tmp_path):
         write_evaluation(tmp_path, ENSEMBLE[:2], SCENES[:2])
-        sums = tmp_path / "work" / "scannet" / SCENES[1][1] / "Ensemble.pt"
+        sums = tmp_path / "records" / "scannet" / SCENES[1][1] / "Ensemble.pt"
         kept = sums.read_bytes()
         sums.unlink()
         found = load_results(tmp_path)

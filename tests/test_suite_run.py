@@ -42,7 +42,7 @@ def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
     ended, told = go(job)
     assert ended
     assert [line.split(":")[0] for line in told] == [f"rooms/{name}" for name in NAMES]
-    record = Record.load(job.out / "work" / "rooms" / "birch" / "UfMstar-DepthOnly.json")
+    record = Record.load(job.out / "records" / "rooms" / "birch" / "UfMstar-DepthOnly.json")
     assert (record.suite, record.dataset, record.sequence) == ("depth-only", "rooms", "birch")
     assert (record.network, record.method, record.setting) == ("ground truth", "UfM*-DepthOnly", {})
     assert record.provenance["sequence"] == content_digest(job.items[1].open())
@@ -67,7 +67,7 @@ def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
                 k: v for k, v in result.figures.items() if np.isfinite(v)
             }
     # Pictures of the first sequence only.
-    assert [path.parent.name for path in sorted(job.out.glob("work/*/*/examples"))] == ["ash"]
+    assert [path.parent.name for path in sorted(job.out.glob("records/*/*/examples"))] == ["ash"]
 
 
 def test_resume_computes_nothing_that_is_there(rooms, tmp_path):
@@ -107,7 +107,7 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
     assert ended
     assert "rooms/birch: failed: " in told[1]
     assert sorted(path.split("/")[2] for path in kept(job.out)) == ["ash"] * 4 + ["cedar"] * 4
-    failed = json.loads((job.out / "work" / "rooms" / "birch" / "failed.json").read_text())
+    failed = json.loads((job.out / "records" / "rooms" / "birch" / "failed.json").read_text())
     assert (failed["sequence"], failed["dataset"], len(failed["rows"])) == ("birch", "rooms", 4)
     assert "poses.txt" in failed["reason"]
     assert failures(folder_of(job), job.items).keys() == {"rooms/birch"}

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -167,7 +166,7 @@ def report(arguments: Sequence[str]) -> int:
 
     options = parse_report(arguments)
     from ufmstar_torch.eval.report.load import ResultsError, load_results
-    from ufmstar_torch.eval.report.write import summary, write_report
+    from ufmstar_torch.eval.report.write import summary, write_report, written
 
     try:
         print(summary(load_results(options.out, with_sums=False)))
@@ -178,10 +177,7 @@ def report(arguments: Sequence[str]) -> int:
         if options.debug:
             traceback.print_exc()
         return _told(f"ufmstar report: failed: {_one_line(error)}", FAILED)
-    folders = Counter(file.parent for file in files if file.parent != options.out)
-    told = [file.name for file in files if file.parent == options.out]
-    told += [f"{folder.name}/ ({count} files)" for folder, count in folders.items()]
-    print(f"{options.out}: {', '.join(told)}")
+    print(written(options.out, files))
     return OK
 
 

@@ -103,7 +103,7 @@ def deviation(variance: Map, valid: NDArray[np.bool_]) -> Map:
 
 
 def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list[Example]:
-    """The examples of one sequence, ``OUT/work/DATASET/SEQUENCE``, in the order of their frames.
+    """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames.
 
     Rows whose maps show the frame with another camera (a network of another size) make an example of their own. Rows
     without a variance have nothing to show and are left out, and so are frames without any row.

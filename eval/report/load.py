@@ -116,7 +116,7 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
         OSError: a file cannot be read.
     """
     about = _about(out)
-    found = {path: _record(path) for path in sorted((out / "work").rglob("*.json")) if path.name != FAILED}
+    found = {path: _record(path) for path in sorted((out / "records").rglob("*.json")) if path.name != FAILED}
     order = {row: number for number, row in enumerate(listed_rows(about))}
     paths = sorted(found, key=lambda path: _place(found[path], order))
     records = [found[path] for path in paths]
@@ -214,7 +214,7 @@ def _check(out: Path, about: Mapping[str, Any], paths: Sequence[Path], records: 
 
 def _failed(out: Path) -> tuple[Failed, ...]:
     found = []
-    for path in sorted((out / "work").rglob(FAILED)):
+    for path in sorted((out / "records").rglob(FAILED)):
         values = _optional(path)
         if not isinstance(values, dict) or "reason" not in values:
             raise ResultsError(f"{path} does not say why a sequence failed")

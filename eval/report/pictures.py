@@ -120,7 +120,7 @@ def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[
 
 def _place(results: Results, dataset: str, sequence: str) -> Path:
     """The folder of a sequence, whose name need not be fit for one."""
-    return results.out / "work" / WorkItem(dataset, sequence, path="", layout="").folder
+    return results.out / "records" / WorkItem(dataset, sequence, path="", layout="").folder
 
 
 def _strip(folder: Path, example: Example, rows: Sequence[Row], base: str) -> Picture:

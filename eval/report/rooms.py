@@ -47,7 +47,7 @@ class Snapshot:
 
 
 def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
-    """The snapshots of one sequence, ``OUT/work/DATASET/SEQUENCE``, by row, in the order of their frames.
+    """The snapshots of one sequence, ``OUT/records/DATASET/SEQUENCE``, by row, in the order of their frames.
 
     Raises:
         ValueError: a file cannot be read or holds something else; the message names it.

@@ -17,6 +17,8 @@ from ufmstar_torch.eval.suite.record import Record
 from ufmstar_torch.eval.suite.row import Row
 
 METHOD = "Method"
+# [nats] Above it, a mean NLL is that of a few pixels: sigma = .25 d of a room makes about 1.
+NLL_OF_FEW = 100.0
 # LaTeX headings of the paper's columns.
 _PAPER_COLUMNS = {
     "delta1": ("δ₁", r"$\delta_1$"),
@@ -98,7 +100,7 @@ def _means(results: Results, dataset: str | None, quantities: Sequence[Quantity]
     alike = len({frozenset(where) for where in on.values()}) == 1
     cells = {row: _cells(found, quantities) for row, found in records.items()}
     columns = _columns(quantities, group)
-    notes = [_network_note(results), _interval_note(records)]
+    notes = [_network_note(results), _interval_note(records), _nll_note(records, quantities)]
     if not alike:
         columns = (Column("sequences", "Sequences", group), *columns)
         cells = {row: [Cell(str(len(on[row]))), *found] for row, found in cells.items()}
@@ -177,6 +179,18 @@ def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:
         return "One sequence: no confidence intervals."
     return (
         "Means over sequences, each counting the same, with 95 % confidence intervals (those below 0.01 are left out)."
+    )
+
+
+def _nll_note(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quantity]) -> str:
+    """A warning where the NLL is that of a few pixels."""
+    shown = any(quantity.key == "nll" for quantity in quantities)
+    found = [record.figures.get("nll") for of_row in records.values() for record in of_row]
+    if not shown or max((nll for nll in found if nll is not None), default=0.0) < NLL_OF_FEW:
+        return ""
+    return (
+        f"An NLL above {NLL_OF_FEW:.0f} tells of a few pixels with almost no variance and of nothing else; those with "
+        "none at all have no NLL (their share stands among the further figures)."
     )
 
 

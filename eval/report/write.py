@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,15 @@ def summary(results: Results) -> str:
         parts.append(_missing(results))
     parts += [f"note: {note}" for note in results.notes]
     return "\n".join(parts)
+
+
+def written(out: Path, files: Iterable[Path]) -> str:
+    """A line for a terminal: the folder's files by name, those of its folders by number."""
+    listed = list(files)
+    folders = Counter(file.parent for file in listed if file.parent != out)
+    told = [file.name for file in listed if file.parent == out]
+    told += [f"{folder.name}/ ({count} files)" for folder, count in folders.items()]
+    return f"{out}: {', '.join(told)}"
 
 
 def _missing(results: Results) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ufmstar_torch.eval.report.load import ResultsError, load_results
-from ufmstar_torch.eval.report.write import summary, write_report
+from ufmstar_torch.eval.report.write import summary, write_report, written
 from ufmstar_torch.eval.suite.launch import Ended
 
 
@@ -16,7 +16,7 @@ def table(ended: Ended) -> str:
         lines = [str(error)]
     if job.missing_bases:
         lines.append(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
-    lines.append(f"{job.out}: eval.json, work/DATASET/SEQUENCE/ with a record for every row")
+    lines.append(f"{job.out}: eval.json, records/DATASET/SEQUENCE/ with a record for every row")
     return "\n".join(lines)
 
 
@@ -52,4 +52,4 @@ def draw(ended: Ended) -> str:
         files = write_report(ended.job.out)
     except (ImportError, ResultsError) as error:
         return f"no report: {' '.join(str(error).split())}"
-    return f"{ended.job.out}: {', '.join(str(file.relative_to(ended.job.out)) for file in files)}"
+    return written(ended.job.out, files)

@@ -3,9 +3,9 @@
 ```
 OUT/eval.json                       what is evaluated: suite, rows, networks, sequences, settings
 OUT/eval.lock                       held while eval.json is made or extended
-OUT/work/DATASET/SEQUENCE/.claim    held while a process is at the sequence; says which launch took it last
-OUT/work/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: its presence says that both are there
-OUT/work/DATASET/SEQUENCE/failed.json
+OUT/records/DATASET/SEQUENCE/.claim    held while a process is at the sequence; says which launch took it last
+OUT/records/DATASET/SEQUENCE/ROW.json  a record, written after ROW.pt: its presence says that both are there
+OUT/records/DATASET/SEQUENCE/failed.json
 ```
 Several processes may work in one folder, on one computer or many that see it.
 """
@@ -112,7 +112,7 @@ class EvalFolder:
 
     def place(self, item: WorkItem) -> Path:
         """The folder of a sequence."""
-        return self.path / "work" / item.folder
+        return self.path / "records" / item.folder
 
     def claim(self, item: WorkItem, launch: str) -> Claim | None:
         """Take a sequence; None while another process has it.
@@ -243,7 +243,7 @@ def _clear(out: Path) -> None:
     Raises:
         FolderError: a process is at one of its sequences.
     """
-    places = sorted(path.parent for path in out.glob(f"work/*/*/{CLAIM}"))
+    places = sorted(path.parent for path in out.glob(f"records/*/*/{CLAIM}"))
     claims = [hold(place / CLAIM) for place in places]
     try:
         if None in claims:
@@ -252,7 +252,7 @@ def _clear(out: Path) -> None:
             for pattern in ("*.json", "*.pt", "examples/*.npz", "room/*.npz", CLAIM):
                 for file in place.glob(pattern):
                     file.unlink()
-            for folder in (place / "examples", place / "room", place, place.parent, out / "work"):
+            for folder in (place / "examples", place / "room", place, place.parent, out / "records"):
                 if folder.is_dir() and not any(folder.iterdir()):
                     folder.rmdir()
     finally:

@@ -40,7 +40,7 @@ class WorkItem:
 
     @property
     def folder(self) -> Path:
-        """DATASET/SEQUENCE below the outputs' "work", both in letters that every file system takes."""
+        """DATASET/SEQUENCE below the outputs' "records", both in letters that every file system takes."""
         return Path(_safe(self.dataset), _safe(self.sequence))
 
     @property
