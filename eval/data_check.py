@@ -17,6 +17,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError, Sequence
 from ufmstar_torch.eval.sequences.layout import open_sequence
 
 _SAMPLED = 12  # frames whose depth is looked at for its range
+_DECODED = 500  # frames that are read to see that they can be; of more, as many evenly spaced ones: seconds
 _QUANTILES = (0.01, 0.99)
 # Scales that are customary [m per unit]; one within the check's own tolerance of what was found is meant.
 _CUSTOMARY = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1 / 5000, 1 / 256, 1 / 4000, 1 / 1024)
@@ -140,14 +141,13 @@ def _verdict(
         found = check_sequence(sequence, pairs)
     except ValueError as error:
         return problems, remedies, [f"nothing was compared: {error}"], {}
-    if found.unreadable:
-        problems.append(
-            f"{len(found.unreadable)} of the frames looked at cannot be decoded, first {found.unreadable[0]}"
-        )
+    read, broken = _read_frames(sequence)
+    if broken:
+        problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
         remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
     problems += found.problems
     remedies += _remedies(found, sequence, path, options)
-    return problems, remedies, list(found.undecided), _measured(found)
+    return problems, remedies, list(found.undecided), {**_measured(found), "read": read, "unreadable": broken}
 
 
 def _remedies(found: SequenceCheck, sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
@@ -215,8 +215,21 @@ def _measured(found: SequenceCheck) -> dict[str, Any]:
         "scale": found.scale,
         "best_error": found.best_error,
         "registration": None if lies is None else asdict(lies),
-        "unreadable": list(found.unreadable),
     }
+
+
+def _read_frames(sequence: Sequence) -> tuple[int, list[str]]:
+    """How many frames were read, and what was said of those that cannot be; a rendered frame always can."""
+    if sequence.layout == "tour":
+        return 0, []
+    chosen = np.unique(np.linspace(0, len(sequence) - 1, min(_DECODED, len(sequence))).astype(int))
+    broken = []
+    for index in chosen:
+        try:
+            sequence[int(index)]
+        except FrameError as error:
+            broken.append(str(error))
+    return len(chosen), broken
 
 
 def _depth_statistics(sequence: Sequence) -> tuple[tuple[float, ...] | None, float]:

@@ -131,7 +131,17 @@ def test_broken_and_missing_frames_are_told(tour, capsys):
     assert code == 1
     assert "23 of 24 frames usable" in out
     assert re.search(r"skipped +1 x non-finite pose", out)
-    assert re.search(r"PROBLEM +1 of the frames looked at cannot be decoded, first .*000000\.png", out)
+    assert re.search(r"PROBLEM +1 of the \d+ frames read cannot be decoded, first .*000000\.png", out)
+
+
+def test_every_frame_is_read(tour, capsys):
+    """A truncated file in the middle, which no compared pair holds, is found."""
+    broken = sorted((tour / "depth").iterdir())[13]
+    layouts.truncate(broken)
+    code, out = command(capsys, tour, "--pairs", 1)
+    assert code == 1
+    assert re.search(rf"PROBLEM +1 of the 24 frames read cannot be decoded, first .*{broken.name}", out)
+    assert check_data(tour, pairs=1).checked["read"] == 24
 
 
 def test_a_sequence_that_cannot_be_opened(tour, capsys):
