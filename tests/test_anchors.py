@@ -145,7 +145,7 @@ def test_sums_and_means_by_hand(seed, memory, kappa):
             rows(list(zip(d, g, s2, own, strict=True))),
             torch.tensor(m)[None],
             torch.tensor(share)[None],
-            torch.tensor([memory], dtype=torch.float64),
+            memory,
         )
         assert bool(used.all())
         sums, total = sums * memory, total * memory
@@ -158,11 +158,24 @@ def test_sums_and_means_by_hand(seed, memory, kappa):
     np.testing.assert_allclose(evidence.component[0].numpy(), sums, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(evidence.overall[0].numpy(), total, rtol=1e-12, atol=1e-14)
     beyond, stream = means(evidence, kappa)
-    expected = total[1:] / total[0]
+    expected = total[1:] / (total[0] + kappa)
     np.testing.assert_allclose(stream[0].numpy(), expected, rtol=1e-12, atol=1e-14)
     for c in range(k):
         shrunk = (sums[c, 1:] + kappa * expected) / (sums[c, 0] + kappa)
         np.testing.assert_allclose(beyond[0, c].numpy() + expected, shrunk, rtol=1e-10, atol=1e-12)
+
+
+def test_without_new_anchors_nothing_fades_and_one_does_not_decide():
+    depths, poses, K = scenes.sequence(8, HEIGHT, WIDTH, 0.0)
+    ufm, rng = UfMStar(ON), np.random.default_rng(0)
+    for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
+        depth = torch.tensor(truth * 1.5)[None]
+        ufm(depth, torch.tensor(T), torch.tensor(K), anchors=anchors_of(truth, 40, rng) if i == 0 else None)
+        if i == 0:
+            learnt = ufm.overall_evidence.clone()
+        assert torch.equal(ufm.overall_evidence, learnt)
+    one = Evidence(torch.zeros(1, 2, 3), torch.tensor([[1.0, -0.3, 0.09]]))
+    torch.testing.assert_close(means(one, 5.0)[1], torch.tensor([[-0.05, 0.015]], dtype=torch.float64))
 
 
 def test_outliers_are_those_without_support():

@@ -12,8 +12,10 @@ before, and neither is the anchors' own noise.
 
 Sums of (1, r, e) live beside the mixture, one row a component, and one for the stream as a whole. A component takes an
 anchor by its share in explaining the predicted point, w_k = pi_k N_k / (sum pi N + pi_0). Old evidence fades by a
-factor a frame. Means shrink: (sum_k + kappa mean)/(n_k + kappa) towards the stream's; and where no component explains a
-point, the stream's mean is the answer: what the network has been getting wrong lately, not nothing.
+factor with every frame that brings new; without new evidence what was learnt stays. Means shrink: the stream's towards
+0, sum/(n + kappa), so that a single anchor does not decide for all; a component's towards the stream's,
+(sum_k + kappa mean)/(n_k + kappa). Where no component explains a point, the stream's mean is the answer: what the
+network has been getting wrong lately, not nothing.
 """
 
 from __future__ import annotations
@@ -64,11 +66,6 @@ class Evidence:
         missing = capacity - self.component.shape[1]
         return Evidence(torch.nn.functional.pad(self.component, (0, 0, 0, max(missing, 0))), self.overall)
 
-    def faded(self, memory: Tensor) -> Evidence:
-        """Older by a frame: multiplied by ``memory`` [B] in (0, 1]."""
-        m = memory.to(self.overall.dtype)
-        return Evidence(m[:, None, None] * self.component, m[:, None] * self.overall)
-
 
 def inliers(anchors: AnchorInput) -> Tensor:
     """[B, N] True for valid anchors that enough of their neighbours in the image support.
@@ -99,7 +96,7 @@ def _take(value: Tensor, index: Tensor) -> Tensor:
 
 
 def observe(
-    evidence: Evidence, anchors: AnchorInput, disagreement: Tensor, share: Tensor, memory: Tensor
+    evidence: Evidence, anchors: AnchorInput, disagreement: Tensor, share: Tensor, memory: float
 ) -> tuple[Evidence, Tensor]:
     """Let old evidence fade and add a frame's.
 
@@ -108,7 +105,7 @@ def observe(
         anchors: of the frame.
         disagreement: [B, N] M at the anchors' predicted points [m^2].
         share: [B, N, K] how much of each anchor's point a component explains, in [0, 1].
-        memory: [B] in (0, 1], by which old evidence is multiplied.
+        memory: in (0, 1], by which the old evidence of a stream is multiplied when there is new.
 
     Returns:
         The evidence, and [B, N] which anchors were used.
@@ -120,7 +117,8 @@ def observe(
     rows = torch.stack([torch.ones_like(r), r, e], dim=-1)
     rows = torch.where(used[..., None], rows, torch.zeros_like(rows))
     dtype = evidence.overall.dtype
-    fade = memory.double()[:, None]
+    fresh = used.any(1, keepdim=True).double()
+    fade = memory * fresh + (1 - fresh)
     component = fade[..., None] * evidence.component.double() + torch.einsum("bnk,bns->bks", share.double(), rows)
     overall = fade * evidence.overall.double() + rows.sum(1)
     return Evidence(component.to(dtype), overall.to(dtype)), used
@@ -131,15 +129,13 @@ def means(evidence: Evidence, shrinkage: float) -> tuple[Tensor, Tensor]:
 
     Args:
         evidence: so far.
-        shrinkage: kappa, the number of anchors that the stream's mean counts for in a component's.
+        shrinkage: kappa, the number of anchors for which the stream's mean counts in a component's, and 0 in its own.
 
     Returns:
-        [B, K, 2] mean r and e of the components less the stream's, 0 without evidence; [B, 2] the stream's, 0 before
-        the first anchor.
+        [B, K, 2] mean r and e of the components less the stream's; [B, 2] the stream's, 0 before the first anchor.
     """
     overall = evidence.overall.double()
-    n = overall[..., :1]
-    stream = torch.where(n > 0, overall[..., 1:] / torch.where(n > 0, n, torch.ones_like(n)), torch.zeros_like(n))
+    stream = overall[..., 1:] / (overall[..., :1] + shrinkage)
     component = evidence.component.double()
     beyond = component[..., 1:] - component[..., :1] * stream[:, None]
     return beyond / (component[..., :1] + shrinkage), stream

@@ -29,14 +29,13 @@ def learn(
     if evidence is None:
         return None, none
     evidence = evidence.padded(mixture_cam.capacity)
-    gamma = 0.5 ** (1 / config.anchor_half_life)
-    memory = torch.where(frame.fault == 0, gamma, 1.0)  # a stream that skips the frame keeps its state
     if anchors is None:
-        return evidence.faded(memory), none
+        return evidence, none
     points = torch.gather(_points(frame).double(), 1, anchors.index[..., None].expand(*anchors.index.shape, 3))
     share = shares(mixture_cam, points, config)
     disagreement = (share * mixture_cam.disagreement[:, None]).sum(-1) + (1 - share.sum(-1)) * config.prior_mean
-    evidence, used = observe(evidence, anchors, disagreement, share, memory)
+    gamma = 0.5 ** (1 / config.anchor_half_life)
+    evidence, used = observe(evidence, anchors, disagreement, share, gamma)  # a faulty frame's anchors are not valid
     return evidence, used.sum(1)
 
 
