@@ -160,12 +160,8 @@ def step(
     far_enough = current_cam.mean[..., 2] > config.near_plane
     new = current_cam.valid & far_enough & ~pairs.match.any(dim=2)
 
-    mixture, rounds = _make_room(state.mixture, pairs, new, frame.fault, config)
-    pairs = _pad_pairs(pairs, mixture.capacity)
-    R_first, t_first = relative_pose(frame.T_world_cam, first)
-    current_first = current_cam.rigid(R_first, t_first)
-    mixture = backend.fuse(mixture, current_first, pairs, config, rounds=rounds)
-    mixture, dropped = append(mixture, current_first, new)
+    current_first = current_cam.rigid(*relative_pose(frame.T_world_cam, first))
+    mixture, dropped = _remember(state.mixture, current_first, pairs, new, frame.fault, config, backend)
 
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
     evidence, used = learn(state.evidence, mixture_cam, frame, anchors, config)
@@ -220,6 +216,22 @@ def segment(frame: FrameInput, config: UfMStarConfig, backend: Backend) -> tuple
     z = mixture.mean[..., 2].clamp_min(config.near_plane)
     floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
     return mixture.replace(covariance=backend.floor_covariance(mixture.covariance, floor)), labels
+
+
+def _remember(
+    mixture: GaussianMixture,
+    current: GaussianMixture,
+    pairs: Correspondence,
+    new: Tensor,
+    fault: Tensor,
+    config: UfMStarConfig,
+    backend: Backend,
+) -> tuple[GaussianMixture, Tensor]:
+    """Step 4, M_i from M_(i-1) and C_i in one frame, and how many new components [B] found no room."""
+    mixture, rounds = _make_room(mixture, pairs, new, fault, config)
+    pairs = _pad_pairs(pairs, mixture.capacity)
+    mixture = backend.fuse(mixture, current, pairs, config, rounds=rounds)
+    return append(mixture, current, new)
 
 
 def _make_room(
