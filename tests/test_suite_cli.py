@@ -225,7 +225,9 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     monkeypatch.setattr(launch, "job_from", lambda options: _about_efficiency(own(options)))
     own = job_from
     words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1")
-    code, _, err = ufmstar(*words)
+    assert "measured when all sequences are evaluated" in ufmstar(*words, "--shard", "1/2")[1]
+    assert measured == [], "another part may still be running"
+    code, _, err = ufmstar(*words, "--shard", "2/2")
     assert (code, "measuring time, energy and memory" in err) == (0, True)
     assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
     assert measured == [(["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"], "ash", 1, 1)]

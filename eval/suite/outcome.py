@@ -23,6 +23,8 @@ def table(ended: Ended) -> str:
 def measure(ended: Ended, threads: int | None = None) -> str | None:
     """Measure what a suite about efficiency asks for, unless it is there; a line if it cannot be had.
 
+    Not while sequences are still to be evaluated: other parts (``--shard``) are at them, and would be timed along.
+
     Args:
         ended: the evaluation.
         threads: of the CPU; None = all.
@@ -36,8 +38,10 @@ def measure(ended: Ended, threads: int | None = None) -> str | None:
     if not ended.job.suite.efficiency or (ended.job.out / EFFICIENCY).exists():
         return None
     try:
+        if load_results(ended.job.out, with_sums=False).missing:
+            return f"no {EFFICIENCY} yet: it is measured when all sequences are evaluated"
         measure_job(ended.job, Plan(threads=threads))
-    except ValueError as error:
+    except (ResultsError, ValueError) as error:
         return f"no {EFFICIENCY}: {' '.join(str(error).split())}"
     return None
 
