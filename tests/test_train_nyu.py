@@ -1,0 +1,194 @@
+"""NYU Depth V2 for training: what is read is what was written, damage, conversion."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from scipy.io import savemat
+from training_data import PLAIN, nyu_frame, truncated, write_h5, write_nyu
+
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.train.nyu import INTRINSICS, NyuFrames, convert_labelled
+from ufmstar_torch.train.samples import SampleDataset, SampleError
+
+
+def test_nyu_frames_are_what_the_files_hold(tmp_path):
+    frames = NyuFrames(write_nyu(tmp_path), "train")
+    names = [f.relative_to(tmp_path / "train").as_posix() for f in frames.files]
+    # 8 before 10 before 12: numbers by value.
+    assert names == [f"kitchen_{s}/{n}.h5" for s, n in ((0, 8), (0, 10), (0, 12), (1, 9), (1, 11), (1, 13))]
+    for index, number in enumerate((0, 2, 4, 1, 3, 5)):
+        rgb, depth = nyu_frame(number)
+        raw = frames.load(index)
+        np.testing.assert_array_equal(raw.image.numpy(), rgb)
+        np.testing.assert_array_equal(raw.depth.numpy(), depth)
+    assert len(NyuFrames(tmp_path, "val")) == 3
+
+
+def test_nyu_validation_is_the_fields(tmp_path):
+    """480 x 640 by Preprocess.nyu(): 224 x 224, fx' = fx (333/640)(224/304), fy' = fy (250/480)(224/228)."""
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 9, (480, 640)).astype(np.float32)
+    write_h5(tmp_path / "val" / "official" / "00001.h5", rng.integers(0, 256, (3, 480, 640), np.uint8), depth)
+    frames = NyuFrames(tmp_path, "val")
+    K = frames.load(0).intrinsics
+    assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2]) == INTRINSICS
+    sample = SampleDataset(frames, Preprocess.nyu())[0]
+    assert sample["image"].shape == (3, 224, 224)
+    fx, fy, cx, cy = INTRINSICS
+    expected = [fx * 333 / 640 * 224 / 304, fy * 250 / 480 * 224 / 228]
+    torch.testing.assert_close(sample["intrinsics"].diagonal()[:2], torch.tensor(expected, dtype=torch.float64))
+    # The depth of the network's pixel nearest to the optical axis is the one that the camera sees there.
+    v, u = (round(float(sample["intrinsics"][i, 2])) for i in (1, 0))
+    x = (u - float(sample["intrinsics"][0, 2])) / float(sample["intrinsics"][0, 0])
+    y = (v - float(sample["intrinsics"][1, 2])) / float(sample["intrinsics"][1, 1])
+    assert sample["depth"][v, u] == depth[round(fy * y + cy), round(fx * x + cx)]
+
+
+def test_nyu_files_of_another_size(tmp_path):
+    write_h5(tmp_path / "train" / "a" / "1.h5", *nyu_frame(0, (240, 320)))
+    write_h5(tmp_path / "train" / "a" / "2.h5", *nyu_frame(0, (228, 304)))
+    write_h5(tmp_path / "train" / "a" / "3.h5", *nyu_frame(0, (224, 224)))
+    frames = NyuFrames(tmp_path, "train")
+    K = frames.load(0).intrinsics
+    expected = [INTRINSICS[0] / 2, (INTRINSICS[2] + 0.5) / 2 - 0.5]
+    torch.testing.assert_close(K[0, ::2], torch.tensor(expected, dtype=torch.float64))
+    with pytest.raises(SampleError, match=r"3\.h5: is 224 x 224.*intrinsics"):
+        frames.load(2)
+
+
+RGB, DEPTH = nyu_frame(0)
+BROKEN = {
+    "empty": lambda p: p.write_bytes(b""),
+    "half": lambda p: truncated(p, 0.5),
+    "last byte": lambda p: truncated(p, 0.9999),
+    "text": lambda p: p.write_text("<html>404</html>" * 200),
+    "folder": lambda p: (p.unlink(), p.mkdir()),
+    "gone": lambda p: p.unlink(),
+    "no depth": lambda p: (p.unlink(), write_h5(p, RGB, None)),
+    "no rgb": lambda p: (p.unlink(), write_h5(p, None, DEPTH)),
+    "float rgb": lambda p: (p.unlink(), write_h5(p, RGB.astype(np.float32), DEPTH)),
+    "rgb last": lambda p: (p.unlink(), write_h5(p, RGB.transpose(1, 2, 0), DEPTH)),
+    "integer depth": lambda p: (p.unlink(), write_h5(p, RGB, DEPTH.astype(np.int16))),
+    "depth size": lambda p: (p.unlink(), write_h5(p, RGB, DEPTH[:-1])),
+    "depth channel": lambda p: (p.unlink(), write_h5(p, RGB, DEPTH[None])),
+    "no pixels": lambda p: (p.unlink(), write_h5(p, RGB[:, :0], DEPTH[:0])),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN.values(), ids=BROKEN.keys())
+def test_a_broken_h5_is_named_or_skipped(how, tmp_path):
+    frames = NyuFrames(write_nyu(tmp_path), "train")
+    how(frames.files[2])
+    with pytest.raises(SampleError, match=r"kitchen_0/12\.h5: "):
+        SampleDataset(frames, PLAIN)[2]
+    dataset = SampleDataset(frames, PLAIN, on_bad_file="skip")
+    samples = [dataset[i] for i in range(len(dataset))]
+    np.testing.assert_array_equal(samples[2]["depth"].numpy(), nyu_frame(1)[1])
+    assert dataset.bad_files() == (str(frames.files[2]),)
+
+
+def test_damage_anywhere_is_an_error_of_the_file_or_none_at_all(tmp_path):
+    """Cut and overwritten at many places: nothing but SampleError comes out."""
+    path = tmp_path / "train" / "a" / "1.h5"
+    write_h5(path, *nyu_frame(0))
+    whole, frames = path.read_bytes(), NyuFrames(tmp_path, "train")
+    rng, errors, harmless = np.random.default_rng(0), 0, 0
+    for _ in range(60):
+        at = int(rng.integers(len(whole))) if rng.random() < 0.5 else int(rng.integers(2500))
+        broken = whole[:at] if rng.random() < 0.3 else whole[:at] + rng.bytes(64) + whole[at + 64 :]
+        path.write_bytes(broken)
+        try:
+            frames.load(0)
+        except SampleError as error:
+            errors += error.name == str(path)
+        else:
+            harmless += 1
+    assert errors + harmless == 60
+    assert errors > 10
+
+
+def test_a_folder_without_the_layout_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"val holds no <scene>/\*\.h5"):
+        NyuFrames(tmp_path, "val")
+    with pytest.raises(ValueError, match="part must be"):
+        NyuFrames(tmp_path, "test")
+
+
+SCENES = ["attic_1", "attic_1", "bath_1", "cafe_1", "den_1", "den_1"]
+
+
+def write_mat(path, width=64, height=48):
+    """As MATLAB 7.3 writes it: columns first, strings as references to columns of UTF-16."""
+    rng = np.random.default_rng(5)
+    rgb = rng.integers(0, 256, (len(SCENES), height, width, 3), np.uint8)
+    depth = rng.uniform(0.7, 9, (len(SCENES), height, width)).astype(np.float32)
+    raw = np.where(rng.random(depth.shape) < 0.2, 0, depth).astype(np.float32)
+    with h5py.File(path, "w") as file:
+        file["images"] = rgb.transpose(0, 3, 2, 1)
+        file["depths"], file["rawDepths"] = depth.transpose(0, 2, 1), raw.transpose(0, 2, 1)
+        references = file.create_dataset("scenes", (1, len(SCENES)), dtype=h5py.ref_dtype)
+        for i, scene in enumerate(SCENES):
+            codes = np.array([[ord(letter)] for letter in scene], np.uint16)
+            references[0, i] = file.create_dataset(f"#refs#/{i}", data=codes).ref
+    return rgb, depth, raw
+
+
+def test_the_labelled_file_becomes_fastdepths_layout(tmp_path):
+    rgb, depth, _ = write_mat(tmp_path / "labelled.mat")
+    told = []
+    counts = convert_labelled(
+        tmp_path / "labelled.mat", tmp_path / "nyu", progress=lambda done, of: told.append((done, of))
+    )
+    assert counts == {"train": 4, "val": 2}  # every fourth scene, the den, with all its frames
+    assert told == [(i + 1, 6) for i in range(6)]
+    train, val = NyuFrames(tmp_path / "nyu", "train"), NyuFrames(tmp_path / "nyu", "val")
+    assert [f.parent.name for f in train.files] == SCENES[:4]
+    assert [f.name for f in val.files] == ["00005.h5", "00006.h5"]
+    for frames, indices in ((train, range(4)), (val, range(4, 6))):
+        for k, i in enumerate(indices):
+            np.testing.assert_array_equal(frames.load(k).image.numpy(), rgb[i].transpose(2, 0, 1))
+            np.testing.assert_array_equal(frames.load(k).depth.numpy(), depth[i])
+
+
+def test_the_official_split_and_the_sensors_own_depth(tmp_path):
+    _, _, raw = write_mat(tmp_path / "labelled.mat")
+    splits = {"trainNdxs": np.array([[1], [3], [6]]), "testNdxs": np.array([[2], [4], [5]])}
+    savemat(tmp_path / "splits.mat", splits)
+    counts = convert_labelled(tmp_path / "labelled.mat", tmp_path / "nyu", tmp_path / "splits.mat", raw=True)
+    assert counts == {"train": 3, "val": 3}
+    val = NyuFrames(tmp_path / "nyu", "val")
+    assert [f.name for f in val.files] == ["00002.h5", "00004.h5", "00005.h5"]
+    np.testing.assert_array_equal(val.load(1).depth.numpy(), raw[3])
+    savemat(tmp_path / "splits.mat", {**splits, "testNdxs": np.array([[2], [4]])})
+    with pytest.raises(ValueError, match="divide the frames 1 to 6"):
+        convert_labelled(tmp_path / "labelled.mat", tmp_path / "other", tmp_path / "splits.mat")
+
+
+def test_an_interrupted_conversion_goes_on(tmp_path):
+    write_mat(tmp_path / "labelled.mat")
+
+    class Stop(Exception):
+        pass
+
+    def stop_at_3(done, _):
+        if done == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        convert_labelled(tmp_path / "labelled.mat", tmp_path / "nyu", progress=stop_at_3)
+    first = {p: p.stat().st_mtime_ns for p in (tmp_path / "nyu").rglob("*.h5")}
+    assert len(first) == 3
+    convert_labelled(tmp_path / "labelled.mat", tmp_path / "nyu")
+    assert len(list((tmp_path / "nyu").rglob("*.h5"))) == 6
+    assert all(p.stat().st_mtime_ns == t for p, t in first.items())
+    assert not list((tmp_path / "nyu").rglob("*.tmp"))
+
+
+def test_another_mat_file_is_named(tmp_path):
+    with h5py.File(tmp_path / "x.mat", "w") as file:
+        file["labels"] = np.zeros(3)
+    with pytest.raises(ValueError, match=r"x\.mat has no depths, images, scenes"):
+        convert_labelled(tmp_path / "x.mat", tmp_path / "nyu")

@@ -1,0 +1,239 @@
+"""Recorded sequences and rendered tours for training: parts, poses or none, the cache of tours."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from layouts import write_generic, write_scannet, write_tum
+from training_data import PLAIN, TINY, truncated
+
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.train.parts import Part
+from ufmstar_torch.train.samples import SampleDataset, SampleError
+from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
+from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_files, tour_frames
+from ufmstar_torch.train.unposed import open_unposed
+
+
+@pytest.mark.parametrize(
+    ("text", "length", "expected"),
+    [
+        ("0:70%", 10, range(7)),
+        ("75%:100%", 10, range(7, 10)),
+        ("75%:", 1000, range(750, 1000)),
+        (":30", 100, range(30)),
+        ("100:400", 250, range(100, 250)),
+        (":", 5, range(5)),
+        ("10:50%", 100, range(10, 50)),
+        ("0:29%", 100, range(29)),
+        ("12.5%:25%", 8, range(1, 2)),
+        (" 0 : 5 ", 9, range(5)),
+    ],
+)
+def test_parts_of_a_sequence(text, length, expected):
+    assert Part.parse(text).frames(length) == expected
+    assert Part.parse(str(Part.parse(text))) == Part.parse(text)
+
+
+@pytest.mark.parametrize("text", ["", "5", "0:70:90", "a:b", "-5:10", "0:120%", "50%:20%", "7:7", "1.5:3", "0.5:0.7"])
+def test_what_is_no_part_is_named(text):
+    with pytest.raises(ValueError, match="a part must"):
+        Part.parse(text)
+
+
+def test_an_empty_part_is_named():
+    with pytest.raises(ValueError, match="50:60 of 20 frames is empty"):
+        Part.parse("50:60").frames(20)
+
+
+@settings(max_examples=100, deadline=None)
+@given(length=st.integers(1, 5000), edge=st.integers(1, 99))
+def test_two_parts_that_meet_divide_every_sequence(length, edge):
+    covered = []
+    for text in (f"0:{edge}%", f"{edge}%:100%"):
+        try:
+            covered += list(Part.parse(text).frames(length))
+        except ValueError:
+            continue
+    assert covered == list(range(length))
+
+
+def test_frames_of_a_sequence_are_the_readers(tmp_path):
+    path, *_ = write_tum(tmp_path)
+    sequence = open_sequence(path)
+    frames = SequenceFrames([sequence, sequence], "0:50%")
+    half = len(sequence) // 2
+    assert len(frames) == 2 * half
+    assert frames.name(half) == f"{sequence.name}/{sequence.names[0]}"
+    for index in (0, 1, half):
+        frame, raw = sequence[index % half], frames.load(index)
+        np.testing.assert_array_equal(raw.image.numpy().transpose(1, 2, 0), frame.image)
+        np.testing.assert_array_equal(raw.depth.numpy(), frame.depth)
+        np.testing.assert_array_equal(raw.intrinsics.numpy(), frame.intrinsics)
+
+
+def test_depth_with_a_camera_of_its_own_is_seen_by_the_images(tmp_path):
+    """ScanNet: 121 x 162 colour, 48 x 64 depth. At the image's pixels it is the colour camera's depth, but for
+    the coarser depth map's edges."""
+    path, of_color, _ = write_scannet(tmp_path)
+    raw = SequenceFrames([open_sequence(path)]).load(2)
+    assert raw.depth.shape == raw.image.shape[1:] == (121, 162)
+    np.testing.assert_allclose(raw.intrinsics.numpy(), of_color.K)
+    valid = raw.depth.numpy() > 0
+    error = np.abs(raw.depth.numpy() - of_color.depths[2])[valid] / of_color.depths[2][valid]
+    assert valid.mean() > 0.9
+    assert np.median(error) < 0.01
+    assert (error < 0.03).mean() > 0.9
+
+
+def test_frames_without_depth_are_left_out_and_counted_in_the_part(tmp_path):
+    path, _ = write_generic(tmp_path)
+    (path / "depth" / "8.png").unlink()
+    sequence = open_sequence(path)
+    frames = SequenceFrames([sequence], "0:50%")  # of six frames: 7, 8, 9
+    assert [frames.name(i) for i in range(len(frames))] == [f"{sequence.name}/7", f"{sequence.name}/9"]
+    with pytest.raises(ValueError, match="no frame of the part 1:2"):
+        SequenceFrames([sequence], "1:2")
+    with pytest.raises(ValueError, match="at least one sequence"):
+        SequenceFrames([])
+
+
+def test_a_broken_image_of_a_sequence_is_named_or_skipped(tmp_path):
+    path, _ = write_generic(tmp_path)
+    frames = SequenceFrames([open_sequence(path)])
+    truncated(path / "images" / "9.png", 0.4)
+    with pytest.raises(SampleError, match=r"walk/9: .*9\.png"):
+        frames.load(2)
+    dataset = SampleDataset(frames, PLAIN, on_bad_file="skip")
+    assert torch.equal(dataset[2]["image"], dataset[3]["image"])
+    assert dataset.bad_files() == ("walk/9",)
+
+
+def test_images_and_depth_without_poses(tmp_path):
+    path, scene = write_generic(tmp_path)
+    posed = SequenceFrames([open_rgbd(path)])
+    assert posed.sequences[0].layout == "generic"
+    (path / "poses.txt").unlink()
+    (path / "depth" / "12.png").unlink()
+    unposed = SequenceFrames([open_rgbd(path)])
+    assert len(unposed) == len(posed) - 1
+    assert [s.name for s in unposed.sequences[0].skipped] == ["12"]
+    for i in range(len(unposed)):
+        one, two = posed.load(i), unposed.load(i)
+        assert torch.equal(one.image, two.image)
+        assert torch.equal(one.depth, two.depth)
+        assert torch.equal(one.intrinsics, two.intrinsics)
+    np.testing.assert_allclose(unposed.load(0).intrinsics.numpy(), scene.K)
+
+
+def test_a_tum_recording_without_its_trajectory(tmp_path):
+    """Names are timestamps that differ between image and depth, and depth is in 1/5000 m."""
+    path, *_ = write_tum(tmp_path)
+    posed = open_sequence(path)
+    (path / "groundtruth.txt").unlink()
+    with pytest.raises(ValueError, match="pass intrinsics"):
+        open_rgbd(path)
+    np.savetxt(path / "K.txt", posed.intrinsics)
+    unposed = open_rgbd(path)
+    for frame in posed:
+        if frame.depth is not None:
+            same = unposed[unposed.names.index(frame.name)]
+            np.testing.assert_array_equal(same.depth, frame.depth)
+
+
+def test_what_is_missing_in_an_unposed_folder_is_named(tmp_path):
+    path, scene = write_generic(tmp_path)
+    (path / "poses.txt").unlink()
+    shutil.move(path / "K.txt", tmp_path / "K.txt")
+    with pytest.raises(ValueError, match="pass intrinsics"):
+        open_unposed(path)
+    np.testing.assert_allclose(open_unposed(path, tmp_path / "K.txt").intrinsics, scene.K)
+    for i, file in enumerate(sorted((path / "depth").iterdir())):
+        file.rename(file.with_name(f"map{i + 500}.png"))
+    with pytest.raises(ValueError, match="none of 6 depth maps is named like"):
+        open_unposed(path, tmp_path / "K.txt")
+    shutil.rmtree(path / "depth")
+    with pytest.raises(ValueError, match="must hold one of"):
+        open_unposed(path, tmp_path / "K.txt")
+
+
+@pytest.fixture(scope="module")
+def tours(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cache")
+    return folder, tour_frames([5, 6], TINY, folder)
+
+
+def test_stored_tours_are_the_rendered_ones(tours):
+    from ufmstar_torch.eval.tour import tour_sequence
+
+    _, frames = tours
+    assert len(frames) == 6
+    sequence = tour_sequence(6, frames=12, size=(24, 32), path_seed=0)
+    for i in range(3):
+        frame, raw = sequence[4 * i], frames.load(3 + i)
+        np.testing.assert_array_equal(raw.image.numpy().transpose(1, 2, 0), frame.image)
+        np.testing.assert_allclose(raw.depth.numpy(), frame.depth, atol=5.1e-4)
+        np.testing.assert_array_equal(raw.intrinsics.numpy(), frame.intrinsics)
+
+
+def test_tours_are_rendered_once_and_completed(tours, tmp_path):
+    folder, frames = tours
+    shutil.copytree(folder, tmp_path / "cache")
+    inside = tmp_path / "cache" / frames.folder.name
+    times = {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
+    told = []
+    tour_frames([5, 6], TINY, tmp_path / "cache", progress=lambda *done: told.append(done))
+    assert not told
+    tour_files(inside, 6)[2].unlink()  # as a kill between the writes leaves it
+    again = tour_frames([5, 6], TINY, tmp_path / "cache", progress=lambda *done: told.append(done))
+    assert told == [(2, 2)]
+    for path in tour_files(inside, 5):
+        assert path.stat().st_mtime_ns == times[path.name]
+    assert torch.equal(again.load(4).image, frames.load(4).image)
+    assert sorted(times) == sorted(path.name for path in inside.iterdir())  # nothing temporary is left
+
+
+def test_every_setting_has_a_cache_of_its_own():
+    others = [
+        TourSettings(frames=4, stride=4, size=(24, 32)),
+        TourSettings(frames=3, stride=5, size=(24, 32)),
+        TourSettings(frames=3, stride=4, size=(32, 24)),
+        TourSettings(frames=3, stride=4, size=(24, 32), style="hall"),
+        TourSettings(frames=3, stride=4, size=(24, 32), fov=60.0),
+    ]
+    digests = {one.digest() for one in (TINY, *others)}
+    assert len(digests) == 6
+    assert TourSettings(frames=3, stride=4, size=(24, 32)).digest() == TINY.digest()
+
+
+def test_a_truncated_cache_file_is_named(tours, tmp_path):
+    folder, frames = tours
+    shutil.copytree(folder, tmp_path / "cache")
+    inside = tmp_path / "cache" / frames.folder.name
+    truncated(tour_files(inside, 5)[1], 0.5)
+    copy = TourFrames(inside, [5, 6], 3)
+    with pytest.raises(SampleError, match=r"5\.image\.npy\[1\]"):
+        copy.load(1)
+    assert torch.equal(copy.load(3).depth, frames.load(3).depth)
+
+
+def test_pickled_tours_map_their_files_anew(tours):
+    _, frames = tours
+    frames.load(0)
+    packed = pickle.dumps(frames)
+    assert len(packed) < 2000
+    assert torch.equal(pickle.loads(packed).load(0).depth, frames.load(0).depth)
+
+
+def test_impossible_tours_are_named(tmp_path):
+    for wrong in ({"frames": 0}, {"stride": 0}, {"size": (4, 32)}, {"fov": 170.0}, {"style": "castle"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            TourSettings(**wrong)
+    with pytest.raises(ValueError, match="seeds"):
+        tour_frames([], TINY, tmp_path)

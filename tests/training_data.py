@@ -1,0 +1,71 @@
+"""Frames, folders and sources for the tests of training data; small and known."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import torch
+
+from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.train.augment import Augmentation, AugmentationConfig
+from ufmstar_torch.train.batches import EpochBatches, EpochLoader
+from ufmstar_torch.train.samples import RawSample, SampleDataset, SampleError
+from ufmstar_torch.train.tour_data import TourSettings
+
+SMALL = (48, 64)  # NYU's aspect ratio
+PLAIN = Preprocess()
+TINY = TourSettings(frames=3, stride=4, size=(24, 32))
+
+
+def nyu_frame(number: int, size=SMALL) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(number)
+    return rng.integers(0, 256, (3, *size), np.uint8), rng.uniform(0.5, 9, size).astype(np.float32)
+
+
+def write_h5(path, rgb, depth, **others):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        for name, value in {"rgb": rgb, "depth": depth, **others}.items():
+            if value is not None:
+                file[name] = value
+
+
+def write_nyu(root, frames=6):
+    """Two scenes of training frames, numbered without leading zeros, and one of validation frames."""
+    for i in range(frames):
+        write_h5(root / "train" / f"kitchen_{i % 2}" / f"{i + 8}.h5", *nyu_frame(i))
+    for i in range(3):
+        write_h5(root / "val" / "official" / f"{i}.h5", *nyu_frame(100 + i))
+    return root
+
+
+class Numbered:
+    """A source whose frame i is grey i at depth i + 1; those in ``broken`` cannot be read."""
+
+    def __init__(self, length: int, broken: tuple[int, ...] = ()) -> None:
+        self.length, self.broken = length, broken
+
+    def __len__(self) -> int:
+        return self.length
+
+    def name(self, index: int) -> str:
+        return f"frame-{index}"
+
+    def load(self, index: int) -> RawSample:
+        if index in self.broken:
+            raise SampleError(self.name(index), "torn")
+        image = torch.full((3, 6, 8), index, dtype=torch.uint8)
+        return RawSample(image, torch.full((6, 8), index + 1.0), torch.eye(3, dtype=torch.float64) + 2)
+
+
+def numbers(batch) -> list[int]:
+    return [round(x.item()) - 1 for x in batch["depth"][:, 3, 4]]
+
+
+def truncated(path, share):
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+
+
+def loader(length=23, **options):
+    dataset = SampleDataset(Numbered(length), PLAIN, Augmentation(AugmentationConfig(scale=(1.0, 1.0))))
+    return EpochLoader(dataset, EpochBatches(length, 4, seed=9, **options))
