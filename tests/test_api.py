@@ -41,9 +41,9 @@ def test_signatures():
     assert names(UfMStar.forward) == observation
     assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average"]
     assert names(UfMStar.query) == ["points", "frame"]
-    assert names(UfMStar.reset) == ["streams"]
+    assert names(UfMStar.reset) == ["streams", "keep_evidence"]
     assert names(UncertainDepth.__init__) == ["networks", "config", "mode", "samples", "preprocess"]
-    assert names(UncertainDepth.forward) == ["image", "pose", "intrinsics", "valid"]
+    assert names(UncertainDepth.forward) == ["image", "pose", "intrinsics", "valid", "anchors"]
     assert names(spgf)[:3] == ["depth", "intrinsics", "config"]
     assert "before_pruning" in names(spgf)
 

@@ -6,7 +6,7 @@ prediction is known. ``evidence`` says what is learnt from that, and how it is s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,6 +29,77 @@ class Anchors:
     depth: Tensor
     variance: Tensor
     valid: Tensor | None = None
+
+    @classmethod
+    def from_points(
+        cls,
+        points_cam: Tensor,
+        variance: Tensor,
+        intrinsics: Tensor,
+        size: tuple[int, int],
+        valid: Tensor | None = None,
+    ) -> Anchors:
+        """Points in the camera's frame, landmarks of a map or returns of a range sensor, as anchors.
+
+        A point behind the camera, beside the image or with a value that is not finite is not valid: rows of different
+        lengths may be padded with NaN. What hides a point is not known here: give those that the camera sees.
+
+        Args:
+            points_cam: [B, N, 3], x right, y down, z forward [m].
+            variance: [B, N] of z [m^2].
+            intrinsics: [B, 3, 3] or [3, 3] of the depth map [px].
+            size: (H, W) of the depth map [px].
+            valid: [B, N] bool, True = use; None = all.
+
+        Raises:
+            TypeError: points or variance are not of a floating dtype, or ``valid`` is not bool.
+            ValueError: a wrong shape.
+        """
+        points = _floating("points_cam", points_cam)
+        if points.dim() != 3 or points.shape[2] != 3:
+            raise ValueError(f"points_cam must be [B, N, 3], got {tuple(points.shape)}")
+        spread = _like(_floating("variance", variance), "variance", points.shape[:2], "points_cam")
+        K = _floating("intrinsics", intrinsics).to(points.device)
+        if K.shape not in ((3, 3), (points.shape[0], 3, 3)):
+            raise ValueError(f"intrinsics must be [3, 3] or [{points.shape[0]}, 3, 3], got {tuple(K.shape)}")
+        z = points[..., 2]
+        fine = points.isfinite().all(-1) & (z > 0) & spread.isfinite() & (spread >= 0)
+        if valid is not None:
+            fine = fine & _like(_mask("valid", valid), "valid", points.shape[:2], "points_cam")
+        safe = torch.where(fine[..., None], points, torch.ones_like(points))
+        pixel = (safe @ K.mT)[..., :2] / safe[..., 2:]
+        fine = fine & _inside(pixel, size)
+        zero = torch.zeros_like(z)
+        return cls(
+            torch.where(fine[..., None], pixel, torch.zeros_like(pixel)),
+            torch.where(fine, z, zero),
+            torch.where(fine, spread, zero),
+            fine,
+        )
+
+    def moved(self, K_from: Tensor, K_to: Tensor) -> Anchors:
+        """The same anchors in the pixels of an image of the same camera that was resized or cropped.
+
+        Args:
+            K_from: [B, 3, 3] or [3, 3] of the image in whose pixels they are [px].
+            K_to: likewise, of the other one.
+
+        Raises:
+            TypeError: ``pixel`` is not of a floating dtype.
+            ValueError: ``pixel`` is not [B, N, 2].
+        """
+        pixel = _floating("anchors.pixel", self.pixel)
+        if pixel.dim() != 3 or pixel.shape[2] != 2:
+            raise ValueError(f"anchors.pixel must be [B, N, 2], got {tuple(pixel.shape)}")
+        # inv_ex does not wait for a device; of intrinsics that make no sense, what comes out is not finite.
+        mapping = K_to.detach().double() @ torch.linalg.inv_ex(K_from.detach().double().to(K_to.device)).inverse
+        mapping = mapping.to(pixel.device)
+        return replace(self, pixel=pixel @ mapping[..., :2, :2].mT + mapping[..., None, :2, 2])
+
+    def to(self, device: torch.device | str) -> Anchors:
+        """The same on another device."""
+        valid = None if self.valid is None else self.valid.to(device)
+        return Anchors(self.pixel.to(device), self.depth.to(device), self.variance.to(device), valid)
 
 
 @dataclass(frozen=True)
@@ -68,23 +139,20 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
         ValueError: a field has the wrong shape or lies on another device.
     """
     b, (height, width) = frame.depth.shape[0], frame.size
-    pixel = _floating("anchors.pixel", anchors.pixel, frame)
+    pixel = _on_device("anchors.pixel", anchors.pixel, frame)
     if pixel.dim() != 3 or pixel.shape[0] != b or pixel.shape[2] != 2:
         raise ValueError(f"anchors.pixel must be [{b}, N, 2], got {tuple(pixel.shape)}")
     shape = pixel.shape[:2]
-    depth = _like(_floating("anchors.depth", anchors.depth, frame), "anchors.depth", shape)
-    variance = _like(_floating("anchors.variance", anchors.variance, frame), "anchors.variance", shape)
+    depth = _like(_on_device("anchors.depth", anchors.depth, frame), "anchors.depth", shape)
+    variance = _like(_on_device("anchors.variance", anchors.variance, frame), "anchors.variance", shape)
     valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance < torch.inf) & pixel.isfinite().all(-1)
     if anchors.valid is not None:
-        if not isinstance(anchors.valid, Tensor) or anchors.valid.dtype != torch.bool:
-            raise TypeError("anchors.valid must be a bool tensor (True = use) or None")
-        valid = valid & _like(anchors.valid, "anchors.valid", shape)
+        valid = valid & _like(_mask("anchors.valid", anchors.valid), "anchors.valid", shape)
     pixel = torch.where(valid[..., None], pixel, torch.zeros_like(pixel))
     u, v = pixel.round().long().unbind(-1)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
     predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
-    valid = valid & inside & torch.gather(frame.valid.flatten(1), 1, index)
+    valid = valid & _inside(pixel, frame.size) & torch.gather(frame.valid.flatten(1), 1, index)
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     own = zero if own_variance is None else torch.gather(own_variance.detach().flatten(1), 1, index).double()
     return AnchorInput(
@@ -98,15 +166,32 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
     )
 
 
-def _floating(name: str, value: object, frame: FrameInput) -> Tensor:
+def _inside(pixel: Tensor, size: tuple[int, int]) -> Tensor:
+    """[B, N] whether the pixel [B, N, 2] nearest to a position belongs to an image of ``size`` (H, W)."""
+    u, v = pixel.round().unbind(-1)
+    return (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
+
+
+def _floating(name: str, value: object) -> Tensor:
     if not isinstance(value, Tensor) or not value.is_floating_point():
         raise TypeError(f"{name} must be a floating-point tensor, got {getattr(value, 'dtype', type(value).__name__)}")
-    if value.device != frame.depth.device:
-        raise ValueError(f"{name} lies on {value.device} but the depth on {frame.depth.device}")
     return value.detach().double()
 
 
-def _like(value: Tensor, name: str, shape: torch.Size) -> Tensor:
+def _on_device(name: str, value: object, frame: FrameInput) -> Tensor:
+    found = _floating(name, value)
+    if found.device != frame.depth.device:
+        raise ValueError(f"{name} lies on {found.device} but the depth on {frame.depth.device}")
+    return found
+
+
+def _mask(name: str, value: object) -> Tensor:
+    if not isinstance(value, Tensor) or value.dtype != torch.bool:
+        raise TypeError(f"{name} must be a bool tensor (True = use) or None")
+    return value
+
+
+def _like(value: Tensor, name: str, shape: torch.Size, told_by: str = "anchors.pixel") -> Tensor:
     if value.shape != shape:
-        raise ValueError(f"{name} must have shape {tuple(shape)} as anchors.pixel says, got {tuple(value.shape)}")
+        raise ValueError(f"{name} must have shape {tuple(shape)} as {told_by} says, got {tuple(value.shape)}")
     return value

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
@@ -77,6 +78,15 @@ class UncertainDepth(nn.Module):
 
     Raises:
         ValueError: no network, an unknown mode, or ``samples`` that fit neither.
+
+    Example::
+
+        model, tracker = UncertainDepth(network, UfMStarConfig(anchored=True)), LandmarkTracker()
+        for picture, T_world_cam, K in video:  # picture [H, W, 3] uint8
+            landmarks = tracker.update(picture, T_world_cam, K)
+            image, pose, intrinsics = ...  # of the same frame, as tensors
+            out = model(image, pose, intrinsics, anchors=landmarks.anchors(K, intrinsics))
+            out.variance  # M + A + E + B
     """
 
     image_index: Tensor
@@ -109,7 +119,13 @@ class UncertainDepth(nn.Module):
         self._next = 0
 
     def forward(
-        self, image: Tensor, pose: Tensor, intrinsics: Tensor, valid: Tensor | None = None
+        self,
+        image: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        valid: Tensor | None = None,
+        *,
+        anchors: Anchors | None = None,
     ) -> UncertainPrediction:
         """Predict depth and its variance for the next image of every stream.
 
@@ -118,6 +134,8 @@ class UncertainDepth(nn.Module):
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
             valid: [B, h, w] bool at the depth map's size, True = use.
+            anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchored``; their pixels are
+                those of ``image`` and ``intrinsics``, whatever the preprocessing makes of them. None = none.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; the alternation has not advanced then.
@@ -129,7 +147,10 @@ class UncertainDepth(nn.Module):
             x, K = (image, K) if self.preprocess is None else self.preprocess(image, K)
             member = None if self.mode == "full" else self._next % len(self.networks)
             prediction = self._all(x) if member is None else self._one(member, x)
-        ufm = self.ufm(prediction.depth, pose, K, prediction.aleatoric_variance, prediction.epistemic_variance, valid)
+        if anchors is not None and self.preprocess is not None:
+            anchors = anchors.moved(intrinsics, K)
+        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+        ufm = self.ufm(prediction.depth, pose, K, a, e, valid, anchors=anchors)
         self._count(self._next + 1)
         return UncertainPrediction(prediction, ufm, K, member)
 
@@ -143,9 +164,9 @@ class UncertainDepth(nn.Module):
         members = range(len(self.networks)) if self.samples is None else [0] * self.samples
         return combine([self._one(n, x) for n in members])
 
-    def reset(self, streams: Sequence[int] | Tensor | None = None) -> None:
+    def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
-        self.ufm.reset(streams)
+        self.ufm.reset(streams, keep_evidence=keep_evidence)
         if streams is None:
             self._count(0)
 

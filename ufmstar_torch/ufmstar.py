@@ -22,6 +22,8 @@ from ufmstar_torch.step import StepOutput, UfMStarState, step
 
 _MIXTURE = ("mean", "covariance", "weight", "disagreement", "count", "features")
 _STATE = (*_MIXTURE, "T_world_first", "started", "frames", "skipped", "smoothed", "evidence", "overall_evidence")
+# What ``reset(keep_evidence=True)`` leaves.
+_LASTING = "overall_evidence"
 
 
 class UfMStar(StatefulModule):
@@ -238,38 +240,43 @@ class UfMStar(StatefulModule):
             self.mixture, self.T_world_first, self.started, self.frames, self.skipped, smoothed, evidence
         )
 
-    def reset(self, streams: Sequence[int] | Tensor | None = None) -> None:
+    def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
+            keep_evidence: keep what anchors taught of a stream as a whole, what this network has been getting wrong
+                lately: a robot that starts in the same place again is not blind at its first frames. What was learnt
+                of single components goes with them. The batch size stays.
 
         Raises:
             IndexError: an index is out of range.
-            ValueError: a mask of the wrong length.
+            ValueError: a mask of the wrong length; ``keep_evidence`` without ``config.anchored``.
         """
+        if keep_evidence and not self.config.anchored:
+            raise ValueError("keep_evidence needs UfMStarConfig(anchored=True): nothing is learnt without")
         with torch.inference_mode(False), torch.no_grad():  # buffers must outlive the caller's inference mode
-            self._reset(streams)
+            self._reset(streams, keep_evidence)
 
-    def _reset(self, streams: Sequence[int] | Tensor | None) -> None:
+    def _reset(self, streams: Sequence[int] | Tensor | None, keep_evidence: bool) -> None:
         dtype, device, b = self.mean.dtype, self.mean.device, self.mean.shape[0]
         if streams is None:
-            self._store(_to_buffers(UfMStarState.initial(0, self.config, dtype, device)))
+            fresh = _to_buffers(UfMStarState.initial(b if keep_evidence else 0, self.config, dtype, device))
+            self._store({**fresh, _LASTING: self.overall_evidence} if keep_evidence else fresh)
             return
         chosen = torch.as_tensor(streams, device=device)
         if chosen.dtype == torch.bool and chosen.shape != (b,):
             raise ValueError(f"streams as a mask must have shape ({b},), got {tuple(chosen.shape)}")
         keep = torch.ones(b, dtype=torch.bool, device=device)
         keep[chosen if chosen.numel() else chosen.long()] = False
-        fresh = {"T_world_first": torch.eye(4, dtype=torch.float64, device=device), "smoothed": torch.nan}
+        start = {"T_world_first": torch.eye(4, dtype=torch.float64, device=device), "smoothed": torch.nan}
         for name in _STATE:
+            if keep_evidence and name == _LASTING:
+                continue
             old = getattr(self, name)
             mask = keep.view(-1, *[1] * (old.dim() - 1))
-            setattr(
-                self,
-                name,
-                torch.where(mask, old, torch.as_tensor(fresh.get(name, 0), dtype=old.dtype, device=device)),
-            )
+            value = torch.as_tensor(start.get(name, 0), dtype=old.dtype, device=device)
+            setattr(self, name, torch.where(mask, old, value))
 
     def _anchors(self, anchors: Anchors | None, frame: FrameInput) -> AnchorInput | None:
         """Checked, with what the network itself claims where they lie.
