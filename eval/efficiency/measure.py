@@ -131,7 +131,7 @@ def _obstacle(row: Row, networks: Mapping[str, Contender]) -> str | None:
         return f"no network for {base}"
     if row.method.every_member and not networks[base].several:
         return f"it runs several members, {networks[base].label} has one"
-    if setting.skip or setting.rotation_noise or setting.translation_noise:
+    if setting.skip or setting.pose_noise:
         return "left out frames and noise on poses are no matter of efficiency"
     if setting.anchors:
         return (

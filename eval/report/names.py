@@ -85,6 +85,8 @@ DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)
 SETTINGS = {
     "rotation_noise": ("rotation noise", "°"),
     "translation_noise": ("translation noise", "m"),
+    "rotation_drift": ("rotation drift", "°/√frame"),
+    "translation_drift": ("translation drift", "m/√frame"),
     "skip": ("images skipped", ""),
     "eta": ("overlap threshold η", ""),
     "eta_occlusion": ("occlusion threshold η_occl", ""),

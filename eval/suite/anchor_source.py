@@ -132,7 +132,5 @@ def anchor_sources(rows: Iterable[Row]) -> dict[Row, AnchorSource]:
         if setting.anchors == TRUTH:
             found[row] = AnchorSource(setting, None)
         elif setting.anchors == TRACKED:
-            noise = (setting.rotation_noise, setting.translation_noise)
-            seen = (setting.skip, *noise, setting.seed if any(noise) else 0)
-            found[row] = AnchorSource(setting, tracks.setdefault(seen, Tracks()))
+            found[row] = AnchorSource(setting, tracks.setdefault((setting.skip, setting.pose_noise), Tracks()))
     return found

@@ -54,8 +54,8 @@ def _frames(row: Row) -> int:
     return row.setting.skip
 
 
-def _noise(row: Row) -> tuple[float, float, int]:
-    return row.setting.rotation_noise, row.setting.translation_noise, row.setting.seed
+def _noise(row: Row) -> tuple[float, ...]:
+    return row.setting.pose_noise
 
 
 def _points(row: Row) -> float:

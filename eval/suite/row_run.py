@@ -17,7 +17,7 @@ from ufmstar_torch.eval.run_clock import Stopwatch
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.suite.anchor_source import AnchorSource
 from ufmstar_torch.eval.suite.estimator import Estimate, make_estimator
-from ufmstar_torch.eval.suite.perturb import perturbed, selects
+from ufmstar_torch.eval.suite.perturb import Drift, perturbed, selects
 from ufmstar_torch.eval.suite.predicted import Predicted
 from ufmstar_torch.eval.suite.row import Row
 
@@ -48,6 +48,7 @@ class RowRun:
     ) -> None:
         self.row = row
         self._anchors = anchors
+        self._drift = Drift(row.setting)
         self.estimator = make_estimator(row, device)
         self.done = 0
         self.last: tuple[str, Any] | None = None
@@ -71,7 +72,7 @@ class RowRun:
 
     def estimate(self, frame: Frame, predicted: Predicted, truth: NDArray[np.float32]) -> Estimate:
         """Take in the next frame; its ground truth [h, w] is for anchors of it alone."""
-        T = perturbed(frame.T_world_cam, self.row.setting, frame.index)
+        T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.row.setting, frame.index)
         anchors = None
         if self._anchors is not None:
             anchors, ms = self._anchors.of(frame, T, predicted, truth)

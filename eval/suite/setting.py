@@ -12,6 +12,7 @@ from typing import Any
 
 TRACKED, TRUTH = "tracked", "truth"
 _ANCHORS = ("", TRACKED, TRUTH)
+_OF_POSES = ("rotation_noise", "translation_noise", "rotation_drift", "translation_drift")
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class Setting:
         overrides: of ``UfMStarConfig`` by dotted name, as {"ema_alpha": 1.0, "segment.min_pixels": 2000}.
         rotation_noise: standard deviation of each component of a rotation vector that is added to a pose [deg].
         translation_noise: the same of each component of the position [m].
+        rotation_drift: of a random walk of the orientation, see ``perturb.Drift`` [deg per square root of frames].
+        translation_drift: the same of the position [m per square root of frames].
         skip: images left out between two that are used; the paper's skip interval, 0 = consecutive ones.
         seed: of everything that is drawn: noise, and which anchors are taken.
         anchors: what UfM* is anchored by (``UfMStarConfig.anchored`` follows): "" nothing; "tracked": corners of the
@@ -37,6 +40,8 @@ class Setting:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     rotation_noise: float = 0.0
     translation_noise: float = 0.0
+    rotation_drift: float = 0.0
+    translation_drift: float = 0.0
     skip: int = 0
     seed: int = 0
     anchors: str = ""
@@ -45,7 +50,7 @@ class Setting:
     corrected: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("rotation_noise", "translation_noise", "track_noise"):
+        for name in (*_OF_POSES, "track_noise"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
@@ -84,8 +89,14 @@ class Setting:
     @property
     def draws(self) -> bool:
         """Whether anything is drawn at random, so that the seed matters."""
-        noisy = self.rotation_noise or self.translation_noise or self.track_noise
-        return bool(noisy) or self.anchors == TRUTH or self.anchor_count is not None
+        noisy = bool(self.pose_noise or self.track_noise)
+        return noisy or self.anchors == TRUTH or self.anchor_count is not None
+
+    @property
+    def pose_noise(self) -> tuple[float, ...]:
+        """What decides how poses are disturbed: the size of each kind of noise, and the seed; () where they are not."""
+        sizes = tuple(getattr(self, name) for name in _OF_POSES)
+        return (*sizes, self.seed) if any(sizes) else ()
 
     @property
     def slug(self) -> str:

@@ -1,0 +1,226 @@
+"""Drift: a random walk of the poses with the variance that was asked for, and that every row gets the same one."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, kstest
+from tiny_suite import row
+
+from ufmstar_torch.eval.efficiency.measure import _obstacle
+from ufmstar_torch.eval.report.load import setting_of
+from ufmstar_torch.eval.report.names import row_label
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.suite.anchor_source import anchor_sources
+from ufmstar_torch.eval.suite.confident import references
+from ufmstar_torch.eval.suite.perturb import Drift, perturbed
+from ufmstar_torch.eval.suite.predicted import Predicted
+from ufmstar_torch.eval.suite.row_run import RowRun
+from ufmstar_torch.eval.suite.setting import Setting
+from ufmstar_torch.eval.suite.suite import default_of, setting_from
+from ufmstar_torch.eval.suite.suites import ROTATION_DRIFTS, TRANSLATION_DRIFTS, suite_named
+
+NAME = "UfM*-DepthOnly"
+BOTH = Setting(rotation_drift=0.5, translation_drift=0.02, seed=3)
+
+
+def walk(frames=24):
+    """[N, 4, 4] poses of a camera that turns and moves, no two steps alike."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    t = np.arange(frames)
+    turned = np.stack([0.1 * np.sin(0.5 * t), 0.08 * t, 0.05 * np.cos(0.3 * t)], axis=-1)
+    poses[:, :3, :3] = Rotation.from_rotvec(turned).as_matrix()
+    poses[:, :3, 3] = np.stack([5 + 0.1 * t, 0.3 * np.sin(t), -2 + 0.02 * t**1.5], axis=-1)
+    return poses
+
+
+WALK = walk()
+EVERY = range(len(WALK))
+
+
+def drifted(setting, indices=EVERY):
+    drift = Drift(setting)
+    return np.stack([drift.of(WALK[i], i) for i in indices])
+
+
+def steps(poses):
+    """[N - 1, 4, 4] each pose as the one before sees it."""
+    return np.linalg.solve(poses[:-1], poses[1:])
+
+
+def noise(setting, indices=EVERY):
+    """What is wrong with each step: rotation vectors [rad] and translations [m] about and along the camera's axes."""
+    indices = list(indices)
+    wrong = np.linalg.solve(steps(WALK[indices]), steps(drifted(setting, indices)))
+    return Rotation.from_matrix(wrong[:, :3, :3]).as_rotvec(), wrong[:, :3, 3]
+
+
+# ---- the walk ----
+
+
+def test_without_drift_poses_stay_themselves():
+    drift = Drift(Setting(rotation_noise=1.0, seed=5))
+    assert all(drift.of(pose, i) is pose for i, pose in enumerate(WALK))
+
+
+@pytest.mark.parametrize("first", [0, 9])
+def test_the_first_pose_is_exact_and_all_are_poses(first):
+    found = drifted(BOTH, range(first, len(WALK)))
+    np.testing.assert_array_equal(found[0], WALK[first])
+    R = found[:, :3, :3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-12)
+    assert (np.linalg.det(R) > 0).all()
+    np.testing.assert_allclose(found[:, 3], np.tile([0, 0, 0, 1.0], (len(R), 1)), atol=1e-14)
+
+
+def test_a_step_has_the_noise_that_was_asked_for():
+    """Of the pose relative to the frame before, whatever path and orientation the walk has come to."""
+    found = [noise(Setting(rotation_drift=2.0, translation_drift=0.05, seed=seed)) for seed in range(12)]
+    turned, moved = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    for values, deviation in ((turned, math.radians(2)), (moved, 0.05)):
+        assert kstest(values.ravel() / deviation, "norm").pvalue > 0.01
+    together = np.corrcoef(np.hstack([turned, moved]).T) - np.eye(6)
+    assert np.abs(together).max() < 0.2, "axes are independent"
+    assert np.abs(np.corrcoef(moved[:-1, 0], moved[1:, 0])[0, 1]) < 0.2, "steps are independent"
+
+
+@pytest.mark.parametrize("of_rotation", [True, False])
+def test_variance_grows_linearly_with_frames(of_rotation):
+    """Sum over the three axes of the squared error after n frames: 3 n sigma^2, a chi-square over many seeds."""
+    seeds, name = 150, "rotation_drift" if of_rotation else "translation_drift"
+    sigma = 0.2 if of_rotation else 0.01  # small angles: beyond, orientations wrap
+    squares = np.zeros(len(WALK))
+    for seed in range(seeds):
+        poses = drifted(setting_from({name: sigma, "seed": seed}))
+        if of_rotation:
+            turned = Rotation.from_matrix(WALK[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, :3])
+            squares += np.square(np.degrees(turned.as_rotvec())).sum(1)
+        else:
+            squares += np.square(poses[:, :3, 3] - WALK[:, :3, 3]).sum(1)
+    n = np.arange(1, len(WALK))
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * seeds) / (3 * seeds)
+    ratio = squares[1:] / (seeds * 3 * n * sigma**2)
+    assert ((ratio > low) & (ratio < high)).all(), ratio
+    assert low > 0.75
+    assert high < 1.3
+
+
+def test_translation_drift_leaves_orientations_and_rotation_drift_moves_the_path():
+    moved, turned = drifted(Setting(translation_drift=0.05)), drifted(Setting(rotation_drift=1.0))
+    np.testing.assert_allclose(moved[:, :3, :3], WALK[:, :3, :3], atol=1e-13)
+    # Where to the camera moves, as it sees it itself, is exact; the path in the world bends.
+    np.testing.assert_allclose(steps(turned)[:, :3, 3], steps(WALK)[:, :3, 3], atol=1e-12)
+    assert np.abs(turned[-1, :3, 3] - WALK[-1, :3, 3]).max() > 0.01
+
+
+def test_drift_is_of_the_seed_and_only_its_size_of_the_setting():
+    np.testing.assert_array_equal(drifted(BOTH), drifted(BOTH))
+    assert np.abs(noise(BOTH)[1] - noise(Setting(translation_drift=0.02, seed=4))[1]).min() > 1e-6
+    weak, strong = noise(Setting(rotation_drift=0.1)), noise(Setting(rotation_drift=1.0))
+    np.testing.assert_allclose(strong[0], 10 * weak[0], atol=1e-12)
+    np.testing.assert_allclose(noise(Setting(translation_drift=0.3, seed=3))[1], 15 * noise(BOTH)[1], atol=1e-12)
+    # Not the noise that single poses have, nor moved along with it.
+    single = [perturbed(np.eye(4), Setting(translation_noise=1.0, seed=3), i)[:3, 3] for i in range(1, len(WALK))]
+    assert np.abs(np.array(single) - noise(Setting(translation_drift=1.0, seed=3))[1]).min() > 1e-4
+
+
+def test_frames_left_out_drift_all_the_same():
+    """The step over three frames has the sum of their increments: 3 times the variance, of the same walk."""
+    every = [noise(Setting(translation_drift=0.01)), noise(Setting(rotation_drift=0.3))]
+    third = [
+        noise(Setting(translation_drift=0.01), range(0, 24, 3)),
+        noise(Setting(rotation_drift=0.3), range(0, 24, 3)),
+    ]
+    for which, (one, three) in enumerate(zip(every, third, strict=True)):
+        values = one[1 - which][:21].reshape(7, 3, 3).sum(1)
+        np.testing.assert_allclose(three[1 - which], values, atol=1e-12)
+
+
+def test_frames_must_come_in_order():
+    drift = Drift(BOTH)
+    drift.of(WALK[3], 3)
+    for index in (3, 2):
+        with pytest.raises(ValueError, match=f"must come in order, got index {index} after 3"):
+            drift.of(WALK[index], index)
+
+
+# ---- settings and rows ----
+
+
+@pytest.mark.parametrize("name", ["rotation_drift", "translation_drift"])
+def test_a_setting_of_drift(name):
+    for value in (-1.0, math.inf, math.nan):
+        with pytest.raises(ValueError, match=f"{name} must be a finite number"):
+            setting_from({name: value})
+    setting = setting_from({name: 0.1, "seed": 2})
+    assert setting.to_dict() == {name: 0.1, "seed": 2}
+    assert setting_of(json.loads(json.dumps(setting.to_dict()))) == setting
+    assert len({setting.slug, Setting(**{name: 0.2, "seed": 2}).slug, Setting(**{name: 0.1}).slug, ""}) == 4
+    assert default_of(name) == 0
+    assert setting.pose_noise != Setting(**{name: 0.1}).pose_noise
+    assert Setting(seed=2, anchors="truth").pose_noise == ()
+    assert "no matter of efficiency" in _obstacle(row(NAME, **{name: 0.1}), {"depth_only": object()})
+
+
+def test_words():
+    shown = row_label(row(NAME, rotation_drift=0.1, translation_drift=0.002))
+    assert shown == f"{NAME}, rotation drift 0.1 °/√frame, translation drift 0.002 m/√frame"
+
+
+class Poses:
+    """An estimator that keeps the poses it is given."""
+
+    def __init__(self):
+        self.given = []
+
+    def update(self, predicted, T_world_cam, anchors=None):
+        self.given.append(T_world_cam.numpy())
+
+    def state(self):
+        return {}
+
+
+def test_a_row_sees_drift_and_noise_on_top_of_it():
+    setting = Setting(rotation_drift=0.5, translation_drift=0.02, translation_noise=0.1, seed=3)
+    run, blank = RowRun(row(NAME, **setting.to_dict()), torch.device("cpu"), []), np.zeros((2, 2), np.float32)
+    run.estimator = Poses()
+    one = Predicted(torch.ones(2, 2), None, None, torch.eye(3, dtype=torch.float64))
+    for i in range(0, 20, 4):
+        run.estimate(Frame(i, str(i), None, None, WALK[i], np.eye(3)), one, blank)
+    expected = [perturbed(T, setting, i) for T, i in zip(drifted(BOTH, range(0, 20, 4)), range(0, 20, 4), strict=True)]
+    np.testing.assert_allclose(np.stack(run.estimator.given), np.stack(expected), atol=1e-12)
+    np.testing.assert_array_equal(run.last[1], run.estimator.given[-1])
+
+
+def test_rows_of_one_drift_share_a_tracker_and_a_reference():
+    alike = [
+        row(NAME, anchors="tracked", rotation_drift=0.1),
+        row(NAME, anchors="tracked", rotation_drift=0.1, corrected=True),
+    ]
+    others = [
+        row(NAME, anchors="tracked", **{name: 0.1, "seed": seed})
+        for name in ("translation_drift", "rotation_noise")
+        for seed in (0, 1)
+    ]
+    sources = anchor_sources([*alike, *others, row(NAME, anchors="tracked")])
+    assert sources[alike[0]]._tracks is sources[alike[1]]._tracks
+    assert len({id(source._tracks) for source in sources.values()}) == 6
+    plain, drift = (row("UfM-Ensemble-100K", **values) for values in ({}, {"rotation_drift": 0.1}))
+    rows = [plain, drift, row("UfM*-Ensemble", rotation_drift=0.1), row("UfM*-Ensemble", anchors="truth", seed=7)]
+    assert references(rows[2], rows) == [drift]
+    assert references(rows[3], rows) == [plain]
+
+
+def test_the_suite_of_anchors_drifts_with_anchors_and_without():
+    suite = suite_named("ablation-anchors")
+    assert {"rotation_drift", "translation_drift", "anchor_count", "track_noise"} <= set(suite.sweep)
+    assert "anchors" not in suite.sweep
+    for name, values in (("rotation_drift", ROTATION_DRIFTS), ("translation_drift", TRANSLATION_DRIFTS)):
+        for anchors in ("", "tracked"):
+            tried = [r.setting for r in suite.rows if r.setting.anchors == anchors and getattr(r.setting, name)]
+            assert tuple(getattr(setting, name) for setting in tried) == values
