@@ -1,0 +1,237 @@
+"""Anchors that a user brings: points into pixels, through ``UncertainDepth``; what a reset keeps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import scenes
+from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.camera import resize_intrinsics
+
+H, W = 48, 64
+ON = UfMStarConfig(anchored=True)
+K = torch.tensor([[60.0, 0.5, 31.5], [0, 58.0, 23.5], [0, 0, 1]], dtype=torch.float64)
+NAN, INF = float("nan"), float("inf")
+
+
+def at(u, v, z):
+    """The point at depth z that projects to (u, v)."""
+    return (torch.linalg.inv(K) @ torch.tensor([u, v, 1.0], dtype=torch.float64) * z).tolist()
+
+
+# ---- points into pixels ----
+
+
+def test_points_project_to_their_pixels():
+    wanted = [(3.25, 40.0, 2.0), (0.0, 0.0, 0.5), (63.0, 47.0, 8.0)]
+    points = torch.tensor([[at(*w) for w in wanted]])
+    found = Anchors.from_points(points, torch.full((1, 3), 0.01, dtype=torch.float64), K, (H, W))
+    # float32 points: a millionth of a pixel's ray
+    torch.testing.assert_close(found.pixel[0], torch.tensor([w[:2] for w in wanted]).double(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(found.depth[0], torch.tensor([2.0, 0.5, 8.0]).double(), rtol=1e-6, atol=0)
+    assert found.variance.tolist() == [[0.01] * 3]
+    assert found.valid.all()
+
+
+def test_each_stream_has_its_own_camera():
+    other = resize_intrinsics(K, (H, W), (2 * H, 2 * W))
+    points = torch.tensor([[at(10.0, 20.0, 3.0)]]).expand(2, 1, 3).float()
+    found = Anchors.from_points(points, torch.zeros(2, 1), torch.stack([K, other]), (2 * H, 2 * W))
+    expected = torch.tensor([[[10.0, 20.0]], [[20.5, 40.5]]], dtype=torch.float64)
+    torch.testing.assert_close(found.pixel, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("point", "variance"),
+    [
+        (at(10.0, 10.0, -2.0), 0.01),  # behind the camera
+        ([0.1, 0.1, 0.0], 0.01),
+        (at(-0.6, 10.0, 2.0), 0.01),  # beside the image: its pixel would be -1
+        (at(63.6, 10.0, 2.0), 0.01),
+        (at(10.0, 47.6, 2.0), 0.01),
+        ([NAN, 0.0, 2.0], 0.01),
+        ([0.0, 0.0, INF], 0.01),
+        (at(10.0, 10.0, 2.0), -0.01),
+        (at(10.0, 10.0, 2.0), NAN),
+        (at(10.0, 10.0, 2.0), INF),
+    ],
+)
+def test_what_cannot_be_seen_or_makes_no_sense_is_not_valid(point, variance):
+    points, spread = torch.tensor([[at(63.4, -0.4, 2.0), point]]), torch.tensor([[0.01, variance]])
+    found = Anchors.from_points(points, spread, K, (H, W))
+    assert found.valid.tolist() == [[True, False]]
+    assert all(bool(part.isfinite().all()) for part in (found.pixel, found.depth, found.variance))
+    assert found.depth[0, 1] == found.variance[0, 1] == 0
+
+
+def test_the_mask_and_padding_are_respected():
+    points, spread = torch.tensor([[at(10.0, 10.0, 2.0)] * 3]), torch.zeros(1, 3)
+    mask = torch.tensor([[True, False, True]])
+    assert torch.equal(Anchors.from_points(points, spread, K, (H, W), mask).valid, mask)
+    assert Anchors.from_points(torch.zeros(2, 0, 3), torch.zeros(2, 0), K, (H, W)).valid.shape == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "told"),
+    [
+        ({"points_cam": torch.zeros(4, 3)}, ValueError, r"points_cam must be \[B, N, 3\], got \(4, 3\)"),
+        ({"points_cam": torch.zeros(1, 4, 3).long()}, TypeError, "points_cam must be a floating-point tensor"),
+        ({"points_cam": np.zeros((1, 4, 3))}, TypeError, "points_cam must be a floating-point tensor, got float64"),
+        ({"variance": torch.zeros(4)}, ValueError, r"variance must have shape \(1, 4\) as points_cam says"),
+        ({"intrinsics": torch.zeros(2, 3, 3)}, ValueError, r"intrinsics must be \[3, 3\] or \[1, 3, 3\]"),
+        ({"valid": torch.ones(1, 4)}, TypeError, "valid must be a bool tensor"),
+        ({"valid": torch.ones(1, 3).bool()}, ValueError, r"valid must have shape \(1, 4\)"),
+    ],
+)
+def test_wrong_kinds_and_shapes_are_named(change, error, told):
+    given = {"points_cam": torch.ones(1, 4, 3), "variance": torch.zeros(1, 4), "intrinsics": K, "size": (H, W)}
+    with pytest.raises(error, match=told):
+        Anchors.from_points(**{**given, **change})
+
+
+def test_moved_to_a_resized_image():
+    half = resize_intrinsics(K, (H, W), (H // 2, W // 2))
+    given = Anchors(torch.tensor([[[10.5, 20.5]]]), torch.ones(1, 1), torch.zeros(1, 1))
+    found = given.moved(K, half)
+    torch.testing.assert_close(found.pixel, torch.tensor([[[5.0, 10.0]]], dtype=torch.float64))
+    assert found.depth is given.depth
+    torch.testing.assert_close(found.moved(half, K).pixel, given.pixel.double())
+    with pytest.raises(ValueError, match=r"anchors.pixel must be \[B, N, 2\]"):
+        Anchors(torch.zeros(4, 2), torch.ones(4), torch.ones(4)).moved(K, half)
+
+
+# ---- through the pipeline ----
+
+
+class Biased(nn.Module):
+    """Depth that is 20 % too far, from an image that is the depth itself."""
+
+    def forward(self, image):
+        return DepthPrediction(1.2 * image[:, 0], torch.full_like(image[:, 0], 0.01))
+
+
+def half(image, intrinsics):
+    """Half the size, taking every second pixel."""
+    small = resize_intrinsics(intrinsics, (H, W), (H // 2, W // 2))
+    return image[..., ::2, ::2], small
+
+
+def two_streams(frames=4):
+    """Depths [2, H, W], poses [2, 4, 4], K [2, 3, 3] and anchors of ground truth, 40 and 25 of them, of two walks."""
+    depths, poses, K_ = scenes.sequence(2 * frames, H, W, 0.0)
+    rng, found = np.random.default_rng(0), []
+    for i in range(frames):
+        truth = np.stack([depths[i], depths[-1 - i]])
+        seen = [rng.permutation(np.argwhere(map_ > 0))[:40] for map_ in truth]
+        v, u = np.moveaxis(np.stack(seen), -1, 0)
+        depth = torch.tensor(np.stack([truth[s, v[s], u[s]] for s in (0, 1)]))
+        pixel = torch.tensor(np.stack([u, v], -1).astype(float))
+        valid = torch.arange(40) < torch.tensor([[40], [25]])
+        anchors = Anchors(pixel, depth.where(valid, NAN), torch.full((2, 40), 1e-4), valid)
+        pose = torch.tensor(np.stack([poses[i], poses[-1 - i]]))
+        found.append((torch.tensor(truth).float(), pose, torch.tensor(K_).expand(2, 3, 3), anchors))
+    return found
+
+
+@pytest.mark.parametrize("preprocess", [None, half])
+def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
+    model, ufm = UncertainDepth(Biased(), ON, preprocess=preprocess), UfMStar(ON)
+    for truth, pose, intrinsics, anchors in two_streams():
+        image = truth[:, None].expand(2, 3, H, W)
+        out = model(image, pose, intrinsics, anchors=anchors)
+        x, K_map = (image, intrinsics) if preprocess is None else preprocess(image, intrinsics)
+        by_hand = anchors
+        if preprocess is not None:  # u' + 1/2 = (u + 1/2)/2
+            by_hand = Anchors((anchors.pixel + 0.5) / 2 - 0.5, anchors.depth, anchors.variance, anchors.valid)
+        expected = ufm(1.2 * x[:, 0], pose, K_map, torch.full_like(x[:, 0], 0.01), anchors=by_hand)
+        for name in ("variance", "anchored", "bias"):
+            torch.testing.assert_close(getattr(out.ufm, name), getattr(expected, name), equal_nan=True)
+        assert torch.equal(out.ufm.statistics.anchors_used, expected.statistics.anchors_used)
+        given, fewer = out.ufm.statistics.anchors.tolist()
+        assert 38 <= given <= 40, "but for those that a pixel without depth takes at half the size"
+        assert 23 <= fewer <= 25
+    assert float(out.ufm.anchored[out.ufm.valid].mean()) > 0.05
+    with pytest.raises(ValueError, match="anchored=True"):
+        UncertainDepth(Biased())(image, pose, intrinsics, anchors=anchors)
+
+
+# ---- a standing camera, and starting again ----
+
+
+def test_a_standing_camera_has_no_anchors_and_says_so():
+    from ufmstar_torch.eval.sequences import open_sequence
+    from ufmstar_torch.tracker import LandmarkTracker
+
+    frame = open_sequence("tour:5?frames=2&size=180x240")[0]
+    tracker, plain, anchored = LandmarkTracker(), UfMStar(), UfMStar(ON)
+    arguments = [torch.tensor(x)[None] for x in (1.2 * frame.depth, frame.T_world_cam, frame.intrinsics)]
+    for _ in range(4):
+        landmarks = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        a = plain(*arguments)
+        b = anchored(*arguments, anchors=landmarks.anchors(frame.intrinsics, arguments[2]))
+        assert b.statistics.anchors.tolist() == b.statistics.anchors_used.tolist() == [0]
+        torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=0, equal_nan=True)
+    assert landmarks.tracked > 20, "corners are seen, but without parallax"
+
+
+def learnt():
+    """UfM* of two streams after four frames of a network that is 20 % off, and the next frame."""
+    ufm, frames = UfMStar(ON), two_streams(5)
+    for truth, pose, intrinsics, anchors in frames[:4]:
+        ufm(1.2 * truth, pose, intrinsics, anchors=anchors)
+    truth, pose, intrinsics, _ = frames[4]
+    return ufm, (1.2 * truth, pose, intrinsics)
+
+
+def test_kept_evidence_makes_the_first_frame_see():
+    ufm, frame = learnt()
+    overall = ufm.overall_evidence.clone()
+    ufm.reset(keep_evidence=True)
+    assert torch.equal(ufm.overall_evidence, overall)
+    assert int(ufm.mixture.components.sum()) == 0
+    assert not ufm.started.any()
+    assert not ufm.evidence.any()
+    out = ufm(*frame)
+    relative = (out.anchored / out.depth.square())[out.valid]
+    expected = (overall[:, 2] / (overall[:, 0] + ON.anchor_shrinkage)).clamp_min(0)
+    torch.testing.assert_close(relative.min(), expected.min(), rtol=1e-4, atol=0)
+    assert 0.5 < float(relative.mean()) / (1 / 1.2 - 1) ** 2 < 1.2
+    ufm.reset()
+    assert not ufm.overall_evidence.any()
+    assert bool((ufm(*frame).anchored.nan_to_num(0) == 0).all())
+
+
+def test_kept_evidence_of_one_stream():
+    ufm, frame = learnt()
+    overall = ufm.overall_evidence.clone()
+    twin = UfMStar(ON)
+    twin.load_state_dict(ufm.state_dict())
+    ufm.reset([1], keep_evidence=True)
+    assert torch.equal(ufm.overall_evidence, overall)
+    assert ufm.evidence[0].any()
+    assert not ufm.evidence[1].any()
+    assert ufm.mixture.components.tolist() == [int(twin.mixture.components[0]), 0]
+    a, b = ufm(*frame), twin(*frame)
+    torch.testing.assert_close(a.variance[0], b.variance[0], rtol=0, atol=0, equal_nan=True)
+    ufm.reset(torch.tensor([True, False]))
+    assert ufm.overall_evidence[1].any()
+    assert not ufm.overall_evidence[0].any()
+
+
+def test_kept_evidence_survives_saving_and_needs_anchors():
+    ufm, frame = learnt()
+    later = UfMStar(ON)
+    later.load_state_dict(ufm.state_dict())
+    for module in (ufm, later):
+        module.reset(keep_evidence=True)
+    torch.testing.assert_close(ufm(*frame).variance, later(*frame).variance, rtol=0, atol=0, equal_nan=True)
+    with pytest.raises(ValueError, match="keep_evidence needs UfMStarConfig"):
+        UfMStar().reset(keep_evidence=True)
+    model = UncertainDepth(Biased(), ON)
+    model.ufm.load_state_dict(ufm.state_dict())
+    model.reset(keep_evidence=True)
+    assert torch.equal(model.ufm.overall_evidence, ufm.overall_evidence)
