@@ -144,6 +144,28 @@ class LandmarkTracker:
         self._poses = np.tile(np.eye(4), (w, 1, 1))
         self._view = -1
 
+    def state(self) -> dict[str, Tensor]:
+        """A copy of all that is remembered, for :meth:`load_state`: the window, and the last image in gray."""
+        gray = np.zeros((0, 0), dtype=np.uint8) if self._gray is None else self._gray
+        K = np.eye(3) if self._K is None else self._K
+        held = {"gray": gray, "K": K, "pixel": self._pixel, "seen": self._seen, "poses": self._poses}
+        return {**{name: torch.tensor(value) for name, value in held.items()}, "view": torch.tensor(self._view)}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where :meth:`state` was taken, with the same landmarks to the last bit.
+
+        Raises:
+            ValueError: another ``max_points`` or ``window``.
+        """
+        shape, own = tuple(state["pixel"].shape), self._pixel.shape
+        if shape != own:
+            raise ValueError(f"state must be of {own[0]} points in {own[1]} views, got {shape[0]} in {shape[1]}")
+        gray, K, self._pixel, self._seen, self._poses = (
+            np.array(state[name].numpy()) for name in ("gray", "K", "pixel", "seen", "poses")
+        )
+        self._gray, self._K = (gray, K) if gray.size else (None, None)
+        self._view = int(state["view"])
+
     def update(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]) -> Landmarks:
         """Take in the next image.
 
