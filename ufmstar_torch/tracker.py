@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors import Anchors
-
-# Lucas-Kanade on patches of 11 x 11 px over four octaves, at most ten iterations each: half the time of OpenCV's
-# defaults, and what it follows differs by hundredths of a pixel.
-_PATCH, _LEVELS, _ITERATIONS, _CONVERGED = 11, 3, 10, 0.03
-# [px] Width from which corners are looked for at half the size.
-_HALVED_FROM = 480
+from ufmstar_torch.corners import find, follow
 
 
 @dataclass(frozen=True)
@@ -201,54 +196,24 @@ class LandmarkTracker:
 
     def _followed(self, gray: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
-        import cv2
-
-        before, alive = self._pixel[:, self._view], self._seen[:, self._view].copy()
-        position = before.copy()
-        if not alive.any() or self._gray is None:
-            return position, alive
-        start = before[alive].astype(np.float32)[:, None]
-        options: dict[str, Any] = {"winSize": (_PATCH, _PATCH), "criteria": (3, _ITERATIONS, _CONVERGED)}
-        forward, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._gray, gray, start, np.empty_like(start), maxLevel=_LEVELS, **options
-        )
-        # Back from where it came to, starting where it should arrive: the finest level tells.
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            gray, self._gray, forward, start.copy(), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **options
-        )
-        gap = np.linalg.norm(back - start, axis=-1)[:, 0]
-        height, width = gray.shape
-        u, v = forward[:, 0, 0], forward[:, 0, 1]
-        inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-        fine = (found[:, 0] == 1) & (returned[:, 0] == 1) & (gap < self.config.back_tolerance) & inside
-        position[alive] = forward[:, 0]
-        alive[alive] = fine
+        position, alive = self._pixel[:, self._view].copy(), self._seen[:, self._view].copy()
+        if alive.any() and self._gray is not None:
+            position[alive], alive[alive] = follow(self._gray, gray, position[alive], self.config.back_tolerance)
         return position, alive
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
         """New corners in free slots, away from those that are followed."""
-        import cv2
-
-        free = np.flatnonzero(~self._seen[:, self._view])
-        # A detection costs as much as following all corners: not for a few.
+        followed = self._seen[:, self._view]
+        free = np.flatnonzero(~followed)
+        # Not for a few: a search costs a third of following them all.
         if len(free) < max(1, self.config.max_points // 5):
             return
-        # A large image is searched at half its size: a tenth of the time, and a corner need not be met exactly, only
-        # be the same from frame to frame.
-        half = gray.shape[1] >= _HALVED_FROM
-        searched = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if half else gray
-        factor = 2 if half else 1
-        spacing = self.config.spacing * gray.shape[1] / 640 / factor
-        mask = np.full(searched.shape, 255, dtype=np.uint8)
-        for u, v in (self._pixel[self._seen[:, self._view], self._view] + 0.5) / factor - 0.5:
-            cv2.circle(mask, (round(u), round(v)), round(spacing), 0, -1)
-        corners = cv2.goodFeaturesToTrack(searched, len(free), 0.01, spacing, mask=mask)
-        if corners is None:
-            return
-        slots = free[: len(corners)]
+        spacing = self.config.spacing * gray.shape[1] / 640
+        found = find(gray, len(free), spacing, self._pixel[followed, self._view])
+        slots = free[: len(found)]
         self._seen[slots] = False
         self._seen[slots, self._view] = True
-        self._pixel[slots, self._view] = (corners[:, 0] + 0.5) * factor - 0.5
+        self._pixel[slots, self._view] = found
 
     def _landmarks(self, tracked: int) -> Landmarks:
         """What the views in the window say of the corners that the newest one shows."""

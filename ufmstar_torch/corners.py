@@ -1,0 +1,88 @@
+"""Corners of images: found where none is followed yet, and followed from one image to the next.
+
+OpenCV on the CPU, imported when it is first needed.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Lucas-Kanade on patches of 11 x 11 px over four octaves, at most ten iterations each: half the time of OpenCV's
+# defaults, and what it follows differs by hundredths of a pixel.
+_PATCH, _LEVELS, _ITERATIONS, _CONVERGED = 11, 3, 10, 0.03
+# [px] Width from which corners are looked for at half the size.
+_HALVED_FROM = 480
+
+
+def follow(
+    before: NDArray[np.uint8], after: NDArray[np.uint8], position: NDArray[np.float64], back_tolerance: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Where corners of one gray image are in the next, and which of them lead back to where they were.
+
+    Args:
+        before, after: [H, W] gray.
+        position: [N, 2] (u, v) in ``before``, N at least 1 [px].
+        back_tolerance: a corner followed there and back must return this near [px].
+
+    Returns:
+        Positions [N, 2] in ``after`` [px], and which may be believed [N]: found both ways and inside the image.
+    """
+    import cv2
+
+    start = position.astype(np.float32)[:, None]
+    options: dict[str, Any] = {"winSize": (_PATCH, _PATCH), "criteria": (3, _ITERATIONS, _CONVERGED)}
+    # The flag asks for the patch's eigenvalue in place of the difference of the patches, which would be computed in a
+    # pass of its own; neither is used.
+    quick = cv2.OPTFLOW_LK_GET_MIN_EIGENVALS
+    forward, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, start, np.empty_like(start), maxLevel=_LEVELS, flags=quick, **options
+    )
+    # Back from where it came to, starting where it should arrive: the finest level tells.
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(
+        after, before, forward, start.copy(), maxLevel=0, flags=quick | cv2.OPTFLOW_USE_INITIAL_FLOW, **options
+    )
+    gap = np.linalg.norm(back - start, axis=-1)[:, 0]
+    height, width = after.shape
+    u, v = forward[:, 0, 0], forward[:, 0, 1]
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    fine = (found[:, 0] == 1) & (returned[:, 0] == 1) & (gap < back_tolerance) & inside
+    return forward[:, 0].astype(np.float64), fine
+
+
+def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """New corners, away from those that are followed.
+
+    Args:
+        gray: [H, W].
+        count: how many at most.
+        spacing: least distance between two of them, and to one that is followed [px].
+        followed: [N, 2] (u, v) inside the image [px].
+
+    Returns:
+        [n, 2] positions (u, v), the best first [px].
+    """
+    import cv2
+
+    # A large image is searched at half its size: a tenth of the time, and a corner need not be met exactly, only be the
+    # same from frame to frame.
+    factor = 2 if gray.shape[1] >= _HALVED_FROM else 1
+    searched = gray if factor == 1 else cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    free = _away_from((followed + 0.5) / factor - 0.5, round(spacing / factor), searched.shape)
+    corners = cv2.goodFeaturesToTrack(searched, count, 0.01, spacing / factor, mask=free)
+    return np.zeros((0, 2)) if corners is None else (corners[:, 0].astype(np.float64) + 0.5) * factor - 0.5
+
+
+def _away_from(position: NDArray[np.float64], radius: int, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """[H, W] 255 where no position [N, 2] is within a radius [px], 0 elsewhere: all discs drawn at once."""
+    height, width = shape
+    side = np.arange(-radius, radius + 1)
+    down, right = (offset - radius for offset in np.nonzero(side[:, None] ** 2 + side**2 <= radius**2))
+    margin = radius + 1  # discs may reach beyond the image; at least 1, so that it can be cut off again
+    wide = width + 2 * margin
+    free = np.full((height + 2 * margin, wide), 255, dtype=np.uint8)
+    u, v = np.rint(position).astype(np.int64).T + margin
+    free.ravel()[(v * wide + u)[:, None] + down * wide + right] = 0
+    return np.ascontiguousarray(free[margin:-margin, margin:-margin])
