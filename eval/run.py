@@ -162,7 +162,7 @@ def run(
 
 def _rewind(source: Source, folder: RunFolder) -> None:
     """Bring the source to the state after the last finished frame."""
-    source.ufm.reset()
+    source.reset()
     if folder.checkpoint.module:
         source.load_state(folder.checkpoint.module)
 
@@ -215,6 +215,8 @@ def _one_frame(job: Job, folder: RunFolder, judge: Judge, index: int, saving: fl
         return {"index": index, "name": name, "state": "skipped", "reason": error.reason}
     fault = int(result.ufm.statistics.fault[0])
     if fault:
+        if job.source.anchors is not None:
+            job.source.anchors.undo()
         return {"index": index, "name": name, "state": "skipped", "reason": FRAME_FAULTS[fault]}
     with clock.stage("metrics"):
         judge.update(result, truth)
@@ -224,10 +226,12 @@ def _one_frame(job: Job, folder: RunFolder, judge: Judge, index: int, saving: fl
             depth=result.depth[0],
             variance=result.variance[0],
             disagreement=result.disagreement[0],
+            anchored=None if result.ufm.anchored is None else result.ufm.anchored[0],
+            bias=None if result.ufm.bias is None else result.ufm.bias[0],
             valid=result.ufm.valid[0],
         )
     ms = {**clock.take(), "save": saving}
-    return _record(index, name, result, truth is not None, written, ms)
+    return _record(index, name, result, truth is not None, written, ms) | _anchors(job.source, result)
 
 
 def _truth(frame: Frame, result: UncertainPrediction) -> np.ndarray | None:
@@ -238,10 +242,10 @@ def _truth(frame: Frame, result: UncertainPrediction) -> np.ndarray | None:
 def _record(
     index: int, name: str, result: UncertainPrediction, judged: bool, written: WrittenFrame, ms: dict[str, float]
 ) -> dict[str, Any]:
-    """What is remembered of a frame. "prepare" is what a prediction takes beside the network and UfM*."""
+    """What is remembered of a frame. "prepare" is what a prediction takes beside network, anchors and UfM*."""
     statistics, K = result.ufm.statistics, result.intrinsics[0].tolist()
     counts = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-    prepare = ms["predict"] - ms.get("network", 0.0) - ms["ufm"]
+    prepare = ms["predict"] - ms.get("network", 0.0) - ms.get("anchors", 0.0) - ms["ufm"]
     times = {stage: time for stage, time in {**ms, "prepare": prepare}.items() if stage != "predict"}
     own = result.prediction.variance
     return {
@@ -261,6 +265,15 @@ def _record(
         "saturated": {"depth": written.depth_saturated, "sigma": written.sigma_saturated},
         "ms": times,
     }
+
+
+def _anchors(source: Source, result: UncertainPrediction) -> dict[str, Any]:
+    """What a run with anchors remembers besides: their counts, and the means of B [m^2] and of r."""
+    anchored, bias, valid = result.ufm.anchored, result.ufm.bias, result.ufm.valid
+    if source.anchors is None or anchored is None or bias is None:
+        return {}
+    means = {"mean_anchored": _mean(anchored, valid), "mean_bias": _mean(bias, valid)}
+    return {"anchors": source.anchors.counts(result.ufm.statistics), **means}
 
 
 def _mean(values: Tensor, valid: Tensor) -> float:

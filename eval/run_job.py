@@ -9,8 +9,10 @@ import torch
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.run import Job
+from ufmstar_torch.eval.run_anchors import require_images
+from ufmstar_torch.eval.run_maps import folder_source, own_depth_source
 from ufmstar_torch.eval.run_options import OWN_DEPTH, check_options, parse_intrinsics, parse_size, parse_slice
-from ufmstar_torch.eval.run_source import Source, folder_source, network_source, own_depth_source
+from ufmstar_torch.eval.run_source import Source, network_source
 from ufmstar_torch.eval.sequences import Sequence, open_sequence
 
 # How a run is carried out; the rest of the options says what is run.
@@ -30,6 +32,8 @@ def job_from(options: Mapping[str, Any]) -> Job:
     device = _device(options["device"])
     chosen = parse_slice(options["frames"])
     sequence = _sequence(options)
+    if config.anchored:
+        require_images(sequence)
     indices = range(len(sequence))[chosen]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")

@@ -90,6 +90,8 @@ def run_parser() -> ArgumentParser:
     group = parser.add_argument_group("UfM*")
     text = "upstream's segmentation thresholds; single --ufm.segment.* go before them"
     group.add_argument("--preset", choices=PRESETS, default=None, help=text)
+    text = "track corners of the images: their depths show the error on which all views agree (docs/anchors.md)"
+    group.add_argument("--anchors", action="store_true", help=text)
     _add_config(group, UfMStarConfig, "ufm", _OTHER_DEFAULTS)
     return parser
 
@@ -118,6 +120,8 @@ def parse_run(parser: ArgumentParser, arguments: Sequence[str]) -> dict[str, Any
         options = parser.parse_args(words)
     plain: dict[str, Any] = options.as_dict()
     plain["config"] = [str(file) for file in plain["config"] or []]
+    if plain["anchors"]:
+        plain["ufm"]["anchored"] = True
     return plain
 
 
@@ -151,6 +155,8 @@ def check_options(options: Mapping[str, Any]) -> None:
         raise ValueError("--mode full needs several --weights")
     if options["samples"] is not None and (options["samples"] < 2 or options["mode"] != "full"):
         raise ValueError(f"--samples must be at least 2 and goes with --mode full, got {options['samples']}")
+    if options["ufm"].get("anchored") and not options["anchors"]:
+        raise ValueError("--ufm.anchored needs anchors: give --anchors instead")
     if options["resume"] and options["overwrite"]:
         raise ValueError("--resume and --overwrite contradict each other")
 

@@ -1,33 +1,28 @@
-"""Where a run's depth comes from: networks, a folder of maps that another program predicted, or the
-sequence's own depth. Each source carries UfM* and its state."""
+"""Where a run's depth comes from: networks, or maps that are already there (``run_maps``). Each source carries UfM* and
+its state."""
 
 from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.ground_truth import depth_camera, resample_nearest, scaled_to_map
+from ufmstar_torch.eval.run_anchors import RunAnchors, of_tracker
 from ufmstar_torch.eval.run_clock import Stopwatch
-from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
-from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models.dropout import SAMPLES, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.load import DIRECTORIES, load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.pipeline import UncertainDepth, UncertainPrediction
-from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -37,7 +32,8 @@ class Source(ABC):
     Attributes:
         identity: plain values that tell this source from another one: a run cannot go on with another.
         is_truth: whether the prediction is the sequence's own depth, so that it has no error to show.
-        clock: the stages "network" and "ufm" of the frames.
+        clock: the stages "network", "ufm" and "anchors" of the frames.
+        anchors: the tracker, with ``config.anchored``; else None.
     """
 
     is_truth = False
@@ -46,7 +42,8 @@ class Source(ABC):
         self._module = module.to(device)
         self.ufm = ufm
         self.device = device
-        self.identity = dict(identity)
+        self.anchors = RunAnchors() if ufm.config.anchored else None
+        self.identity = dict(identity) | ({} if self.anchors is None else {"anchors": self.anchors.identity})
         self.clock = Stopwatch(device)
         self.clock.watch(ufm, "ufm")
 
@@ -60,7 +57,8 @@ class Source(ABC):
 
     def state(self) -> dict[str, Tensor]:
         """Everything that the next prediction depends on, without the networks' weights."""
-        return {k: v for k, v in self._module.state_dict().items() if not k.startswith("networks.")}
+        own = {k: v for k, v in self._module.state_dict().items() if not k.startswith("networks.")}
+        return own if self.anchors is None else {**own, **self.anchors.state()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where ``state`` was taken.
@@ -68,10 +66,27 @@ class Source(ABC):
         Raises:
             ValueError: the state belongs to another kind of source.
         """
-        result = self._module.load_state_dict(dict(state), strict=False)
+        tracker, rest = of_tracker(state)
+        if self.anchors is not None:
+            self.anchors.load_state(tracker)
+        result = self._module.load_state_dict(rest, strict=False)
         missing = [name for name in result.missing_keys if not name.startswith("networks.")]
         if missing or result.unexpected_keys:
             raise ValueError(f"the saved state lacks {missing} and has {result.unexpected_keys} too many")
+
+    def reset(self) -> None:
+        """Go back to the start."""
+        self.ufm.reset()
+        if self.anchors is not None:
+            self.anchors.reset()
+
+    def anchors_of(self, frame: Frame) -> Anchors | None:
+        """Those of the next frame, in its image's pixels; None without ``config.anchored`` or without an image."""
+        if self.anchors is None:
+            return None
+        with self.clock.stage("anchors"):
+            found = self.anchors.of(frame)
+        return None if found is None else found.to(self.device)
 
 
 class NetworkSource(Source):
@@ -100,67 +115,7 @@ class NetworkSource(Source):
         self._dropout.manual_seed(frame.index)  # of the frame alone: a resumed run draws the same
         # Pose and intrinsics stay on the host, where UfM* checks them without waiting for a device.
         pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
-        return self._pipeline(image, pose, K)
-
-
-@dataclass(frozen=True, eq=False)
-class PredictedMap:
-    """A depth map from elsewhere.
-
-    Attributes:
-        depth: [H, W] float32 [m], 0 = no prediction.
-        variance: [H, W] float32 [m^2], or None.
-        intrinsics: [3, 3] float64 of the map [px].
-    """
-
-    depth: np.ndarray
-    variance: np.ndarray | None
-    intrinsics: np.ndarray
-
-    def resized(self, size: Size | None) -> PredictedMap:
-        """At another size (h, w), by taking the nearest pixel."""
-        old = (self.depth.shape[0], self.depth.shape[1])
-        if size is None or size == old:
-            return self
-        K = resize_intrinsics(torch.from_numpy(self.intrinsics), old, size).numpy()
-        variance = None if self.variance is None else resample_nearest(self.variance, self.intrinsics, K, size)
-        return PredictedMap(resample_nearest(self.depth, self.intrinsics, K, size), variance, K)
-
-
-class MapSource(Source):
-    """Depth that is already there.
-
-    Args:
-        read: the map of a frame.
-        config: of UfM*.
-        size: (h, w) to which the maps are brought; None = as they are.
-        device, identity: see :class:`Source`.
-        is_truth: the maps are the sequence's own depth.
-    """
-
-    def __init__(
-        self,
-        read: Callable[[Frame], PredictedMap],
-        config: UfMStarConfig,
-        device: torch.device,
-        identity: Mapping[str, Any],
-        *,
-        size: Size | None = None,
-        is_truth: bool = False,
-    ) -> None:
-        ufm = UfMStar(config)
-        super().__init__(ufm, ufm, device, identity)
-        self._read, self._size, self.is_truth = read, size, is_truth
-
-    def predict(self, frame: Frame) -> UncertainPrediction:
-        """See :meth:`Source.predict`."""
-        found = self._read(frame).resized(self._size)
-        depth = torch.from_numpy(found.depth)[None].to(self.device)
-        variance = None if found.variance is None else torch.from_numpy(found.variance)[None].to(self.device)
-        pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(found.intrinsics)[None]
-        with torch.no_grad():
-            ufm = self.ufm(depth, pose, K, variance)
-        return UncertainPrediction(DepthPrediction(depth, variance), ufm, K, None)
+        return self._pipeline(image, pose, K, anchors=self.anchors_of(frame))
 
 
 def network_source(
@@ -281,91 +236,6 @@ def stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:
     """Those of the networks that sample."""
     found = [network.network() if isinstance(network, LazyMember) else network for network in networks]
     return [network for network in found if isinstance(network, MonteCarloDropout)]
-
-
-def folder_source(
-    sequence: Sequence,
-    folder: str | Path,
-    config: UfMStarConfig,
-    *,
-    variance: str | Path | None = None,
-    scale: float | None = None,
-    intrinsics: IntrinsicsLike | None = None,
-    size: Size | None = None,
-    device: str = "cpu",
-) -> MapSource:
-    """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
-
-    Without ``intrinsics``, the maps must show the whole image; theirs are then the image's, scaled by the
-    sizes' ratio.
-
-    Args:
-        sequence: the frames.
-        folder, scale, variance: as :class:`DepthFolder` takes them.
-        config: of UfM*.
-        intrinsics: of the maps [px], where the network saw a part of the image.
-        size, device: see :class:`MapSource`.
-
-    Raises:
-        NotADirectoryError: no such folder.
-        ValueError: no maps, maps that fit no frame, or (the first one) of another aspect ratio than the images.
-    """
-    maps = DepthFolder(folder, scale, variance).for_frames(sequence.names, sequence.names_on_disk)
-    K_given = None if intrinsics is None else read_intrinsics(intrinsics)
-
-    def read(frame: Frame) -> PredictedMap:
-        depth, spread = maps[frame.index]
-        if K_given is not None:
-            return PredictedMap(depth, spread, K_given)
-        try:
-            K = scaled_to_map(frame.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
-        except ValueError as error:
-            raise FrameError(maps.depth_files[frame.index], _cropped(sequence, depth)) from error
-        return PredictedMap(depth, spread, K)
-
-    _check_first(sequence, maps, K_given is not None)
-    files = (*maps.depth_files, *maps.variance_files)
-    listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
-    identity = {
-        "maps": {"count": len(maps.depth_files), "names_and_sizes": hashlib.sha256(listing.encode()).hexdigest()},
-        "with_variance": variance is not None,
-        "scale": scale,
-        "intrinsics": K_given,
-        "size": size,
-    }
-    return MapSource(read, config, torch.device(device), identity, size=size)
-
-
-def _check_first(sequence: Sequence, maps: DepthMaps, any_shape: bool) -> None:
-    """Raises ValueError at once where the first map has another shape than the images, as then all have."""
-    try:
-        depth, _ = maps[0]
-        if not any_shape:
-            scaled_to_map(sequence.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
-    except FrameError:  # counted when its turn comes
-        return
-    except ValueError as error:
-        raise ValueError(f"{maps.depth_files[0]}: {_cropped(sequence, depth)}") from error
-
-
-def _cropped(sequence: Sequence, depth: np.ndarray) -> str:
-    height, width = sequence.image_size or (0, 0)
-    return (
-        f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the whole "
-        "image, so its own intrinsics must be given"
-    )
-
-
-def own_depth_source(config: UfMStarConfig, *, size: Size | None = None, device: str = "cpu") -> MapSource:
-    """The sequence's own depth as the prediction: what UfM* says of perfect depth, the method's floor."""
-
-    def read(frame: Frame) -> PredictedMap:
-        if frame.depth is None:
-            raise FrameError(frame.name, "no depth map")
-        return PredictedMap(frame.depth, None, depth_camera(frame))
-
-    identity = {"maps": "the sequence's own depth", "size": size}
-    return MapSource(read, config, torch.device(device), identity, size=size, is_truth=True)
 
 
 def sha256(file: Path) -> str:

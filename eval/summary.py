@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 from ufmstar_torch.eval.judge import ALONE, UFM
@@ -20,7 +20,7 @@ FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 NEAR_ZERO = 1e-3
 # [nats] Above it, the mean NLL tells of a few pixels with almost no variance, and of nothing else.
 _NLL_DOMINATED = 100.0
-STAGES = ("read", "prepare", "network", "ufm", "metrics", "write", "save")
+STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 _COLUMNS = {
     "delta1": "delta1",
@@ -82,6 +82,7 @@ def summarise(
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else _why_not_alone(done, UFM in figures),
         "uncertainty": _uncertainty(done),
+        "anchors": _anchors(done),
         "mixture": _mixture(done, mixture),
         "rotation_deviation_max": max((record["rotation_deviation"] for record in done), default=None),
         "time": _time(done, sessions),
@@ -146,6 +147,23 @@ def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """What anchors did over all frames, the first ones included; None of a run without."""
+    records = [record["anchors"] for record in done if "anchors" in record]
+    if not records:
+        return None
+    first = next((number for number, record in enumerate(records) if record["used"]), None)
+    means = {f"{key}_per_frame": mean(r[key] for r in records) for key in ("tracked", "found", "usable", "used")}
+    return {
+        **means,
+        "frames_before_the_first": len(records) if first is None else first,
+        "frames_without": dict(Counter(record["without"] for record in records if record["without"] is not None)),
+        "mean_anchored": _pixel_mean(done, "mean_anchored"),
+        "mean_bias": _pixel_mean(done, "mean_bias"),
+        "units": "mean_anchored m^2 (B), mean_bias 1 (r: true depth over predicted, less 1)",
+    }
+
+
 def _near_zero_share(done: Sequence[Mapping[str, Any]]) -> float | None:
     """Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component: there, the prior says 0."""
     pixels = sum(record["valid_pixels"] for record in done)
@@ -194,7 +212,8 @@ def table(summary: Mapping[str, Any]) -> str:
     lines = []
     uncertainty = summary["uncertainty"]
     if summary["metrics"] is not None:
-        rows = [("UfM*", summary["metrics"], uncertainty["mean_sigma"])]
+        name = "UfM*" if summary["anchors"] is None else "UfM*, anchored"
+        rows = [(name, summary["metrics"], uncertainty["mean_sigma"])]
         if summary["network_alone"] is not None:
             rows.append(("network alone", summary["network_alone"], uncertainty["mean_network_sigma"]))
         head = ["", *_COLUMNS.values(), "sigma [m]"]
@@ -213,6 +232,7 @@ def table(summary: Mapping[str, Any]) -> str:
     mixture, time = summary["mixture"], summary["time"]
     stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
     rate = time["frames_per_second"]
+    lines += [] if summary["anchors"] is None else _told(summary["anchors"], summary["frames"]["done"])
     lines += [
         f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
         f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "
@@ -222,6 +242,22 @@ def table(summary: Mapping[str, Any]) -> str:
     lines += [f"skipped {count}: {reason}" for reason, count in summary["frames"]["skipped"].items()]
     lines += [f"left out {count}: {reason}" for reason, count in summary["sequence"]["left_out"].items()]
     return "\n".join(lines)
+
+
+def _told(anchors: Mapping[str, Any], frames: int) -> list[str]:
+    """What anchors did, in a line, and in another one which frames had none."""
+    used, found, tracked = (anchors[f"{key}_per_frame"] for key in ("used", "found", "tracked"))
+    line = f"anchors: {used:.1f} used a frame, of {found:.1f} triangulated and {tracked:.1f} tracked"
+    if used and anchors["mean_bias"] is not None:
+        way = "nearer" if anchors["mean_bias"] < 0 else "farther"
+        expected = f"{abs(anchors['mean_bias']):.0%} {way} than predicted"
+        line += f"; mean B {number(anchors['mean_anchored'])} m^2, true depth expected {expected}"
+    without, before = anchors["frames_without"], anchors["frames_before_the_first"]
+    if not without:
+        return [line]
+    why = "; ".join(f"{count} x {reason}" for reason, count in without.items())
+    told = f"without anchors: {sum(without.values())} of {frames} frames ({why}); plain UfM* in the first {before}"
+    return [line, told + (", then with what was learnt before" if sum(without.values()) > before else "")]
 
 
 def number(value: float | None) -> str:

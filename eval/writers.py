@@ -1,7 +1,8 @@
 """What ``ufmstar run`` leaves on disk: per frame an npz and two 16-bit PNGs, and summary.json.
 
 ```
-OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]
+OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with
+                      anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is the depth corrected)
 OUT/depth/NAME.png    depth, 16 bit, 0 = invalid; metres per count in the PNG's text
 OUT/sigma/NAME.png    standard deviation, likewise
 OUT/summary.json
@@ -98,7 +99,17 @@ class FrameWriter:
                 path.unlink()
         (self.out_dir / "summary.json").unlink(missing_ok=True)
 
-    def write(self, name: str, *, depth: Any, variance: Any, disagreement: Any, valid: Any = None) -> WrittenFrame:
+    def write(
+        self,
+        name: str,
+        *,
+        depth: Any,
+        variance: Any,
+        disagreement: Any,
+        anchored: Any = None,
+        bias: Any = None,
+        valid: Any = None,
+    ) -> WrittenFrame:
         """Write one frame; none of its files appears before all are written.
 
         Args:
@@ -106,17 +117,20 @@ class FrameWriter:
             depth: [H, W] [m], tensor or array.
             variance: [H, W] total variance [m^2].
             disagreement: [H, W] multiview disagreement [m^2].
+            anchored: [H, W] what anchors add to the variance [m^2], or None.
+            bias: [H, W] relative error that anchors lead to expect, or None.
             valid: [H, W] bool, True where the pixel was used; None = where depth is finite and positive.
 
         Raises:
             ValueError: shapes disagree.
             OSError: the disk is full, say; earlier frames are untouched.
         """
-        d, v, m = (
-            _float_map(x, n) for x, n in ((depth, "depth"), (variance, "variance"), (disagreement, "disagreement"))
-        )
+        given = {"depth": depth, "variance": variance, "disagreement": disagreement, "anchored": anchored, "bias": bias}
+        maps: dict[str, NDArray[Any]] = {n: _float_map(x, n) for n, x in given.items() if x is not None}
+        d, v = maps["depth"], maps["variance"]
         used = np.isfinite(d) & (d > 0) if valid is None else _array(valid)
-        for label, value in (("variance", v), ("disagreement", m), ("valid", used)):
+        maps["valid"] = used
+        for label, value in maps.items():
             if value.shape != d.shape:
                 raise ValueError(f"{label} must have the depth's shape {d.shape}, got {value.shape}")
         if used.dtype != np.bool_:
@@ -126,7 +140,6 @@ class FrameWriter:
         sigma = np.sqrt(np.where(v >= 0, v, np.nan))
         depth_png, lost_d = encode_length_png(d, used, depth_unit, quantity="depth")
         sigma_png, lost_s = encode_length_png(sigma, used, sigma_unit, quantity="sigma")
-        maps = {"depth": d, "variance": v, "disagreement": m, "valid": used}
         write_together(
             {
                 paths["depth"]: lambda file: file.write(depth_png),
@@ -153,9 +166,10 @@ class FrameWriter:
 
 
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
-    """The maps of a frame's npz: depth [m], variance [m^2], disagreement [m^2], valid, each [H, W]."""
+    """The maps of a frame's npz: depth [m], variance [m^2], disagreement [m^2], valid, each [H, W]; with anchors
+    also anchored [m^2] and bias."""
     with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in ("depth", "variance", "disagreement", "valid")}
+        return {name: stored[name] for name in stored.files}
 
 
 def fitting_unit(depth: NDArray[Any]) -> float:

@@ -22,7 +22,8 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.pictures import field_of_view, square_pixels
 from ufmstar_torch.eval.run import Progress, run
 from ufmstar_torch.eval.run_folder import FolderError
-from ufmstar_torch.eval.run_source import NetworkSource, folder_source
+from ufmstar_torch.eval.run_maps import folder_source
+from ufmstar_torch.eval.run_source import NetworkSource
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.writers import read_frame
 from ufmstar_torch.models import Preprocess
@@ -273,7 +274,7 @@ def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):
 
 
 def test_maps_are_brought_to_a_size(path, tmp_path):
-    from ufmstar_torch.eval.run_source import own_depth_source
+    from ufmstar_torch.eval.run_maps import own_depth_source
 
     summary = run(job_of(open_sequence(path), own_depth_source(CONFIG, size=(12, 16))), tmp_path / "out")
     assert summary["prediction"]["size"] == [12, 16]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.ground_truth import depth_camera
 from ufmstar_torch.eval.run_clock import Stopwatch
-from ufmstar_torch.eval.run_source import PredictedMap
+from ufmstar_torch.eval.run_maps import PredictedMap
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
 from ufmstar_torch.eval.suite.predicted import Predicted, from_network
 from ufmstar_torch.models.dropout import set_sampling
