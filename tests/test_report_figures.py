@@ -32,10 +32,11 @@ from ufmstar_torch.eval.report.figures_calibration import (
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
 from ufmstar_torch.eval.report.figures_entropy import ONE_METRE, density, draw_entropy, entropy_range
 from ufmstar_torch.eval.report.figures_error import draw_error
-from ufmstar_torch.eval.report.figures_sweep import change, draw_changes, draw_sweep, level, points, sweeps
+from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.sums import Merged
+from ufmstar_torch.eval.report.sweep_lines import Point, change, level, points, sweeps
 from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.suite.method import BASES, Method
 from ufmstar_torch.eval.suite.row import Row
@@ -193,7 +194,8 @@ class TestSweeps:
         assert mean.half == pytest.approx(4.302652729749464 * deviation / math.sqrt(3))
 
     def test_the_change_is_in_pairs(self, swept):
-        found = change(swept, points(swept, UFM_STAR.method, "rotation_noise")[2], noisy(0.0), NLL)
+        still = Point(0.0, (noisy(0.0),))
+        found = change(swept, points(swept, UFM_STAR.method, "rotation_noise")[2], still, NLL)
         assert (found.value, found.half) == (pytest.approx(0.5), pytest.approx(0.0, abs=1e-9))
 
     def test_lines_bands_and_the_base_alone(self, swept):

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from ufmstar_torch.eval.plots import FAINT, INK
-from ufmstar_torch.eval.report.aggregate import Mean, difference, mean_over, value_of
+from ufmstar_torch.eval.report.aggregate import Mean, difference
 from ufmstar_torch.eval.report.figure_style import (
     ALONE_STYLE,
     LABEL,
     TICK,
+    Style,
     counted,
     finish,
     label_ends,
@@ -29,130 +31,185 @@ from ufmstar_torch.eval.report.names import (
     ECE_Q,
     NLL,
     SETTINGS,
+    SPEARMAN,
     Quantity,
     setting_label,
     setting_name,
 )
+from ufmstar_torch.eval.report.sweep_lines import Line, Point, Rest, change, default_value, level, sweep_lines
 from ufmstar_torch.eval.suite.method import ALONE, BASES, Method
 from ufmstar_torch.eval.suite.row import Row
-from ufmstar_torch.eval.suite.setting import DEFAULT
-from ufmstar_torch.eval.suite.suite import default_of
+from ufmstar_torch.eval.suite.setting import DEFAULT, TRACKED, TRUTH
 
 SHOWN = (NLL, ECE_DELTA, ECE_Q)
-
-
-@dataclass(frozen=True)
-class Point:
-    """A value of a setting, and the rows that have it (several where noise was drawn with several seeds)."""
-
-    value: float
-    rows: tuple[Row, ...]
-
-
-def sweeps(results: Results) -> list[tuple[str, str]]:
-    """(base, setting) of every setting of which at least three numbers were tried, the default among them or not."""
-    found = dict.fromkeys((row.method.base, name) for row in results.rows for name in _varied(row))
-    return [
-        (base, name) for base, name in found if any(len(points(results, m, name)) >= 3 for m in _methods(results, base))
-    ]
-
-
-def points(results: Results, method: Method, name: str) -> list[Point]:
-    """The values of a setting tried with a method, nothing else being changed, in rising order."""
-    groups: dict[float, list[Row]] = {}
-    for row in results.rows:
-        if row.method != method or not set(_varied(row)) <= {name}:
-            continue
-        value = row.setting.to_dict().get(name, _default(name))
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            groups.setdefault(float(value), []).append(row)
-    return [Point(value, tuple(groups[value])) for value in sorted(groups)]
-
-
-def level(results: Results, point: Point, quantity: Quantity) -> Mean:
-    """Mean over sequences at a point; seeds of one sequence are averaged first."""
-    return mean_over(list(_by_sequence(results, point, quantity).values()))
-
-
-def change(results: Results, point: Point, reference: Row, quantity: Quantity) -> Mean:
-    """Mean over sequences of the difference to a reference row."""
-    theirs = _by_sequence(results, Point(0.0, (reference,)), quantity)
-    mine = _by_sequence(results, point, quantity)
-    return mean_over([value - theirs.get(where, math.nan) for where, value in mine.items()])
+# Lines of the same method by what is fixed; they differ from all of ``style_of``'s.
+_TRACKED, _TRUTH = Style("#882255", "d"), Style("#222222", "*")
+_OTHERS = (Style("#117733", "h"), Style("#88CCEE", "p"), Style("#999933", "<"), Style("#AA4499", ">"))
+# Beyond this an axis of NLLs is logarithmic: pixels of nearly no variance take their mean to any height.
+_HIGH = 50.0
 
 
 def draw_sweep(results: Results, base: str, name: str) -> Any:
-    """Above, the figures over the values with their confidence intervals; below, the change from the default."""
-    methods = [m for m in _methods(results, base) if m.fusion != ALONE and len(points(results, m, name)) > 1]
-    paired = any(Row(method) in results.rows for method in methods)
+    """Above, the figures over the values with their confidence intervals; below, the change from the default, or where
+    lines differ in what else is fixed, from the method without that."""
+    lines = [line for line in sweep_lines(results, base, name) if len(line.points) > 1 or not line.rest]
+    alone = next((line for line in lines if line.method == Method(base)), None)
+    drawn = [line for line in lines if line.method.fusion != ALONE]
+    styles = dict(zip(((line.method, line.rest) for line in drawn), _styles(drawn), strict=True))
+    below = _Below.of(drawn, alone, name)
+    anchored = any("anchors" in dict(line.rest) for line in drawn)
+    shown = (*SHOWN, SPEARMAN) if anchored else SHOWN
     word, unit = SETTINGS.get(name, (setting_name(name), ""))
     title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {counted(len(results.sequences()))}"
-    figure = new_figure(4.0 * len(SHOWN), 6.0 if paired else 3.4, title)
-    axes = figure.subplots(1 + paired, len(SHOWN), squeeze=False, sharex=True)
-    for column, quantity in enumerate(SHOWN):
-        _draw_levels(axes[0][column], results, base, name, methods, quantity)
-        if paired:
-            _draw_changes(axes[1][column], results, name, methods, quantity)
+    figure = new_figure(4.0 * len(shown), 6.0 if below.pairs else 3.4, title)
+    axes = figure.subplots(1 + bool(below.pairs), len(shown), squeeze=False, sharex=True)
+    for column, quantity in enumerate(shown):
+        _draw_levels(axes[0][column], results, drawn, alone, styles, name, quantity)
+        if below.pairs:
+            _draw_changes(axes[1][column], results, below, styles, name, quantity)
         axes[-1][column].set_xlabel(f"{word} [{unit}]" if unit else word, size=LABEL, color=INK)
     return figure
 
 
+@dataclass(frozen=True)
+class _Below:
+    """Which differences are drawn.
+
+    Attributes:
+        to: what they are to, in words.
+        pairs: lines with the points that theirs are compared with.
+    """
+
+    to: str
+    pairs: tuple[tuple[Line, tuple[tuple[Point, Point], ...]], ...]
+
+    @classmethod
+    def of(cls, drawn: Sequence[Line], alone: Line | None, name: str) -> _Below:
+        """To the base alone on the same images where these change with the value; else of lines with something fixed
+        to those without it, at the same value where that matters; else to the default."""
+        plain = {line.method: line for line in drawn if not line.rest}
+        swept = [line for line in drawn if len(line.points) > 1]
+        if alone is not None and len(alone.points) > 1:
+            return cls("alone", _paired(swept, lambda line, value: alone.at(value)))
+        fixed = [line for line in swept if line.rest and line.method in plain]
+        if fixed:
+            methods = {short_name(line.method) for line in fixed}
+            to = methods.pop() if len(methods) == 1 else "the method as it is"
+            return cls(to, _paired(fixed, lambda line, value: plain[line.method].at(value)))
+        default = default_value(name)
+        return cls("the default", _paired(swept, lambda line, value: line.at(default)))
+
+
+def _paired(
+    lines: Iterable[Line], reference: Callable[[Line, float], Point | None]
+) -> tuple[tuple[Line, tuple[tuple[Point, Point], ...]], ...]:
+    found = []
+    for line in lines:
+        pairs = ((point, reference(line, point.value)) for point in line.points)
+        kept = tuple((point, other) for point, other in pairs if other is not None)
+        found += [(line, kept)] if kept else []
+    return tuple(found)
+
+
 def _draw_levels(
-    axes: Any, results: Results, base: str, name: str, methods: Sequence[Method], quantity: Quantity
+    axes: Any,
+    results: Results,
+    drawn: Sequence[Line],
+    alone: Line | None,
+    styles: Mapping[tuple[Method, Rest], Style],
+    name: str,
+    quantity: Quantity,
 ) -> None:
-    ends = []
-    alone = points(results, Method(base), name)
-    means = [level(results, point, quantity) for point in alone]
-    if any(not math.isnan(mean.value) for mean in means):
-        dashed = {"color": ALONE_STYLE.colour, "linestyle": "--", "linewidth": 1.4, "label": "alone"}
-        if len(alone) == 1:
-            axes.axhline(means[0].value, **dashed)
+    ends, reached = [], []
+    for line in [*filter(None, [alone]), *drawn]:
+        means = [level(results, point, quantity) for point in line.points]
+        reached += [mean.value for mean in means if math.isfinite(mean.value)]
+        label = short_name(line.method) if line is alone else " ".join(filter(None, (line.method.name, line.words)))
+        style = ALONE_STYLE if line is alone else styles[line.method, line.rest]
+        if line is alone or len(line.points) == 1:
+            ends += _dashed(axes, line, means, label, style)
         else:
-            axes.plot([p.value for p in alone], [m.value for m in means], **dashed)
-        ends.append((means[-1].value, "alone", ALONE_STYLE.colour))
-    for method in methods:
-        found = points(results, method, name)
-        ends += _line(axes, found, [level(results, point, quantity) for point in found], method)
+            ends += _line(axes, line.points, means, label, style, _end(line))
     finish(axes, title=f"{quantity.heading}, mean over sequences")
-    _scale(axes, [p.value for method in methods for p in points(results, method, name)])
+    _scale(axes, [point.value for line in drawn if len(line.points) > 1 for point in line.points])
+    _tame(axes, reached)
     _mark_default(axes, name)
     label_ends(axes, ends)
 
 
-def _draw_changes(axes: Any, results: Results, name: str, methods: Sequence[Method], quantity: Quantity) -> None:
-    """Against the base alone on the same images where these change with the value, else against the default."""
-    ends = []
+def _draw_changes(
+    axes: Any,
+    results: Results,
+    below: _Below,
+    styles: Mapping[tuple[Method, Rest], Style],
+    name: str,
+    quantity: Quantity,
+) -> None:
+    ends, reached = [], []
     axes.axhline(0, color=FAINT, linewidth=0.8)
-    for method in methods:
-        found = points(results, method, name)
-        alone = {point.value: point.rows[0] for point in points(results, Method(method.base), name)}
-        references = alone if len(alone) > 1 else dict.fromkeys((p.value for p in found), Row(method))
-        pairs = [(point, references[point.value]) for point in found if point.value in references]
+    for line, pairs in below.pairs:
         means = [change(results, point, reference, quantity) for point, reference in pairs]
-        ends += _line(axes, [point for point, _ in pairs], means, method)
-    other = "alone" if len(alone) > 1 else "the default"
-    finish(axes, title=f"difference to {other} in {quantity.name}, in pairs")
+        reached += [mean.value for mean in means if math.isfinite(mean.value)]
+        label = " ".join(filter(None, (line.method.name, line.words)))
+        style = styles[line.method, line.rest]
+        ends += _line(axes, [point for point, _ in pairs], means, label, style, _end(line))
+    finish(axes, title=f"difference to {below.to} in {quantity.name}, in pairs")
+    _tame(axes, reached)
     _mark_default(axes, name)
     label_ends(axes, ends)
 
 
-def _line(axes: Any, found: Sequence[Point], means: Sequence[Mean], method: Method) -> list[tuple[float, str, str]]:
+def _dashed(axes: Any, line: Line, means: Sequence[Mean], label: str, style: Style) -> list[tuple[float, str, str]]:
+    """A line for reference, level where it has one point; what to write at its end."""
+    if all(math.isnan(mean.value) for mean in means):
+        return []
+    look = {"color": style.colour, "linestyle": "--", "linewidth": 1.4, "label": label}
+    if len(means) == 1:
+        axes.axhline(means[0].value, **look)
+    else:
+        axes.plot([point.value for point in line.points], [mean.value for mean in means], **look)
+    return [(means[-1].value, _end(line), style.colour)]
+
+
+def _line(
+    axes: Any, found: Sequence[Point], means: Sequence[Mean], label: str, style: Style, end: str
+) -> list[tuple[float, str, str]]:
     """A line with its band; what to write at its end."""
     kept = [(point.value, mean) for point, mean in zip(found, means, strict=True) if not math.isnan(mean.value)]
     if not kept:
         return []
     x = np.array([value for value, _ in kept])
     y, half = (np.array([getattr(mean, what) for _, mean in kept]) for what in ("value", "half"))
-    style = style_of(method)
-    axes.plot(x, y, label=method.name, **style.line)
+    axes.plot(x, y, label=label, **style.line)
     axes.fill_between(x, y - half, y + half, color=style.colour, alpha=0.15, linewidth=0)
-    return [(float(y[-1]), short_name(method), style.colour)]
+    return [(float(y[-1]), end, style.colour)]
+
+
+def _end(line: Line) -> str:
+    """What stands at a line's end: "UfM*", "anchored", "UfM-100K, overlap threshold η 0.3"."""
+    return line.words or short_name(line.method)
+
+
+def _styles(lines: Iterable[Line]) -> Iterator[Style]:
+    """The method's own look, or one that says what is fixed."""
+    others = cycle(_OTHERS)
+    for line in lines:
+        known = {(): style_of(line.method), (("anchors", TRACKED),): _TRACKED, (("anchors", TRUTH),): _TRUTH}
+        yield known[line.rest] if line.rest in known else next(others)
+
+
+def _tame(axes: Any, reached: Sequence[float]) -> None:
+    """Logarithmic beyond 1 where values are so high that the others would lie on one line, and cut to the values:
+    intervals of such means reach as far to the other side of 0."""
+    if max(map(abs, reached), default=0.0) > _HIGH:
+        axes.set_yscale("symlog", linthresh=1.0)
+        axes.set_ylim(3 * min(-0.1, *reached), 3 * max(0.1, *reached))
 
 
 def _scale(axes: Any, values: Sequence[float]) -> None:
-    """Logarithmic where values span more than a factor of 20, with a linear piece about 0 where 0 is among them."""
+    """Logarithmic where values span a factor of 20 or more, with a linear piece about 0 where 0 is among them."""
     positive = [value for value in values if value > 0]
-    if positive and max(positive) > 20 * min(positive):
+    if positive and max(positive) >= 20 * min(positive):
         if min(values) > 0:
             axes.set_xscale("log")
         else:
@@ -164,7 +221,9 @@ def _scale(axes: Any, values: Sequence[float]) -> None:
 
 
 def _mark_default(axes: Any, name: str) -> None:
-    axes.axvline(float(_default(name)), color=FAINT, linewidth=0.8, linestyle=":", zorder=0)
+    value = default_value(name)
+    if not math.isnan(value):
+        axes.axvline(value, color=FAINT, linewidth=0.8, linestyle=":", zorder=0)
 
 
 def draw_changes(results: Results, base: str) -> Any | None:
@@ -209,29 +268,3 @@ def _variant_names(rows: Sequence[Row]) -> list[str]:
     """Their settings, with the method where there are several."""
     one = len({row.method for row in rows}) == 1
     return [("" if one else f"{short_name(row.method)}, ") + setting_label(row.setting.to_dict()) for row in rows]
-
-
-def _methods(results: Results, base: str) -> list[Method]:
-    return list(dict.fromkeys(row.method for row in results.rows if row.method.base == base))
-
-
-def _varied(row: Row) -> list[str]:
-    """What a row's setting changes, the noise's seed aside."""
-    return [name for name in row.setting.to_dict() if name != "seed"]
-
-
-def _default(name: str) -> Any:
-    try:
-        return default_of(name)
-    except ValueError:  # a setting of another version: without a default, its rows stand alone
-        return math.nan
-
-
-def _by_sequence(results: Results, point: Point, quantity: Quantity) -> Mapping[tuple[str, str], float]:
-    """The figure of each sequence, the mean over the point's rows (the seeds of a noise)."""
-    found: dict[tuple[str, str], list[float]] = {}
-    for row in point.rows:
-        for record in results.of(row):
-            value = quantity.factor * value_of(record, quantity.key)
-            found.setdefault((record.dataset, record.sequence), []).append(value)
-    return {where: math.fsum(values) / len(values) for where, values in found.items()}

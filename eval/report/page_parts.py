@@ -42,7 +42,11 @@ _FIGURES = {
         "Entropy by data set",
         "How uncertain each method is, whether or not it should be: for data on which no calibration can be had.",
     ),
-    "sweep": ("Sweeps and ablations", "Figures over the values of a setting; bars and bands are 95 % intervals."),
+    "sweep": (
+        "Sweeps and ablations",
+        "Figures over the values of a setting, and below them differences at the same value, in pairs; bars and bands "
+        "are 95 % intervals.",
+    ),
     "tradeoff": ("Calibration against cost", ""),
     "latency": ("Where the time goes", ""),
 }

@@ -1,0 +1,205 @@
+"""Sweeps with anchors: a figure for each setting, in it a line for each choice of anchors, and what they begin from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluations import in_memory
+
+from ufmstar_torch.eval.report.figures import write_figures
+from ufmstar_torch.eval.report.figures_sweep import draw_sweep
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.names import ECE_DELTA
+from ufmstar_torch.eval.report.sweep_lines import default_value, level, points, sweep_lines, sweeps
+from ufmstar_torch.eval.suite.anchor_source import TRUTH_COUNT
+from ufmstar_torch.eval.suite.method import Method
+from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.suite.setting import Setting
+from ufmstar_torch.eval.suite.suite import setting_from
+from ufmstar_torch.eval.suite.suites import COUNTS, ROTATION_DRIFTS, TRACK_NOISES, suite_named
+from ufmstar_torch.tracker import TrackerConfig
+
+STAR = Method.parse("UfM*-DepthOnly")
+SEQUENCES = {"a": 0.3, "b": 0.5, "c": 0.7}  # ECE_delta of plain UfM*
+MOST = TrackerConfig().max_points
+VARIED = {
+    "anchor_count",
+    "track_noise",
+    "rotation_noise",
+    "translation_noise",
+    "rotation_drift",
+    "translation_drift",
+    "anchor_half_life",
+    "anchor_shrinkage",
+}
+
+
+def error(row: Row, plain: float) -> float:
+    """ECE_delta of a row as these tests have it: anchors halve it, those of truth quarter it, noise takes that back."""
+    setting = row.setting
+    gain = {"": 0.0, "tracked": 0.5, "truth": 0.75}[setting.anchors]
+    count = MOST if setting.anchor_count is None else setting.anchor_count
+    noise = 10 * setting.rotation_drift + setting.rotation_noise + 10 * setting.translation_noise
+    return plain * (1 - gain * min(count, 100) / 100 / (1 + noise)) + 0.01 * noise
+
+
+def results_of(rows: list[Row], nll: float = 2.0) -> Results:
+    figures = {}
+    for row in rows:
+        for sequence, plain in SEQUENCES.items():
+            value = error(row, plain)
+            named = {"ece_delta": value, "ece_q": value / 2, "spearman": 1 - value, "nll": nll}
+            figures[row, ("d", sequence)] = named if row.method == STAR else {}
+    return in_memory(figures, "ablation-anchors")
+
+
+@pytest.fixture(scope="module")
+def results() -> Results:
+    return results_of(list(suite_named("ablation-anchors").rows))
+
+
+def row(**values: Any) -> Row:
+    return Row(STAR, setting_from(values))
+
+
+def drawn(axes: Any) -> dict[str, Any]:
+    return {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
+
+
+def ends(axes: Any) -> set[str]:
+    return {text.get_text() for text in axes.texts}
+
+
+def test_every_setting_that_the_suite_varies_is_swept(results):
+    assert {name for base, name in sweeps(results) if base == "depth_only"} == VARIED
+    assert set(suite_named("ablation-anchors").sweep) == VARIED
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("rotation_drift", (0.0, *ROTATION_DRIFTS)),
+        ("track_noise", (0.0, *TRACK_NOISES)),
+        ("anchor_half_life", (10.0, 30.0, 100.0)),
+    ],
+)
+def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(results, name, values):
+    anchored = [line for line in sweep_lines(results, "depth_only", name) if dict(line.rest) == {"anchors": "tracked"}]
+    assert [point.value for point in anchored[0].points] == pytest.approx(values)
+    at_default = anchored[0].at(default_value(name))
+    assert at_default.rows == (row(anchors="tracked"),)
+    assert anchored[0].words == "anchored"
+    # And no row of another line is among those of plain UfM*.
+    assert all(not r.setting.anchors for point in points(results, STAR, name) for r in point.rows)
+
+
+def test_numbers_of_anchors_begin_with_none(results):
+    lines = {line.words: line for line in sweep_lines(results, "depth_only", "anchor_count") if len(line.points) > 1}
+    assert set(lines) == {"anchored", "truth anchors"}
+    assert [point.value for point in lines["truth anchors"].points] == list(COUNTS) == [0, 5, 20, 100, 300]
+    assert [point.value for point in lines["anchored"].points] == [0, 5, 20, MOST]
+    # Plain UfM* where no row says 0; and a row that says nothing has as many as the tracker follows.
+    assert lines["anchored"].points[0].rows == (Row(STAR),)
+    assert lines["anchored"].points[-1].rows == (row(anchors="tracked"),)
+    assert lines["truth anchors"].points[0].rows == (row(anchors="truth", anchor_count=0),)
+    both = results_of([row(anchors="truth"), *(row(anchors="truth", anchor_count=n) for n in (0, 20))])
+    assert [point.value for point in sweep_lines(both, "depth_only", "anchor_count")[0].points] == [0, 20, TRUTH_COUNT]
+
+
+def test_pose_noise_has_lines_of_both_and_their_difference_at_the_same_value(results):
+    figure = draw_sweep(results, "depth_only", "rotation_drift")
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles[1] == "ECE_δ ↓, mean over sequences"
+    assert titles[3].startswith("Spearman")
+    assert titles[5] == "difference to UfM* in ECE_δ, in pairs"
+    above, below = drawn(figure.axes[1]), drawn(figure.axes[5])
+    values = (0.0, *ROTATION_DRIFTS)
+    plain, anchored = above["UfM*-DepthOnly"], above["UfM*-DepthOnly anchored"]
+    rows = [[row(rotation_drift=v, **more) for v in values] for more in ({}, {"anchors": "tracked"})]
+    expected = [[np.mean([error(r, p) for p in SEQUENCES.values()]) for r in line] for line in rows]
+    np.testing.assert_allclose(plain.get_xdata(), values)
+    np.testing.assert_allclose([plain.get_ydata(), anchored.get_ydata()], expected)
+    assert plain.get_color() != anchored.get_color()
+    assert set(below) == {"UfM*-DepthOnly anchored"}, "nothing is compared with itself"
+    np.testing.assert_allclose(below["UfM*-DepthOnly anchored"].get_ydata(), np.subtract(*expected[::-1]))
+    assert ends(figure.axes[1]) == {"UfM*", "anchored"}
+    assert figure.axes[5].get_xlabel() == "rotation drift [°/√frame]"
+
+
+def test_the_band_of_a_line_with_anchors_is_its_interval(results):
+    axes = draw_sweep(results, "depth_only", "rotation_drift").axes[1]
+    line = next(found for found in sweep_lines(results, "depth_only", "rotation_drift") if found.rest)
+    mean = level(results, line.points[0], ECE_DELTA)
+    values = np.array(list(SEQUENCES.values())) / 2
+    assert (mean.value, mean.sequences) == (pytest.approx(values.mean()), 3)
+    assert mean.half == pytest.approx(4.302652729749464 * values.std(ddof=1) / math.sqrt(3))
+    low = [band.get_paths()[0].vertices for band in axes.collections]
+    assert any(vertices[:, 1].min() == pytest.approx(mean.value - mean.half) for vertices in low)
+
+
+@pytest.mark.parametrize("name", ["track_noise", "anchor_half_life", "anchor_count"])
+def test_what_only_anchors_have_stands_beside_plain_ufm_star(results, name):
+    figure = draw_sweep(results, "depth_only", name)
+    above, below = drawn(figure.axes[1]), drawn(figure.axes[5])
+    level_line = above["UfM*-DepthOnly"]
+    assert level_line.get_linestyle() == "--"
+    np.testing.assert_allclose(level_line.get_ydata(), 0.5)
+    assert "UfM*" in ends(figure.axes[1])
+    change = below["UfM*-DepthOnly anchored"].get_ydata()
+    if name == "anchor_count":
+        np.testing.assert_allclose(change, [0, -0.0125, -0.05, -0.25], atol=1e-12)
+        np.testing.assert_allclose(below["UfM*-DepthOnly truth anchors"].get_ydata()[[0, 3, 4]], [0, -0.375, -0.375])
+    else:
+        np.testing.assert_allclose(change, -0.25)
+
+
+def test_settings_beside_the_anchors_are_lines_of_their_own():
+    drifts = (0.0, 0.1, 0.2)
+    mores = ({}, {"disagreement": "overlap"}, {"anchors": "tracked"}, {"anchors": "tracked", "corrected": True})
+    found = results_of([row(**more, **({"rotation_drift": v} if v else {})) for more in mores for v in drifts])
+    words = [line.words for line in sweep_lines(found, "depth_only", "rotation_drift")]
+    assert words == ["", "disagreement overlap", "anchored", "anchored, depth corrected on"]
+    axes = draw_sweep(found, "depth_only", "rotation_drift").axes[0]
+    assert len({line.get_color() for line in drawn(axes).values()}) == 4
+
+
+def test_seeds_of_a_noise_are_one_point():
+    seeds = [Row(STAR, Setting(rotation_drift=0.1, anchors="tracked", seed=seed)) for seed in (0, 1, 2)]
+    found = results_of([row(anchors="tracked"), row(anchors="tracked", rotation_drift=0.5), *seeds])
+    (line,) = sweep_lines(found, "depth_only", "rotation_drift")
+    assert [(point.value, len(point.rows)) for point in line.points] == [(0.0, 1), (0.1, 3), (0.5, 1)]
+    # Without plain UfM*, the difference is to the line's own default.
+    below = draw_sweep(found, "depth_only", "rotation_drift").axes[4]
+    assert below.get_title(loc="left") == "difference to the default in NLL, in pairs"
+    assert drawn(below)["UfM*-DepthOnly anchored"].get_ydata()[0] == 0
+
+
+def test_words_and_switches_are_no_values():
+    rows = [row(), *(row(disagreement="overlap", prior_weight=v) for v in (1.0, 2.0, 3.0))]
+    rows += [row(**{"segment.prune": rule}) for rule in ("either", "none")] + [row(overlap_weighted=True)]
+    assert sweeps(results_of(rows)) == [("depth_only", "prior_weight")]
+    assert math.isnan(default_value("segment.prune"))
+    assert math.isnan(default_value("no_such_setting"))
+    assert math.isnan(default_value("anchor_count"))
+
+
+def test_nlls_beyond_measure_leave_the_others_to_be_seen():
+    rows = [row(**({"rotation_drift": v} if v else {})) for v in (0.0, 0.1, 0.2)]
+    wild = draw_sweep(results_of(rows, nll=1e30), "depth_only", "rotation_drift")
+    assert [axes.get_yscale() for axes in wild.axes[:3]] == ["symlog", "linear", "linear"]
+    low, high = wild.axes[0].get_ylim()
+    assert low < 0 < 1e30 < high < 1e31
+
+
+def test_the_report_draws_them(results, tmp_path):
+    rows = [r for r in suite_named("ablation-anchors").rows if not (r.setting.pose_noise or r.setting.track_noise)]
+    few = [r for r in rows if not {"anchor_half_life", "anchor_shrinkage"} & set(r.setting.to_dict())]
+    names = {path.name for path in write_figures(replace(results_of(few), out=tmp_path), "svg")}
+    assert {name for name in names if name.startswith("sweep")} == {
+        "sweep-depth-only-anchor-count.svg",
+        "sweep-changes-depth-only.svg",
+    }
