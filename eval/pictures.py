@@ -55,13 +55,17 @@ class Finished:
         frame = self._frame(record["index"])
         truth = truth_at(frame, K, size) if self.with_error and frame is not None else None
         maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "valid": stored["valid"]}
+        note = f"K = {record['components']}"
+        if "anchored" in stored:
+            maps["anchored"] = np.sqrt(stored["anchored"])
+            note += f", {record['anchors']['used']} anchors"
         if truth is not None:
             maps["error"] = np.where(truth > 0, np.abs(stored["depth"] - truth), np.nan).astype(np.float32)
         shown = {name: resample_nearest(value, K, K_square, size_square) for name, value in maps.items()}
         image = None if frame is None or frame.image is None else field_of_view(frame.image, frame.intrinsics, K, size)
         if image is None:
             image = np.full((*size_square, 3), INVALID_GREY, np.uint8)
-        return FramePanel(name=record["name"], image=image, note=f"K = {record['components']}", **shown)
+        return FramePanel(name=record["name"], image=image, note=note, **shown)
 
     def fps(self) -> float:
         """Frames per second of the recording, for the video."""

@@ -34,6 +34,7 @@ class FramePanel:
         error: [h, w] |depth - ground truth| [m], NaN where there is none; or None for no ground truth at all.
         valid: [h, w] bool, True where depth and sigma hold; None = everywhere finite.
         note: a short line beside the name, "K = 31" say.
+        anchored: [h, w] the part of sigma that is due to anchors, sqrt(B) [m]; None of a run without.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -46,11 +47,12 @@ class FramePanel:
     error: NDArray[Any] | None = None
     valid: NDArray[np.bool_] | None = None
     note: str = ""
+    anchored: NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[-1] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be uint8 [H, W, 3], got {self.image.dtype} {self.image.shape}")
-        for label in ("sigma", "error", "valid"):
+        for label in ("sigma", "error", "valid", "anchored"):
             value = getattr(self, label)
             if value is not None and value.shape != self.depth.shape:
                 raise ValueError(f"{label} must have the depth's shape {self.depth.shape}, got {value.shape}")
@@ -87,9 +89,10 @@ def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
     return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(*sigma, ERROR_MAP), ColourScale(*error, ERROR_MAP))
 
 
-def map_columns(scales: PanelScales, *, with_error: bool) -> list[Column]:
-    """The columns right of the image."""
+def map_columns(scales: PanelScales, *, with_error: bool, with_anchored: bool = False) -> list[Column]:
+    """The columns right of the image; what anchors add is on the scale of sigma."""
     columns = [Column("depth", scales.depth, "depth"), Column("σ", scales.sigma, "sigma")]
+    columns += [Column("√B", scales.sigma, "anchored")] if with_anchored else []
     return [*columns, Column("|error|", scales.error, "error")] if with_error else columns
 
 
@@ -117,7 +120,7 @@ def contact_sheet(
         path: the file; its folder must exist.
         title: over the sheet.
         scales: None = ``fit_scales(panels)``.
-        columns: right of the image; None = depth, sigma and, where a panel has one, the error.
+        columns: right of the image; None = depth, sigma and, where a panel has one, sqrt(B) and the error.
         dpi: pixels per inch.
 
     Returns:
@@ -135,7 +138,10 @@ def contact_sheet(
 
     used = fit_scales(panels) if scales is None else scales
     if columns is None:
-        columns = map_columns(used, with_error=any(p.error is not None for p in panels))
+        with_error, with_anchored = (
+            any(getattr(p, name) is not None for p in panels) for name in ("error", "anchored")
+        )
+        columns = map_columns(used, with_error=with_error, with_anchored=with_anchored)
     grid = _Grid.of(panels, columns=1 + len(columns), title=bool(title))
     figure = Figure(figsize=(grid.width, grid.height), dpi=dpi, facecolor="white")
     canvas = FigureCanvasAgg(figure)

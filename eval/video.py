@@ -22,7 +22,7 @@ PAPER, INK, FAINT = (255, 255, 255), (26, 26, 26), (107, 107, 107)
 def preview_frame(
     panel: FramePanel, scales: PanelScales, *, cell_height: int | None = None, with_error: bool | None = None
 ) -> NDArray[np.uint8]:
-    """One video frame: image | depth | sigma | error with names, colour bars and units.
+    """One video frame: image | depth | sigma | error with names, colour bars and units; sqrt(B) where the panel has it.
 
     Args:
         panel: the frame.
@@ -38,7 +38,8 @@ def preview_frame(
     """
     from PIL import Image, ImageDraw
 
-    columns = map_columns(scales, with_error=panel.error is not None if with_error is None else with_error)
+    error = panel.error is not None if with_error is None else with_error
+    columns = map_columns(scales, with_error=error, with_anchored=panel.anchored is not None)
     height, width = panel.depth.shape
     if cell_height is None:
         cell_height = min(240, max(1, round(427 * height / width)))
