@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Lucas-Kanade on patches of 11 x 11 px over four octaves, at most ten iterations each: half the time of OpenCV's
-# defaults, and what it follows differs by hundredths of a pixel.
-_PATCH, _LEVELS, _ITERATIONS, _CONVERGED = 11, 3, 10, 0.03
+# Lucas-Kanade on patches 8 px wide and 16 high over four octaves, at most ten iterations each. OpenCV computes eight
+# pixels of a row at once and the rest one by one: a patch of 11 x 11, no larger, takes longer by a third. On six
+# rendered tours this one followed as many corners as that, with errors as small or smaller.
+_PATCH, _LEVELS, _ITERATIONS, _CONVERGED = (8, 16), 3, 10, 0.03
 # [px] Width from which corners are looked for at half the size.
 _HALVED_FROM = 480
 
@@ -33,7 +34,7 @@ def follow(
     import cv2
 
     start = position.astype(np.float32)[:, None]
-    options: dict[str, Any] = {"winSize": (_PATCH, _PATCH), "criteria": (3, _ITERATIONS, _CONVERGED)}
+    options: dict[str, Any] = {"winSize": _PATCH, "criteria": (3, _ITERATIONS, _CONVERGED)}
     # The flag asks for the patch's eigenvalue in place of the difference of the patches, which would be computed in a
     # pass of its own; neither is used.
     quick = cv2.OPTFLOW_LK_GET_MIN_EIGENVALS
