@@ -187,7 +187,7 @@ class UfMStarConfig(_Checked):
     # Anchors (an extension, not in the paper: ``anchors``, ``evidence``)
     anchored: bool = False
     anchor_half_life: float = _number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
-    anchor_shrinkage: float = _number(5.0, "kappa", "anchors", 0.0, open_low=True)
+    anchor_shrinkage: float = _number(2.0, "kappa", "anchors", 0.0, open_low=True)
 
     # State
     features: int = _number(0, "dim H - 1", "1", 0)

@@ -30,8 +30,10 @@ class TrackerConfig:
         spacing: least distance between two corners [px] in an image 640 wide; it follows the width.
         back_tolerance: a corner tracked forward and back must return this near to where it was [px].
         pixel_noise: standard deviation of a tracked position [px], poses' errors included.
-        max_error: largest root mean square reprojection error of a track [px].
-        max_relative_sigma: largest standard deviation of the depth, as a share of it: less parallax is no anchor.
+        max_error: largest root mean square reprojection error of a track [px]. Poses err too; a track that fits
+            worse than ``pixel_noise`` gets a variance by as much larger.
+        max_relative_sigma: largest standard deviation of the depth, as a share of it: less parallax is no anchor. Not
+            less than needed: what is far away has little parallax, and to leave it out would hide the error there.
 
     Raises:
         ValueError: an impossible value.
@@ -39,12 +41,12 @@ class TrackerConfig:
 
     max_points: int = 300
     window: int = 10
-    min_views: int = 3
+    min_views: int = 2
     spacing: float = 14.0
     back_tolerance: float = 0.5
     pixel_noise: float = 1.0
-    max_error: float = 1.5
-    max_relative_sigma: float = 0.1
+    max_error: float = 3.0
+    max_relative_sigma: float = 0.3
 
     def __post_init__(self) -> None:
         for name, least in (("max_points", 1), ("window", 2), ("min_views", 2)):

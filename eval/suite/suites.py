@@ -169,7 +169,7 @@ def _ablation_anchors(base: str) -> Suite:
     points += [{**_ANCHORED, "anchor_count": count} for count in (5, 20)]
     points += [{**_ANCHORED, "track_noise": v} for v in TRACK_NOISES]
     points += [{**_ANCHORED, "anchor_half_life": v} for v in (10.0, 100.0)]
-    points += [{**_ANCHORED, "anchor_shrinkage": v} for v in (1.0, 20.0)]
+    points += [{**_ANCHORED, "anchor_shrinkage": v} for v in (1.0, 5.0, 20.0)]
     points += [{**more, **noise} for noise in noises for more in ({}, _ANCHORED)]
     # What anchors a row does not vary along a figure: it has a line for each.
     sweep = tuple(name for name in _varied(points) if name != "anchors")
