@@ -29,7 +29,7 @@ class RunAnchors:
         self._tracker = LandmarkTracker()
         self._before = self._tracker.state()
         self._tracked = self._found = 0
-        self.identity = self._tracker.config.to_dict()
+        self.identity = {"anchors": "tracked", "tracker": self._tracker.config.to_dict()}
 
     def of(self, frame: Frame) -> Anchors | None:
         """Those of the next frame, [1, N] in its image's pixels; None where it has no image.

@@ -43,7 +43,7 @@ class Source(ABC):
         self.ufm = ufm
         self.device = device
         self.anchors = RunAnchors() if ufm.config.anchored else None
-        self.identity = dict(identity) | ({} if self.anchors is None else {"anchors": self.anchors.identity})
+        self.identity = dict(identity) | ({} if self.anchors is None else self.anchors.identity)
         self.clock = Stopwatch(device)
         self.clock.watch(ufm, "ufm")
 

@@ -1,0 +1,298 @@
+"""``ufmstar run --anchors``: it equals a loop by hand, whatever interrupts it, and says which frames had none."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from runs import Brightness, job_of, outputs, read_summary
+
+from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
+from ufmstar_torch.eval import run_anchors
+from ufmstar_torch.eval.pictures import Finished
+from ufmstar_torch.eval.plots import fit_scales, map_columns
+from ufmstar_torch.eval.run import run
+from ufmstar_torch.eval.run_folder import FolderError
+from ufmstar_torch.eval.run_job import job_from
+from ufmstar_torch.eval.run_maps import MapSource, PredictedMap
+from ufmstar_torch.eval.run_options import parse_run, run_parser
+from ufmstar_torch.eval.run_source import NetworkSource
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.summary import table
+from ufmstar_torch.eval.video import preview_frame
+from ufmstar_torch.eval.writers import read_frame
+from ufmstar_torch.models import Preprocess
+from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
+
+TOUR = "tour:5?frames=8&size=120x160"
+ON = UfMStarConfig(on_bad_frame="skip", anchored=True)
+OFF = ON.replace(anchored=False)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def tour():
+    """Eight rendered frames, 120x160, in memory. Nobody may change them."""
+    sequence = open_sequence(TOUR)
+    frames = list(sequence)
+    entries = [
+        dataclasses.replace(entry, load_image=lambda f=f: f.image, load_depth=lambda f=f: f.depth)
+        for entry, f in zip(sequence.entries, frames, strict=True)
+    ]
+    return dataclasses.replace(sequence, entries=tuple(entries))
+
+
+def with_entries(sequence, change):
+    """Every frame's entry changed by a function of its number; None leaves it out."""
+    changed = [change(i, entry) for i, entry in enumerate(sequence.entries)]
+    return dataclasses.replace(sequence, entries=tuple(entry for entry in changed if entry is not None))
+
+
+def too_far(frame, stop_at=None):
+    """Depth that is 30 % too far, of every second pixel, with a variance of 1 cm^2."""
+    if frame.index == stop_at:
+        raise KeyboardInterrupt
+    depth = 1.3 * frame.depth[::2, ::2]
+    return PredictedMap(depth, np.full_like(depth, 1e-4), np.diag([0.5, 0.5, 1.0]) @ frame.intrinsics)
+
+
+def map_job(sequence, config=ON, read=too_far, **options):
+    return job_of(sequence, MapSource(read, config, CPU, {"maps": "30 % too far"}), **options)
+
+
+@pytest.fixture(scope="module")
+def finished(tour, tmp_path_factory):
+    """An undisturbed run: its folder and summary."""
+    out = tmp_path_factory.mktemp("finished") / "out"
+    return out, run(map_job(tour), out)
+
+
+def records(out):
+    return [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
+
+
+def same(stored, expected):
+    np.testing.assert_array_equal(stored, expected[0].numpy())
+
+
+# ---- the same as by hand ----
+
+
+def test_a_run_with_maps_equals_a_loop_by_hand(tour, finished):
+    out, summary = finished
+    ufm, tracker, expected = UfMStar(ON), LandmarkTracker(), []
+    for frame, record in zip(tour, records(out), strict=True):
+        found = too_far(frame)
+        landmarks = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        K, depth, a = (torch.from_numpy(x)[None] for x in (found.intrinsics, found.depth, found.variance))
+        anchors = landmarks.anchors(frame.intrinsics, K)
+        result = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, a, anchors=anchors)
+        stored = read_frame(out / "frames" / f"{frame.name}.npz")
+        for name in ("variance", "disagreement", "anchored", "bias"):
+            np.testing.assert_allclose(stored[name], getattr(result, name)[0].numpy(), rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(
+            stored["variance"], stored["disagreement"] + stored["anchored"] + np.float32(1e-4), rtol=1e-5
+        )
+        used = int(result.statistics.anchors_used[0])
+        counts = [landmarks.tracked, len(landmarks.depth), int(result.statistics.anchors[0]), used]
+        assert [record["anchors"][key] for key in ("tracked", "found", "usable", "used")] == counts
+        assert (record["anchors"]["without"] is None) == (used > 0)
+        assert record["mean_anchored"] == pytest.approx(float(result.anchored[result.valid].double().mean()), rel=1e-4)
+        assert record["mean_bias"] == pytest.approx(float(result.bias[result.valid].double().mean()), rel=1e-4)
+        expected.append([*counts, record["mean_anchored"], record["mean_bias"]])
+    told = summary["anchors"]
+    means = [told[f"{key}_per_frame"] for key in ("tracked", "found", "usable", "used")]
+    np.testing.assert_allclose([*means, told["mean_anchored"], told["mean_bias"]], np.mean(expected, axis=0), rtol=1e-6)
+    used = [record["anchors"]["used"] for record in records(out)]
+    assert sum(told["frames_without"].values()) == used.count(0)
+    assert used[told["frames_before_the_first"]] > 0 == sum(used[: told["frames_before_the_first"]])
+    # The last frame knows of the 30 %, if roughly, in images as small as these: 1/1.3 - 1 = -.23.
+    assert -0.35 < records(out)[-1]["mean_bias"] < -0.12
+    assert summary["time"]["median_ms"]["anchors"] > 0
+
+
+def test_a_run_with_a_network_equals_a_loop_by_hand(tour, tmp_path):
+    preprocess = Preprocess(size=(60, 80))
+    pipeline, by_hand = (UncertainDepth(Brightness(), ON, preprocess=preprocess) for _ in range(2))
+    run(job_of(tour, NetworkSource(pipeline, CPU, {})), tmp_path / "out")
+    tracker = LandmarkTracker()
+    for frame in tour:
+        K = torch.from_numpy(frame.intrinsics)
+        anchors = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics).anchors(frame.intrinsics, K)
+        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+        result = by_hand(image, torch.from_numpy(frame.T_world_cam)[None], K[None], anchors=anchors)
+        stored = read_frame(tmp_path / "out" / "frames" / f"{frame.name}.npz")
+        same(stored["variance"], result.variance)
+        same(stored["anchored"], result.ufm.anchored)
+    assert stored["anchored"].max() > 0
+
+
+def test_without_anchors_nothing_is_said_of_them(tour, tmp_path):
+    summary = run(map_job(tour, OFF, frames=slice(2)), tmp_path / "out")
+    assert summary["anchors"] is None
+    assert "anchors" not in table(summary)
+    assert summary["time"]["median_ms"]["anchors"] is None
+    assert not {"anchors", "mean_anchored", "mean_bias"} & records(tmp_path / "out")[0].keys()
+    stored = read_frame(tmp_path / "out" / "frames" / f"{tour.names[0]}.npz")
+    assert stored.keys() == {"depth", "variance", "disagreement", "valid"}
+
+
+# ---- frames without anchors ----
+
+
+def test_a_standing_camera_is_plain_ufm_star_and_the_summary_says_so(tour, tmp_path):
+    still = with_entries(tour, lambda i, e: dataclasses.replace(tour.entries[0], name=e.name) if i < 4 else None)
+    summary = run(map_job(still), tmp_path / "on")
+    run(map_job(still, OFF), tmp_path / "off")
+    told = summary["anchors"]
+    assert told["used_per_frame"] == told["found_per_frame"] == told["mean_anchored"] == told["mean_bias"] == 0
+    assert told["tracked_per_frame"] > 20
+    assert told["frames_without"] == {
+        "no corner followed from the frame before": 1,
+        "no parallax, or no track that fits the poses": 3,
+    }
+    assert "without anchors: 4 of 4 frames (1 x no corner followed" in table(summary)
+    assert table(summary).count("plain UfM* in the first 4") == 1
+    for name in still.names:
+        on, off = (read_frame(tmp_path / folder / "frames" / f"{name}.npz") for folder in ("on", "off"))
+        np.testing.assert_array_equal(on["variance"], off["variance"])
+
+
+def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
+    """The last two frames have no image: their B is what was learnt before."""
+    blind = with_entries(tour, lambda i, e: dataclasses.replace(e, load_image=None) if i >= 6 else e)
+    summary = run(map_job(blind), tmp_path / "out")
+    before, *rest = records(tmp_path / "out")[5:]
+    for record in rest:
+        assert record["anchors"]["used"] == record["anchors"]["tracked"] == 0
+        assert 0.6 < record["mean_anchored"] / before["mean_anchored"] < 1.5
+    before = summary["anchors"]["frames_before_the_first"]
+    assert before < 6
+    assert "3 x no corner followed" in table(summary)
+    assert f"plain UfM* in the first {before}, then with what was learnt before" in table(summary)
+
+
+@pytest.mark.parametrize(
+    ("counts", "why"),
+    [
+        ((0, 0, 0), "no corner followed"),
+        ((9, 0, 0), "no parallax"),
+        ((9, 4, 0), "none lies on a pixel with a depth"),
+        ((9, 4, 4), "contradict each other"),
+    ],
+)
+def test_why_a_frame_has_none(counts, why):
+    assert why in run_anchors.why_none(*counts)
+
+
+def test_a_frame_with_a_bad_pose_does_not_spoil_the_tracks(tour, tmp_path):
+    def spoil(i, entry):
+        return dataclasses.replace(entry, T_world_cam=1.1 * entry.T_world_cam) if i == 4 else entry
+
+    summary = run(map_job(with_entries(tour, spoil)), tmp_path / "spoiled")
+    run(map_job(with_entries(tour, lambda i, e: None if i == 4 else e)), tmp_path / "without")
+    assert summary["frames"]["done"] == 7
+    spoiled, without = outputs(tmp_path / "spoiled"), outputs(tmp_path / "without")
+    names = [f"frames/{name}.npz" for i, name in enumerate(tour.names) if i != 4]
+    assert all(spoiled[name] == without[name] for name in names)
+    assert records(tmp_path / "spoiled")[-1]["anchors"]["used"] > 3
+
+
+# ---- going on ----
+
+
+@pytest.mark.parametrize("at", [1, 5])
+def test_a_stopped_run_goes_on_with_the_same_tracks(tour, finished, tmp_path, at):
+    out = tmp_path / "out"
+    stopped = run(map_job(tour, read=lambda frame: too_far(frame, stop_at=at)), out)
+    assert (stopped["state"], stopped["frames"]["done"]) == ("interrupted", at)
+    assert stopped["anchors"]["used_per_frame"] == np.mean([record["anchors"]["used"] for record in records(out)])
+    assert run(map_job(tour), out, resume=True)["state"] == "finished"
+    assert outputs(out) == outputs(finished[0])
+
+
+def test_only_a_run_with_anchors_goes_on_with_anchors(tour, finished, tmp_path):
+    run(map_job(tour, OFF, frames=slice(2)), tmp_path / "out")
+    with pytest.raises(FolderError, match=r"other input: source.anchors was null, now .tracked"):
+        run(map_job(tour, frames=slice(2)), tmp_path / "out", resume=True)
+    job = map_job(tour)
+    job.source.identity["tracker"]["window"] = 9
+    with pytest.raises(FolderError, match=r"other input: source.tracker.window was 10, now 9"):
+        run(job, finished[0], resume=True)
+
+
+# ---- the command ----
+
+
+def test_the_flag(tmp_path, capfd):
+    words = ["run", TOUR, "--depth", "self", "--anchors", "--ufm.disagreement", "overlap", "--no-video", "--no-sheet"]
+    assert cli.main([*words, "--frames", ":5", "--out", str(tmp_path / "a")]) == 0
+    told = capfd.readouterr().out
+    summary = read_summary(tmp_path / "a")
+    assert summary["settings"]["anchors"] is True
+    assert summary["settings"]["ufm"]["anchored"] is True
+    assert summary["settings"]["ufm"]["disagreement"] == "overlap"
+    assert "UfM*, anchored  " in told
+    used, found = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
+    assert f"anchors: {used:.1f} used a frame, of {found:.1f} triangulated" in told
+    # Perfect depth has no bias to find; tracks in images as small as these err by some per cent.
+    assert abs(summary["anchors"]["mean_bias"]) < 0.1
+    assert summary["anchors"]["mean_anchored"] < 0.1
+
+
+def test_pictures_have_a_column_for_what_anchors_add(tour, finished, tmp_path):
+    out, done = finished[0], records(finished[0])
+    panel = Finished(out, tour, done, with_error=True).panel(7)
+    stored = read_frame(out / "frames" / f"{tour.names[7]}.npz")
+    np.testing.assert_array_equal(panel.anchored, np.sqrt(stored["anchored"]))
+    assert panel.note == f"K = {done[7]['components']}, {done[7]['anchors']['used']} anchors"
+    scales = fit_scales([panel])
+    plain = dataclasses.replace(panel, anchored=None)
+    labels = [column.label for column in map_columns(scales, with_error=True, with_anchored=True)]
+    assert labels == ["depth", "σ", "√B", "|error|"]
+    width = panel.depth.shape[1] * 240 / panel.depth.shape[0]
+    gained = preview_frame(panel, scales).shape[1] - preview_frame(plain, scales).shape[1]
+    assert abs(gained - width) < 8
+
+
+def test_anchored_without_anchors_is_a_mistake(tmp_path, capfd):
+    words = ["run", TOUR, "--depth", "self", "--ufm.anchored", "true", "--out", str(tmp_path / "out")]
+    assert cli.main(words) == 2
+    assert "--ufm.anchored needs anchors: give --anchors instead" in capfd.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_images_and_opencv_are_needed(tour, monkeypatch, tmp_path):
+    words = [TOUR, "--depth", "self", "--anchors", "--out", str(tmp_path / "out")]
+    options = parse_run(run_parser(), words)
+    blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
+    monkeypatch.setattr("ufmstar_torch.eval.run_job.open_sequence", lambda *_, **__: blind)
+    with pytest.raises(ValueError, match=r"--anchors tracks corners of images, of which the sequence .* has none"):
+        job_from(options)
+    monkeypatch.setattr("ufmstar_torch.eval.run_job.open_sequence", lambda *_, **__: tour)
+    monkeypatch.setattr(run_anchors, "find_spec", lambda _: None)
+    with pytest.raises(ModuleNotFoundError, match=r"--anchors needs OpenCV: pip install 'ufmstar-torch\[eval\]'"):
+        job_from(options)
+
+
+# ---- the tracker's state ----
+
+
+def test_a_tracker_goes_on_from_its_state(tour):
+    whole, parts = LandmarkTracker(), LandmarkTracker()
+    for frame in tour:
+        fresh = LandmarkTracker()
+        fresh.load_state(parts.state())
+        parts = fresh
+        a, b = (t.update(frame.image, frame.T_world_cam, frame.intrinsics) for t in (whole, parts))
+        for name in ("pixel", "depth", "variance", "tracked"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert len(a.depth) > 10
+    kept = parts.state()
+    parts.update(frame.image, frame.T_world_cam, frame.intrinsics)
+    assert int(kept["view"]) == int(parts.state()["view"]) - 1, "a copy"
+    with pytest.raises(ValueError, match="state must be of 9 points in 10 views, got 300 in 10"):
+        LandmarkTracker(TrackerConfig(max_points=9)).load_state(kept)
