@@ -1,0 +1,102 @@
+"""docs/anchors.md: every piece of code on the page runs, in order, and finds what it should."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import scenes
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.eval.run_options import run_parser
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "anchors.md"
+H, W = 48, 64
+TOO_FAR = 1.25
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+
+
+def seen_points(truth, K, v, u):
+    """[N, 3] what the pixels (u, v) of a depth map show, in the camera's frame."""
+    z = truth[v, u]
+    return np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], axis=-1)
+
+
+def video():
+    """Images of a rendered room, and depth at half their size that is a quarter too far."""
+    from ufmstar_torch.eval.sequences import open_sequence
+
+    for frame in open_sequence("tour:5?frames=6&size=120x160"):
+        K_map = resize_intrinsics(torch.from_numpy(frame.intrinsics), (120, 160), (60, 80))
+        depth = torch.from_numpy(TOO_FAR * frame.depth[::2, ::2])
+        yield frame.image, depth, torch.from_numpy(frame.T_world_cam), frame.intrinsics, K_map
+
+
+def two_cameras():
+    """What the page takes for given: a map of 30 landmarks for one camera, a lidar of 20 beams beside the other."""
+    depths, poses, K = scenes.sequence(2, H, W, 0.0)
+    rng = np.random.default_rng(0)
+    v, u = rng.permutation(np.argwhere(depths[0] > 0))[:30].T
+    in_world = seen_points(depths[0], K, v, u) @ poses[0][:3, :3].T + poses[0][:3, 3]
+    T_cam_lidar = scenes.look((0.1, -0.05, 0.02), 0.1)
+    row, columns = H // 2, np.linspace(4, W - 5, 20).astype(int)
+    in_camera = seen_points(depths[1], K, np.full(20, row), columns)
+    in_lidar = (in_camera - T_cam_lidar[:3, 3]) @ T_cam_lidar[:3, :3]
+    ranges = np.linalg.norm(in_lidar, axis=1)
+    beams = in_lidar / ranges[:, None]
+    ranges[[3, 7]] = np.nan
+    given = {
+        "depth": TOO_FAR * np.stack(depths),
+        "pose": np.stack(poses),
+        "K_map": K,
+        "landmarks": in_world,
+        "sigma_landmarks": np.full(30, 0.01),
+        "T_cam_lidar": T_cam_lidar,
+        "beams": beams,
+        "ranges": ranges,
+    }
+    wanted = [(u, v, depths[0][v, u]), (columns, np.full(20, row), depths[1][row, columns])]
+    return {name: torch.from_numpy(value) for name, value in given.items()}, wanted
+
+
+def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tracked, own, again = blocks("python")
+    scope = {"video": list(video())}
+    exec(compile(tracked, PAGE.name, "exec"), scope)
+    assert scope["out"].statistics.anchors_used.item() > 0
+    assert float(scope["out"].anchored.nan_to_num(0).max()) > 0
+
+    given, wanted = two_cameras()
+    scope = dict(given)
+    exec(compile(own, PAGE.name, "exec"), scope)
+    found = scope["anchors"]
+    assert found.valid.sum(1).tolist() == [30, 18]
+    for stream, (u, v, z) in enumerate(wanted):
+        use = found.valid[stream, : len(z)].numpy()
+        pixel = np.stack([u, v], axis=-1)[use]
+        np.testing.assert_allclose(found.pixel[stream, : len(z)].numpy()[use], pixel, atol=1e-6)
+        np.testing.assert_allclose(found.depth[stream, : len(z)].numpy()[use], z[use], rtol=1e-9)
+    out = scope["out"]
+    assert "[30, 18]" in capsys.readouterr().out
+    # Both streams learn of r = 1/1.25 - 1 = -.2, less what shrinkage leaves of few anchors.
+    for stream in (0, 1):
+        assert -0.21 < float(out.bias[stream].nanmean()) < -0.13
+
+    exec(compile(again, PAGE.name, "exec"), scope)
+    first = scope["ufm"](given["depth"], given["pose"], given["K_map"])
+    assert float(first.bias.nanmean()) == pytest.approx(float(out.bias.nanmean()), rel=0.2)
+    assert bool((first.disagreement.nan_to_num(0) == 0).all()), "a first view"
+
+
+def test_the_flag_on_the_page_is_one():
+    (command,) = [block for block in blocks("bash") if block.startswith("ufmstar run")]
+    options = run_parser().parse_args(command.split()[2:])
+    assert options.anchors is True
+    assert options.model == "fastdepth"
