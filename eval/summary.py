@@ -256,8 +256,10 @@ def _told(anchors: Mapping[str, Any], frames: int) -> list[str]:
     if not without:
         return [line]
     why = "; ".join(f"{count} x {reason}" for reason, count in without.items())
-    told = f"without anchors: {sum(without.values())} of {frames} frames ({why}); plain UfM* in the first {before}"
-    return [line, told + (", then with what was learnt before" if sum(without.values()) > before else "")]
+    later = sum(without.values()) - before
+    told = f"without anchors: {before + later} of {frames} frames ({why})"
+    told += f"; {before} before the first anchors: plain UfM*" if before else ""
+    return [line, told + (f"; {later} later: with what was learnt before" if later else "")]
 
 
 def number(value: float | None) -> str:

@@ -155,7 +155,7 @@ def test_a_standing_camera_is_plain_ufm_star_and_the_summary_says_so(tour, tmp_p
         "no parallax, or no track that fits the poses": 3,
     }
     assert "without anchors: 4 of 4 frames (1 x no corner followed" in table(summary)
-    assert table(summary).count("plain UfM* in the first 4") == 1
+    assert "; 4 before the first anchors: plain UfM*\n" in table(summary)
     for name in still.names:
         on, off = (read_frame(tmp_path / folder / "frames" / f"{name}.npz") for folder in ("on", "off"))
         np.testing.assert_array_equal(on["variance"], off["variance"])
@@ -172,7 +172,10 @@ def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
     before = summary["anchors"]["frames_before_the_first"]
     assert before < 6
     assert "3 x no corner followed" in table(summary)
-    assert f"plain UfM* in the first {before}, then with what was learnt before" in table(summary)
+    later = sum(summary["anchors"]["frames_without"].values()) - before
+    assert f"; {before} before the first anchors: plain UfM*; {later} later: with what was learnt before" in table(
+        summary
+    )
 
 
 @pytest.mark.parametrize(
