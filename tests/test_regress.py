@@ -15,7 +15,7 @@ import scenes
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
-from ufmstar_torch.regress import regress, regress_image, sample_pixels, smooth
+from ufmstar_torch.regress import regress, regress_image, sample_pixels, shares, smooth
 
 K = torch.tensor(scenes.intrinsics(40, 56))[None]
 EXACT = UfMStarConfig(prior_mean=0.3, prior_weight=2.0)
@@ -49,6 +49,22 @@ def test_agrees_with_the_oracle(config, seed):
             )
             assert result.disagreement[b, p].item() == pytest.approx(value, rel=1e-9)
             np.testing.assert_allclose(result.features[b, p].numpy(), features, rtol=1e-9, atol=1e-300)
+
+
+@pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
+def test_shares_make_up_the_regression(config):
+    m = mixture(2, 9, 4, features=2)
+    m = m.replace(weight=m.weight * (torch.arange(9) != 5))  # an empty slot
+    points = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    points[:, :9] = m.mean + 0.02
+    points[:, -1] = 1e3  # far from everything: nothing but the prior
+    share, result = shares(m, points, config), regress(m, points, config)
+    assert share.min() >= 0
+    assert (share[..., 5] == 0).all()
+    assert share[:, -1].max() < 1e-300
+    value = (share * m.disagreement[:, None]).sum(-1) + (1 - share.sum(-1)) * config.prior_mean
+    torch.testing.assert_close(value, result.disagreement, rtol=1e-11, atol=0)
+    torch.testing.assert_close(share @ m.features, result.features, rtol=1e-11, atol=1e-300)
 
 
 @pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])

@@ -19,6 +19,8 @@ from ufmstar_torch.mixture import GaussianMixture
 
 # Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32.
 _CHUNK = 2**22
+# An exponent below which a density is as good as none beside any prior's; exp is many times slower where it underflows.
+_LEAST_EXPONENT = -700.0
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,18 @@ def shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> T
     Returns:
         [B, P, K] in [0, 1]; 1 less their sum is the prior's.
     """
-    density = _density(mixture, *_densities(mixture, points.dtype), points, config)
-    return density / (density.sum(-1, keepdim=True) + config.prior_weight)
+    x, mean = points.double(), mixture.mean.double()
+    whitening, exponent = _densities(mixture, torch.float64)
+    exponent = exponent[:, None].repeat(1, points.shape[1], 1)
+    for row in range(3):  # matrix products: in double precision they are exact enough, and all in a fifth of the time
+        L = whitening[:, :, row]
+        y = (x @ L.mT).sub_((L * mean).sum(-1)[:, None])
+        exponent.addcmul_(y, y, value=-0.5)
+    density = exponent.clamp_min_(_LEAST_EXPONENT).exp_().mul_(mixture.valid[:, None])
+    if config.regression == "neighbourhood":
+        density = density * _near(mixture, x[:, :, None] - mean[:, None], config)
+    evidence = density.sum(-1, keepdim=True) + config.prior_weight
+    return density.div_(evidence).to(points.dtype)
 
 
 def _densities(mixture: GaussianMixture, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
