@@ -14,6 +14,7 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import AnchorInput, Anchors
 from ufmstar_torch.evidence import Evidence, inliers, means, observe
+from ufmstar_torch.read_out import anchored_term
 
 HEIGHT, WIDTH = 48, 64
 ON = UfMStarConfig(anchored=True)
@@ -112,12 +113,29 @@ def test_the_anchors_own_noise_is_no_error_of_the_network():
 
 def test_the_lesson_outlasts_the_anchors():
     depths, poses, K = scenes.sequence(30, HEIGHT, WIDTH, 0.0)
-    rng, ufm = np.random.default_rng(0), UfMStar(ON)
+    rng, ufm = np.random.default_rng(0), UfMStar(ON.replace(disagreement="overlap"))
     for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
         anchors = anchors_of(truth, 100, rng) if i < 10 else None
         output = ufm(torch.tensor(truth * 1.2)[None], torch.tensor(T), torch.tensor(K), anchors=anchors)
-    relative = (output.anchored / output.depth.square())[output.valid]
-    assert 0.3 * (1 / 1.2 - 1) ** 2 < float(relative.mean()) < 1.5 * (1 / 1.2 - 1) ** 2
+    r2 = (1 / 1.2 - 1) ** 2
+    claimed = (output.variance / output.depth.square())[output.valid]
+    assert 0.8 * r2 < float(claimed.median()) < 1.2 * r2
+    plain = (output.disagreement / output.depth.square())[output.valid]
+    assert float(plain.median()) < 0.5 * r2, "without the lesson less is claimed"
+
+
+def test_what_is_claimed_is_the_larger_of_disagreement_and_lesson():
+    ufm, outputs, depths = walk(lambda z, i, rng: z * 1.2 * (1 + 0.1 * rng.standard_normal()), frames=10)
+    once, often = outputs[0], outputs[-1]
+    # Seen once, nothing was compared: M is 0 there, not because views agree, and anchors alone speak.
+    assert float(once.disagreement[once.valid].max()) == 0
+    expected = float((once.depth[0] - torch.tensor(depths[0])).square()[once.valid[0]].mean())
+    assert 0.8 < float(once.variance[once.valid].mean()) / expected < 1.1  # a little is shrunk away
+    assert 0.05 < float((often.anchored[often.valid] == 0).double().mean()) < 0.95, "M is the larger in some places"
+    torch.testing.assert_close(often.variance, often.disagreement + often.anchored, rtol=0, atol=0, equal_nan=True)
+    d2, m = torch.tensor([[4.0, 4.0, 1.0]]), torch.tensor([[0.1, 0.9, 0.2]])
+    term = anchored_term(d2.sqrt(), torch.tensor([[0.2, 0.2, -0.3]]), m)
+    torch.testing.assert_close(term + m, torch.tensor([[0.8, 0.9, 0.2]]))
 
 
 def rows(values, valid=None, pixel=None):
@@ -138,12 +156,11 @@ def test_sums_and_means_by_hand(seed, memory, kappa):
     evidence = Evidence.empty(1, k, dtype=torch.float64, device="cpu")
     for _ in range(3):
         d, g = rng.uniform(1, 4, n), rng.uniform(1, 4, n)
-        s2, own, m = rng.uniform(0, 0.1, (3, n))
+        s2, own = rng.uniform(0, 0.1, (2, n))
         share = rng.uniform(0, 0.3, (n, k))
         evidence, used = observe(
             evidence,
             rows(list(zip(d, g, s2, own, strict=True))),
-            torch.tensor(m)[None],
             torch.tensor(share)[None],
             memory,
         )
@@ -151,7 +168,7 @@ def test_sums_and_means_by_hand(seed, memory, kappa):
         sums, total = sums * memory, total * memory
         for a in range(n):
             r = (g[a] - d[a]) / d[a]
-            row = np.array([1, r, r**2 - (s2[a] + own[a] + m[a]) / d[a] ** 2])
+            row = np.array([1, r, r**2 - (s2[a] + own[a]) / d[a] ** 2])
             total += row
             for c in range(k):
                 sums[c] += share[a, c] * row

@@ -1,14 +1,19 @@
 """What anchors teach: how far off the network has been lately, by component and overall.
 
-At an anchor (depth g, variance s^2) the prediction d has the relative error r = (g - d)/d. UfM* claims V_0 = M + A + E
-there. Were V_0 right, E[r^2] = (V_0 + s^2)/d^2. What is left over,
+At an anchor (depth g, variance s^2) the prediction d has the relative error r = (g - d)/d. Were the network's own
+variance A + E all there is, E[r^2] = (A + E + s^2)/d^2. What is left over,
 
-    e = r^2 - (s^2 + V_0)/d^2,
+    e = r^2 - (s^2 + A + E)/d^2,
 
-is the relative mean square error that neither the views' disagreement nor the network's own variance explains. It may
-be negative at one anchor; its mean over many is unbiased, since expectations are linear. So B = d^2 max(0, mean of e)
-makes V = V_0 + B agree with what was measured, on average; disagreement is not counted twice, because it is subtracted
-before, and neither is the anchors' own noise.
+is the relative mean square error that the network does not state itself. It may be negative at one anchor; its mean
+over many is unbiased, since expectations are linear. Part of d^2 e is what views disagree about, and M states that
+already: only what is beyond M is added,
+
+    B = max(0, d^2 mean(e) - M),        M + B = max(M, d^2 mean(e)),
+
+with M as it is now at the pixel. So nothing is counted twice: A, E and the anchors' noise are taken off before, M
+after. (M before, anchor by anchor, would leave nothing where M has not been measured yet: a surface seen once has M = 0
+because nothing was compared, and so has a point that no component explains.)
 
 Sums of (1, r, e) live beside the mixture, one row a component, and one for the stream as a whole. A component takes an
 anchor by its share in explaining the predicted point, w_k = pi_k N_k / (sum pi N + pi_0). Old evidence fades by a
@@ -95,15 +100,12 @@ def _take(value: Tensor, index: Tensor) -> Tensor:
     return torch.gather(value, 1, index.flatten(1)).view(index.shape)
 
 
-def observe(
-    evidence: Evidence, anchors: AnchorInput, disagreement: Tensor, share: Tensor, memory: float
-) -> tuple[Evidence, Tensor]:
+def observe(evidence: Evidence, anchors: AnchorInput, share: Tensor, memory: float) -> tuple[Evidence, Tensor]:
     """Let old evidence fade and add a frame's.
 
     Args:
         evidence: up to the frame before.
         anchors: of the frame.
-        disagreement: [B, N] M at the anchors' predicted points [m^2].
         share: [B, N, K] how much of each anchor's point a component explains, in [0, 1].
         memory: in (0, 1], by which the old evidence of a stream is multiplied when there is new.
 
@@ -113,7 +115,7 @@ def observe(
     used = inliers(anchors)
     d2 = anchors.predicted.square()
     r = anchors.depth / anchors.predicted - 1
-    e = r.square() - (anchors.variance + anchors.own_variance + disagreement) / d2
+    e = r.square() - (anchors.variance + anchors.own_variance) / d2
     rows = torch.stack([torch.ones_like(r), r, e], dim=-1)
     rows = torch.where(used[..., None], rows, torch.zeros_like(rows))
     dtype = evidence.overall.dtype

@@ -33,10 +33,20 @@ def learn(
         return evidence, none
     points = torch.gather(_points(frame).double(), 1, anchors.index[..., None].expand(*anchors.index.shape, 3))
     share = shares(mixture_cam, points, config)
-    disagreement = (share * mixture_cam.disagreement[:, None]).sum(-1) + (1 - share.sum(-1)) * config.prior_mean
     gamma = 0.5 ** (1 / config.anchor_half_life)
-    evidence, used = observe(evidence, anchors, disagreement, share, gamma)  # a faulty frame's anchors are not valid
+    evidence, used = observe(evidence, anchors, share, gamma)  # a faulty frame's anchors are not valid
     return evidence, used.sum(1)
+
+
+def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> Tensor:
+    """B = max(0, d^2 e - M) [m^2], what anchors found beyond the disagreement M; NaN where that is.
+
+    Args:
+        depth: d, any shape [m].
+        excess: e, likewise, the relative mean square error that the network does not state (``evidence``).
+        disagreement: M, likewise [m^2].
+    """
+    return (depth.square() * excess - disagreement).clamp_min(0)
 
 
 def _points(frame: FrameInput) -> Tensor:

@@ -16,6 +16,7 @@ from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
+from ufmstar_torch.read_out import anchored_term
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import StepOutput, UfMStarState, step
@@ -124,7 +125,7 @@ class UfMStar(StatefulModule):
         disagreement = out.disagreement.reshape(shape)
         bias, anchored = (None, None) if out.residual is None else out.residual.unbind(-1)
         if anchored is not None:
-            anchored = (frame.depth.square() * anchored.clamp_min(0)).reshape(shape)
+            anchored = anchored_term(frame.depth, anchored, out.disagreement).reshape(shape)
         variance = self._total(
             disagreement,
             None if frame.aleatoric is None else frame.aleatoric.reshape(shape),
@@ -183,7 +184,8 @@ class UfMStar(StatefulModule):
 
         anchored = None
         if out.residual is not None:
-            anchored = torch.gather(frame.depth.flatten(1), 1, index).square() * out.residual[..., 1].clamp_min(0)
+            at = torch.gather(frame.depth.flatten(1), 1, index)
+            anchored = anchored_term(at, out.residual[..., 1], out.disagreement)
         variance = self._total(out.disagreement, chosen(frame.aleatoric), chosen(frame.epistemic), anchored)
         count = used.sum(1)
         value = torch.where(used, variance, torch.zeros_like(variance))
