@@ -173,9 +173,8 @@ def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
     assert before < 6
     assert "3 x no corner followed" in table(summary)
     later = sum(summary["anchors"]["frames_without"].values()) - before
-    assert f"; {before} before the first anchors: plain UfM*; {later} later: with what was learnt before" in table(
-        summary
-    )
+    told = f"; {before} before the first anchors: plain UfM*; {later} later: with what was learnt before"
+    assert told in table(summary)
 
 
 @pytest.mark.parametrize(
