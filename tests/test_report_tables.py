@@ -292,7 +292,8 @@ class TestLoading:
     def test_settings_survive_their_dict(self, name):
         for row in suite_named(name).rows:
             assert setting_of(json.loads(json.dumps(row.setting.to_dict()))) == row.setting
-            assert row_label(row).startswith(row.method.name)
+            assert row_label(row).startswith(row.name)
+            assert row.name.replace("-Anchored", "") == row.method.name
 
     def test_what_is_no_evaluation(self, tmp_path):
         with pytest.raises(ResultsError, match=r"no folder of `ufmstar eval`: it has no eval\.json"):

@@ -19,6 +19,7 @@ from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.suite.anchor_source import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
 from ufmstar_torch.eval.suite.estimator import make_estimator, ufm_star_config
+from ufmstar_torch.eval.suite.method import BASES
 from ufmstar_torch.eval.suite.perturb import perturbed
 from ufmstar_torch.eval.suite.predicted import Predicted
 from ufmstar_torch.eval.suite.setting import DEFAULT, Setting
@@ -151,10 +152,19 @@ def test_suites_and_words(tmp_path):
         "DepthOnly",
         NAME,
         f"{NAME}, disagreement overlap",
-        f"{NAME}, anchored by tracked corners",
-        f"{NAME}, disagreement overlap, anchored by tracked corners",
-        f"{NAME}, anchored by tracked corners, depth corrected on",
+        "UfM*-Anchored-DepthOnly",
+        "UfM*-Anchored-DepthOnly, disagreement overlap",
+        "UfM*-Anchored-DepthOnly, depth corrected on",
         f"{NAME}, anchored by ground truth",
+    ]
+    every = suite_named("all-anchored")
+    assert set(every.bases) == set(BASES)
+    assert [r.label for r in every.rows if r.method.base == "evidential"] == [
+        "Evidential",
+        "UfM*-Evidential",
+        "UfM*-Evidential (disagreement overlap)",
+        "UfM*-Anchored-Evidential",
+        "UfM*-Anchored-Evidential (disagreement overlap)",
     ]
     assert suite_named("anchors", "ensemble").bases == ("ensemble",)
     counts = {r.setting.anchor_count for r in suite_named("ablation-anchors").rows if r.setting.anchors == "truth"}

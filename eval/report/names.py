@@ -140,4 +140,4 @@ def setting_label(values: Mapping[str, Any]) -> str:
 
 def row_label(row: Row) -> str:
     """A row for people: "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
-    return ", ".join(filter(None, (row.method.name, setting_label(row.setting.to_dict()))))
+    return ", ".join(filter(None, (row.name, setting_label(row.changed))))

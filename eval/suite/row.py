@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from ufmstar_torch.eval.suite.method import Method
-from ufmstar_torch.eval.suite.setting import DEFAULT, Setting
+from ufmstar_torch.eval.suite.setting import DEFAULT, TRACKED, Setting
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,19 @@ class Row:
         return f"{name}@{setting}" if setting else name
 
     @property
+    def name(self) -> str:
+        """The method's name, with what anchors it if that are tracked corners: "UfM*-Anchored-Ensemble"."""
+        anchored = self.setting.anchors == TRACKED
+        return self.method.name.replace("UfM*-", "UfM*-Anchored-", 1) if anchored else self.method.name
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """Settings that are not the default, less what ``name`` says."""
+        values = self.setting.to_dict()
+        return {name: value for name, value in values.items() if (name, value) != ("anchors", TRACKED)}
+
+    @property
     def label(self) -> str:
         """For people: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
-        changed = ", ".join(f"{name} {value}" for name, value in self.setting.to_dict().items())
-        return f"{self.method.name} ({changed})" if changed else self.method.name
+        changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
+        return f"{self.name} ({changed})" if changed else self.name

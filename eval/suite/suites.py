@@ -160,6 +160,14 @@ def _anchors(base: str) -> Suite:
     return Suite("anchors", "UfM* without and with anchors, and what disagreement compares", tuple(rows))
 
 
+def _all_anchored() -> Suite:
+    """Both disagreements, without and with anchors, of every network."""
+    overlap = {"disagreement": "overlap"}
+    points: tuple[Mapping[str, Any], ...] = ({}, overlap, _ANCHORED, {**overlap, **_ANCHORED})
+    rows = [row for base in BASES for row in (Row(Method(base)), *_points(base, points))]
+    return Suite("all-anchored", "UfM* without and with anchors, of every network", tuple(rows))
+
+
 def _ablation_anchors(base: str) -> Suite:
     """Noise and drift of poses with anchors and without, and what is particular to anchors."""
     noises = [{"rotation_noise": v} for v in ROTATIONS if v] + [{"translation_noise": v} for v in TRANSLATIONS if v]
@@ -236,6 +244,7 @@ _TABLES: dict[str, Callable[[], Suite]] = {
     "paper-table-4": _table_4,
     "depth-only": _depth_only,
     "all-methods": _all_methods,
+    "all-anchored": _all_anchored,
 }
 # With the base that the paper draws; it has no figures of the ablations, whose base is its main method's.
 _FIGURES: dict[str, tuple[Callable[[str], Suite], str]] = {
