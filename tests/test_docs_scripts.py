@@ -116,3 +116,17 @@ def test_the_scripts_run(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "nan" not in printed.split("both, 2 clips")[1]
     draw = script("draw_analysis")
     assert len(draw.draw_factors({"both": figures}).axes) == 2
+
+
+def test_constants_of_anchors(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each choice has a line with its figures; anchors change them, and a tracker that never answers does not."""
+    measure = script("measure_anchors")
+    monkeypatch.setattr(measure, "OF_UFM", ({}, measure.ANCHORED))
+    monkeypatch.setattr(measure, "OF_TRACKER", ({"min_views": 10},))
+    monkeypatch.setattr("sys.argv", ["measure_anchors.py", "--tours", "201:202", "--frames", "8"])
+    measure.main()
+    lines = [line.strip("| \n").split(" | ") for line in capsys.readouterr().out.splitlines()]
+    assert [name for name, *_ in lines] == ["UfM\\*", "anchored True", "min_views 10"]
+    plain, anchored, never = (np.array(values, dtype=float) for _, *values in lines)
+    assert (anchored != plain).all()
+    np.testing.assert_array_equal(never, plain)
