@@ -15,15 +15,17 @@ from typing import Any
 
 from ufmstar_torch.eval.benchmark_timing import pinned_threads
 
-# Milliseconds and ratios at 224 x 224, bytes and ratios for one room. For information.
+# Milliseconds and ratios at 224 x 224, bytes and ratios for one room; the tracker's mean processor time for 300 corners
+# at 640 x 480. For information.
 _TARGETS = {
     "spgf_ms": 1.5,
     "step_ms": 10.0,
     "step/resnet50": 1 / 3,
     "components_bytes": 30_000.0,
     "long_run_ratio": 1.2,
+    "tracker_cpu_ms": 3.0,
 }
-_TARGET_SIZE = 224
+_TARGET_SIZE, _TARGET_CORNERS = 224, 300
 _WARM_UP, _TORCH_ROUNDS = 3, 3
 
 
@@ -46,6 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--long", type=int, nargs="?", const=1000, help="also time this many frames in one room (1000 without a number)"
     )
+    parser.add_argument(
+        "--anchors", type=int, nargs="?", const=_TARGET_CORNERS, metavar="CORNERS",
+        help="also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one "
+        f"thread ({_TARGET_CORNERS} without a number; needs OpenCV)",
+    )  # fmt: skip
     parser.add_argument("--skip-compile", action="store_true", help="do not time compilation (some tens of seconds)")
     parser.add_argument("--json", type=Path, help="write the report here")
 
@@ -86,8 +93,8 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
         progress: is told what is measured next.
 
     Returns:
-        The report: settings, versions, hardware, "results" per size and backend, "compilation" and
-        "long_run" where asked for, and "targets".
+        The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run" and
+        "anchors" where asked for, and "targets".
 
     Raises:
         ValueError: an option is out of range.
@@ -110,6 +117,7 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
         "settings": {"threads": threads, "seed": options.seed, "config": config.to_dict()},
         "compilation": None,
         "long_run": None,
+        "anchors": None,
     }
     if "numba" in options.backends and not options.skip_compile:
         progress("compilation")
@@ -122,15 +130,18 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
             progress(f"long run of {options.long} frames")
             backend = config.replace(backend=options.backends[0])
             report["long_run"] = measure_long_run(source, backend, size=_TARGET_SIZE, frames=options.long)
+        if options.anchors is not None:
+            report["anchors"] = _anchors(options, config, source, progress)
     report["load_average"]["after"] = machine.load_average()
     report["targets"] = targets(report)
     return report
 
 
 def _check(options: argparse.Namespace) -> None:
-    for name in ("frames", "boxes", "history", "in_view"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(options, name)}")
+    for name in ("frames", "boxes", "history", "in_view", "anchors"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
     if min(options.sizes) < 16:
         raise ValueError(f"--sizes must be at least 16 pixels, got {options.sizes}")
 
@@ -175,10 +186,22 @@ def _results(
     return results
 
 
+def _anchors(
+    options: argparse.Namespace, config: Any, source: Any, progress: Callable[[str], object]
+) -> dict[str, Any]:
+    from ufmstar_torch.eval.benchmark_anchors import measure_anchors
+
+    progress(f"{options.anchors} corners and anchors")
+    return measure_anchors(
+        source, config.replace(backend=options.backends[0]), points=options.anchors, frames=options.frames,
+        history=options.history, in_view=options.in_view, step_size=_TARGET_SIZE,
+    )  # fmt: skip
+
+
 def targets(report: dict[str, Any]) -> list[dict[str, Any]]:
     """The figures that have a target, for information: name, value (None = not measured), target, met."""
     wanted = (r for r in report["results"] if r["size"] == _TARGET_SIZE and r["backend"] == "numba")
-    result, long_run = next(wanted, None), report["long_run"]
+    result, long_run, anchors = next(wanted, None), report["long_run"], report["anchors"]
     values: dict[str, float | None] = dict.fromkeys(_TARGETS)
     if result is not None:
         values["spgf_ms"] = result["kernels"]["spgf"]["median_ms"]
@@ -189,6 +212,8 @@ def targets(report: dict[str, Any]) -> list[dict[str, Any]]:
     if long_run is not None:
         values["long_run_ratio"] = long_run["ratio"]
         values["components_bytes"] = long_run["memory"]["in_use"]
+    if anchors is not None and anchors["points"] == _TARGET_CORNERS:
+        values["tracker_cpu_ms"] = anchors["tracker"]["update"]["cpu_mean_ms"]
     return [
         {"name": name, "value": value, "target": target, "met": None if value is None else value <= target}
         for (name, value), target in zip(values.items(), _TARGETS.values(), strict=True)

@@ -7,6 +7,8 @@ from typing import Any
 
 from ufmstar_torch.eval.benchmark_timing import STAGES
 
+_COLUMNS = ("median_ms", "p90_ms", "mean_ms", "min_ms", "cpu_median_ms", "cpu_p90_ms", "cpu_mean_ms", "cpu_min_ms")
+
 
 def format_report(report: Mapping[str, Any]) -> str:
     """A table per size and backend, the long run, and the targets."""
@@ -26,6 +28,8 @@ def format_report(report: Mapping[str, Any]) -> str:
         lines += ["", *_result(result)]
     if report["long_run"] is not None:
         lines += ["", *_long_run(report["long_run"])]
+    if report["anchors"] is not None:
+        lines += ["", *_anchors(report["anchors"])]
     lines += ["", f"{'target (for information)':26}{'value':>12}{'target':>12}"]
     for row in report["targets"]:
         told = {None: "not measured", True: "met", False: "missed"}[row["met"]]
@@ -74,6 +78,34 @@ def _long_run(run: Mapping[str, Any]) -> list[str]:
             f"{row['components']:8d}{row['in_view_mean']:9.0f}{row['segments_mean']:10.1f}{row['new_mean']:7.2f}"
         )
     return lines
+
+
+def _anchors(found: Mapping[str, Any]) -> list[str]:
+    tracker, step, (height, width) = found["tracker"], found["step"], found["tour"]["size"]
+    followed, ratio, extra = tracker["followed"], step["ratio"], step["extra_bytes"]
+    rows = {
+        "tracker, a frame": tracker["update"],
+        **{f"  {name}": times for name, times in tracker["parts"].items()},
+        "step without anchors": step["plain"],
+        "step with anchors": step["anchored"],
+    }
+    return [
+        f"anchors, one thread: {followed['mean']:.0f} corners followed at {width} x {height} ({followed['min']:.0f} to "
+        f"{followed['max']:.0f}), {tracker['landmarks']['mean']:.0f} of them triangulated, new ones found in "
+        f"{tracker['refills']:.0%} of {found['frames']} frames",
+        f"  {'[ms]':24}{'median':>9}{'90 %':>9}{'mean':>9}{'minimum':>9}{'CPU:':>6}{'median':>9}{'90 %':>9}{'mean':>9}"
+        f"{'minimum':>9}",
+        *(_anchor_row(name, times) for name, times in rows.items()),
+        f"  step of {step['size']} x {step['size']} with {step['anchors']} anchors ({step['used']['mean']:.0f} used) / "
+        f"without: {ratio['median']:.2f} ({ratio['q1']:.2f} to {ratio['q3']:.2f}; CPU {ratio['cpu_median']:.2f}); "
+        f"{extra['total'] / 1e3:.1f} kB more state ({extra['per_slot']} B a component), "
+        f"tracker {tracker['state_bytes'] / 1e3:.0f} kB",
+    ]
+
+
+def _anchor_row(name: str, times: Mapping[str, Any]) -> str:
+    wall, cpu = ("".join(f"{times[c]:9.2f}" for c in half) for half in (_COLUMNS[:4], _COLUMNS[4:]))
+    return f"  {name:24}{wall}{'':6}{cpu}"
 
 
 def _row(name: str, times: Mapping[str, Any]) -> str:

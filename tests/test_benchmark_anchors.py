@@ -1,0 +1,151 @@
+"""What anchors cost: as many corners as are told are really followed, parts add up, threads are put back."""
+
+from __future__ import annotations
+
+import functools
+import json
+
+import cv2
+import numba
+import numpy as np
+import pytest
+import torch
+
+from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.eval import benchmark
+from ufmstar_torch.eval.benchmark_anchors import PARTS, TrackedTour, measure_anchors, measure_tracker, one_thread
+from ufmstar_torch.eval.benchmark_frames import RenderedRoom
+from ufmstar_torch.eval.benchmark_report import format_report
+from ufmstar_torch.eval.benchmark_timing import pinned_threads
+from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
+
+TIMES = {f"{clock}{name}_ms" for clock in ("", "cpu_") for name in ("median", "p90", "mean", "min")}
+SMALL = TrackedTour(size=(120, 160), path_frames=400)
+
+
+def threads():
+    of_numba = numba.get_num_threads()  # the first call starts numba's threads, which may change torch's number
+    return of_numba, torch.get_num_threads(), cv2.getNumThreads()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_core():
+    """Beside other work, torch's second thread would wait by spinning."""
+    with pinned_threads(1):
+        yield
+
+
+@functools.cache
+def rendered():
+    return SMALL.frames(18)
+
+
+@pytest.fixture(scope="module")
+def report(one_core):
+    """What ``ufmstar bench --anchors 60`` measures, in small."""
+    words = "--sizes 48 --frames 6 --history 4 --in-view 5 --backends numba --skip-compile --threads 1"
+    options = benchmark.parse([*words.split(), "--anchors", "60"])
+    before, seen = threads(), rendered()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrackedTour, "frames", lambda _, count: seen[:count])
+        found = benchmark.run_benchmark(options)
+    assert threads() == before
+    return found
+
+
+def test_every_figure_is_there_and_possible(report):
+    found = json.loads(json.dumps(report["anchors"]))
+    tracker, step = found["tracker"], found["step"]
+    assert (found["points"], found["frames"], found["threads"]) == (60, 6, 1)
+    for times in (tracker["update"], step["plain"], step["anchored"]):
+        assert set(times) == TIMES | {"count"}
+        assert times["count"] == 6
+        assert 0 < times["min_ms"] <= times["median_ms"] <= times["p90_ms"]
+        assert 0 < times["cpu_min_ms"] <= times["cpu_mean_ms"]
+    assert set(tracker["parts"]) == set(PARTS)
+    assert min(times["min_ms"] for times in tracker["parts"].values()) >= 0
+    assert step["size"] == 224
+    assert step["used"]["max"] <= step["anchors"] == 60
+    assert step["used"]["min"] > 50, "the anchors contradict nobody"
+    assert 0 < step["ratio"]["q1"] <= step["ratio"]["median"] <= step["ratio"]["q3"]
+    # Three float32 sums for each slot allocated, 1024 or more, and three for the stream.
+    assert step["extra_bytes"]["per_slot"] == 12
+    assert step["extra_bytes"]["total"] >= 12 * step["components"]
+    assert step["extra_bytes"]["total"] % 12 == 0
+
+
+def test_corners_are_really_followed(report):
+    tracker = report["anchors"]["tracker"]
+    assert tracker["slots"] == 75
+    assert tracker["followed"]["min"] > 0
+    assert 40 < tracker["followed"]["mean"] <= 75, "about the number asked for"
+    assert 0 < tracker["landmarks"]["mean"] <= tracker["followed"]["mean"]
+    # Positions [75, 10, 2] and poses [10, 4, 4] in float64, who saw what, K, the gray image, an index.
+    assert tracker["state_bytes"] == 8 * (75 * 20 + 160 + 9 + 1) + 750 + 120 * 160
+
+
+def test_the_standard_scene_keeps_300_corners():
+    """Of its first two frames: what is found in one is followed into the next."""
+    tracker = LandmarkTracker(TrackerConfig(max_points=375))
+    frames = TrackedTour().frames(2)
+    assert [frame.image.shape for frame in frames] == [(480, 640, 3)] * 2
+    tracked = [tracker.update(f.image, f.T_world_cam, f.intrinsics).tracked for f in frames]
+    assert tracked[0] == 0
+    assert tracked[1] >= 300
+
+
+def test_parts_are_parts_of_the_whole(monkeypatch):
+    """With a clock that moves by one at every look, parts and the whole are numbers of looks."""
+    ticks = iter(range(10**6))
+    monkeypatch.setattr("ufmstar_torch.eval.benchmark_anchors.perf_counter", lambda: float(next(ticks)))
+    found = measure_tracker(rendered()[:14], 60)
+    # Following, searching and triangulating take a tick each; the whole update, from its own first look at the clock to
+    # its last, seven.
+    assert [found["parts"][name]["median_ms"] for name in PARTS] == [1e3, 1e3, 1e3, 4e3]
+    assert found["update"]["count"] == 2
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_opencv_gets_one_thread_and_its_own_back(fails):
+    before = threads()
+    cv2.setNumThreads(2)
+    try:
+        with one_thread():
+            assert threads() == (1, 1, 1)
+            if fails:
+                raise KeyError("anything")
+    except KeyError:
+        pass
+    finally:
+        restored = cv2.getNumThreads()
+        cv2.setNumThreads(before[2])
+    assert restored == 2
+    assert threads() == before
+
+
+def test_the_report_in_words(report):
+    told = format_report(report)
+    assert "corners followed at 640 x 480" in told
+    assert "step of 224 x 224 with 60 anchors" in told
+    assert "triangulating" in told
+    assert {row["name"]: row["met"] for row in report["targets"]}["tracker_cpu_ms"] is None, "the target is for 300"
+    as_if = {**report, "anchors": {**report["anchors"], "points": 300}}
+    value = {row["name"]: row["value"] for row in benchmark.targets(as_if)}["tracker_cpu_ms"]
+    assert value == report["anchors"]["tracker"]["update"]["cpu_mean_ms"]
+
+
+def test_impossible_numbers(capsys):
+    assert benchmark.main(["--anchors", "0", "--skip-compile"]) == 2
+    assert "--anchors must be at least 1" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="points must be at least 1"):
+        measure_anchors(
+            RenderedRoom(), UfMStarConfig(), points=0, frames=1, history=1, in_view=1, step_size=48, tour=SMALL
+        )
+    with pytest.raises(ValueError, match="the way has 400"):
+        SMALL.frames(401)
+
+
+def test_without_a_number_it_is_300():
+    assert benchmark.parse(["--anchors"]).anchors == 300
+    assert benchmark.parse([]).anchors is None
+    assert np.isclose(dict(benchmark._TARGETS)["tracker_cpu_ms"], 3.0)
