@@ -48,6 +48,7 @@ def report(one_core):
     before, seen = threads(), rendered()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackedTour, "frames", lambda _, count: seen[:count])
+        patch.setattr("ufmstar_torch.eval.benchmark_step.reference_networks", lambda size, fastdepth: ({}, {}))
         found = benchmark.run_benchmark(options)
     assert threads() == before
     return found
