@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.triangulate import DAMPING, STEPS, Triangulated
 
-compiled: Any = njit(cache=True, nogil=True)
+# NumPy's error model: no test for zero before every division, and hopeless geometry gives no exception but a covariance
+# that is not finite.
+compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 
 
 def triangulate(
@@ -21,85 +23,94 @@ def triangulate(
     point, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
     error, ahead = np.empty(n), np.empty(n, dtype=np.bool_)
     origin = T_world_cam[:, :3, 3].mean(0)
-    centre = T_world_cam[:, :3, 3] - origin
-    rotation = np.ascontiguousarray(T_world_cam[:, :3, :3])
-    _tracks(pixel, seen, rotation, centre, K, DAMPING, STEPS, point, covariance, error, ahead)
+    centre, rotation = T_world_cam[:, :3, 3] - origin, T_world_cam[:, :3, :3]
+    scale = np.diag([0.0, 0.0, 1.0])
+    scale[:2, :2] = K[:2, :2]
+    into = np.ascontiguousarray(scale @ rotation.transpose(0, 2, 1))
+    out_of = np.ascontiguousarray(rotation @ np.linalg.inv(scale))
+    _tracks(pixel - K[:2, 2], seen, into, out_of, centre, DAMPING, STEPS, point, covariance, error, ahead)
     return Triangulated(point + origin, covariance, error, ahead)
 
 
 @compiled
-def _tracks(pixel, seen, R, centre, K, damping, steps, point, covariance, error, ahead):
+def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance, error, ahead):
+    """Pixels [N, W, 2] are counted from the principal point. ``into`` [W, 3, 3] takes an offset from a camera to
+    (u z, v z, z) in its image, ``out_of`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
     normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    fx, fy, skew, cx, cy = K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2]
-    row_u, row_v, ray = np.empty(3), np.empty(3), np.empty(3)
     for n in range(pixel.shape[0]):
-        X = point[n]
-        for step in range(-1, steps + 1):
-            for i in range(3):
-                right[i] = 0.0
-                for j in range(3):
-                    normal[i, j] = 0.0
-            squares, count, front = 0.0, 0, True
-            for w in range(pixel.shape[1]):
-                if not seen[n, w]:
-                    continue
-                count += 1
-                if step < 0:  # the point nearest to all rays
-                    b = (pixel[n, w, 1] - cy) / fy
-                    a = (pixel[n, w, 0] - cx - skew * b) / fx
-                    length = (a * a + b * b + 1) ** 0.5
-                    for i in range(3):
-                        ray[i] = (R[w, i, 0] * a + R[w, i, 1] * b + R[w, i, 2]) / length
-                    for i in range(3):
-                        for j in range(3):
-                            across = (1.0 if i == j else 0.0) - ray[i] * ray[j]
-                            normal[i, j] += across
-                            right[i] += across * centre[w, j]
-                    continue
-                x, y, z = 0.0, 0.0, 0.0
-                for i in range(3):
-                    offset = X[i] - centre[w, i]
-                    x += R[w, i, 0] * offset
-                    y += R[w, i, 1] * offset
-                    z += R[w, i, 2] * offset
-                front = front and z > 0
-                if abs(z) <= 1e-9:
-                    z = 1e-9
-                u, v = (fx * x + skew * y) / z, fy * y / z
-                du, dv = u + cx - pixel[n, w, 0], v + cy - pixel[n, w, 1]
-                squares += du * du + dv * dv
-                for i in range(3):
-                    row_u[i] = (fx * R[w, i, 0] + skew * R[w, i, 1] - u * R[w, i, 2]) / z
-                    row_v[i] = (fy * R[w, i, 1] - v * R[w, i, 2]) / z
-                for i in range(3):
-                    right[i] += row_u[i] * du + row_v[i] * dv
-                    for j in range(3):
-                        normal[i, j] += row_u[i] * row_u[j] + row_v[i] * row_v[j]
-            scale = damping * max(normal[0, 0] + normal[1, 1] + normal[2, 2], 2.2250738585072014e-308)
-            for i in range(3):
-                normal[i, i] += scale
-            if step == steps:
-                error[n] = (squares / max(2 * count, 1)) ** 0.5
-                ahead[n] = front
-                _inverse(normal, covariance[n])
-                continue
-            _inverse(normal, inverse)
+        X, squares, count, front = point[n], 0.0, 0, True
+        _nearest(pixel[n], seen[n], out_of, centre, normal, right)
+        for step in range(steps + 1):
+            _inverse(normal, damping, inverse)
             for i in range(3):
                 change = inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
-                X[i] = change if step < 0 else X[i] - change
+                X[i] = change if step == 0 else X[i] - change
+            squares, count, front = _linearised(X, pixel[n], seen[n], into, centre, normal, right)
+        error[n] = (squares / max(2 * count, 1)) ** 0.5
+        ahead[n] = front
+        _inverse(normal, damping, covariance[n])
 
 
 @compiled
-def _inverse(S, out):
-    """Of a symmetric positive definite 3x3, by cofactors."""
-    a, b, c = S[0, 0], S[0, 1], S[0, 2]
-    d, e, f = S[1, 1], S[1, 2], S[2, 2]
+def _nearest(pixel, seen, out_of, centre, normal, right):
+    """Normal equations (upper triangle) of the point nearest to all rays."""
+    n00 = n01 = n02 = n11 = n12 = n22 = r0 = r1 = r2 = 0.0
+    for w in range(seen.shape[0]):
+        if not seen[w]:
+            continue
+        M, u, v = out_of[w], pixel[w, 0], pixel[w, 1]
+        x, y = M[0, 0] * u + M[0, 1] * v + M[0, 2], M[1, 0] * u + M[1, 1] * v + M[1, 2]
+        z = M[2, 0] * u + M[2, 1] * v + M[2, 2]
+        share = 1 / (x * x + y * y + z * z)
+        a00, a01, a02 = 1 - share * x * x, -share * x * y, -share * x * z
+        a11, a12, a22 = 1 - share * y * y, -share * y * z, 1 - share * z * z
+        c0, c1, c2 = centre[w, 0], centre[w, 1], centre[w, 2]
+        n00, n01, n02, n11, n12, n22 = n00 + a00, n01 + a01, n02 + a02, n11 + a11, n12 + a12, n22 + a22
+        r0 += a00 * c0 + a01 * c1 + a02 * c2
+        r1 += a01 * c0 + a11 * c1 + a12 * c2
+        r2 += a02 * c0 + a12 * c1 + a22 * c2
+    normal[0, 0], normal[0, 1], normal[0, 2] = n00, n01, n02
+    normal[1, 1], normal[1, 2], normal[2, 2] = n11, n12, n22
+    right[0], right[1], right[2] = r0, r1, r2
+
+
+@compiled
+def _linearised(X, pixel, seen, into, centre, normal, right):
+    """Normal equations (upper triangle) of a Gauss-Newton step from X; the sum of squared residuals [px^2], how many
+    views saw the point, and whether it lies in front of all of them."""
+    n00 = n01 = n02 = n11 = n12 = n22 = r0 = r1 = r2 = squares = 0.0
+    count, front = 0, True
+    for w in range(seen.shape[0]):
+        if not seen[w]:
+            continue
+        count += 1
+        P, x, y, z = into[w], X[0] - centre[w, 0], X[1] - centre[w, 1], X[2] - centre[w, 2]
+        depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z
+        front = front and depth > 0
+        over = 1 / depth if abs(depth) > 1e-9 else 1e9
+        u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z) * over
+        v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z) * over
+        du, dv = u - pixel[w, 0], v - pixel[w, 1]
+        a0, a1, a2 = (P[0, 0] - u * P[2, 0]) * over, (P[0, 1] - u * P[2, 1]) * over, (P[0, 2] - u * P[2, 2]) * over
+        b0, b1, b2 = (P[1, 0] - v * P[2, 0]) * over, (P[1, 1] - v * P[2, 1]) * over, (P[1, 2] - v * P[2, 2]) * over
+        squares += du * du + dv * dv
+        r0, r1, r2 = r0 + a0 * du + b0 * dv, r1 + a1 * du + b1 * dv, r2 + a2 * du + b2 * dv
+        n00, n01, n02 = n00 + a0 * a0 + b0 * b0, n01 + a0 * a1 + b0 * b1, n02 + a0 * a2 + b0 * b2
+        n11, n12, n22 = n11 + a1 * a1 + b1 * b1, n12 + a1 * a2 + b1 * b2, n22 + a2 * a2 + b2 * b2
+    normal[0, 0], normal[0, 1], normal[0, 2] = n00, n01, n02
+    normal[1, 1], normal[1, 2], normal[2, 2] = n11, n12, n22
+    right[0], right[1], right[2] = r0, r1, r2
+    return squares, count, front
+
+
+@compiled
+def _inverse(S, damping, out):
+    """Of a symmetric positive definite 3x3 (its upper triangle), damped, by cofactors."""
+    more = damping * max(S[0, 0] + S[1, 1] + S[2, 2], 2.2250738585072014e-308)
+    a, b, c = S[0, 0] + more, S[0, 1], S[0, 2]
+    d, e, f = S[1, 1] + more, S[1, 2], S[2, 2] + more
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * A + b * B + c * C
-    out[0, 0], out[0, 1], out[0, 2] = A / determinant, B / determinant, C / determinant
-    out[1, 1], out[1, 2], out[2, 2] = (
-        (a * f - c * c) / determinant,
-        (b * c - a * e) / determinant,
-        (a * d - b * b) / determinant,
-    )
+    over = 1 / (a * A + b * B + c * C)
+    out[0, 0], out[0, 1], out[0, 2] = A * over, B * over, C * over
+    out[1, 1], out[1, 2], out[2, 2] = (a * f - c * c) * over, (b * c - a * e) * over, (a * d - b * b) * over
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
