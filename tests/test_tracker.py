@@ -169,6 +169,22 @@ def test_what_is_far_away_is_not_left_out():
     assert np.median(np.abs(surprise)) < 1.5
 
 
+def test_poses_that_contradict_the_images_give_no_anchors(tour):
+    rng, believing = np.random.default_rng(0), TrackerConfig(min_share=0.0)
+    noisy, by_chance, right = LandmarkTracker(), LandmarkTracker(believing), LandmarkTracker()
+    counts = np.zeros(3, dtype=int)
+    for i, frame in enumerate(tour):
+        T = frame.T_world_cam.copy()
+        if i > 1:  # two views alone can be wrong together
+            T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(rng.normal(0, np.deg2rad(3), 3)).as_matrix()
+        arguments = ((noisy, T), (by_chance, T), (right, frame.T_world_cam))
+        found = [len(t.update(frame.image, pose, frame.intrinsics).depth) for t, pose in arguments]
+        counts += found if i > 2 else 0
+    assert counts[1] >= 20, "some tracks fit by chance"
+    assert counts[0] == 0
+    assert counts[2] > 200
+
+
 def test_memory_does_not_grow_and_reset_forgets(tour):
     tracker = LandmarkTracker(TrackerConfig(max_points=40, window=4))
     sizes = set()
@@ -220,7 +236,14 @@ def test_wrong_input_leaves_the_tracker_as_it_was(tour, change, told):
 
 
 def test_config_refuses_the_impossible():
-    for values in ({"max_points": 0}, {"window": 1}, {"min_views": 11}, {"pixel_noise": 0.0}, {"spacing": True}):
+    for values in (
+        {"max_points": 0},
+        {"window": 1},
+        {"min_views": 11},
+        {"pixel_noise": 0.0},
+        {"spacing": True},
+        {"min_share": 2},
+    ):
         with pytest.raises(ValueError, match="TrackerConfig"):
             TrackerConfig(**values)
     with pytest.raises(TypeError):

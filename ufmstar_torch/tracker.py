@@ -34,6 +34,8 @@ class TrackerConfig:
             worse than ``pixel_noise`` gets a variance by as much larger.
         max_relative_sigma: largest standard deviation of the depth, as a share of it: less parallax is no anchor. Not
             less than needed: what is far away has little parallax, and to leave it out would hide the error there.
+        min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer do, poses and image contradict
+            each other, and those that fit do so by chance: none is believed.
 
     Raises:
         ValueError: an impossible value.
@@ -47,6 +49,7 @@ class TrackerConfig:
     pixel_noise: float = 1.0
     max_error: float = 3.0
     max_relative_sigma: float = 0.3
+    min_share: float = 0.2
 
     def __post_init__(self) -> None:
         for name, least in (("max_points", 1), ("window", 2), ("min_views", 2)):
@@ -57,6 +60,9 @@ class TrackerConfig:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
                 raise ValueError(f"TrackerConfig.{name} must be a positive number, got {value!r}")
+        share = self.min_share
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share <= 1:
+            raise ValueError(f"TrackerConfig.min_share must be a number from 0 to 1, got {share!r}")
         if self.min_views > self.window:
             raise ValueError(f"TrackerConfig.min_views must be at most window = {self.window}, got {self.min_views}")
 
@@ -234,7 +240,10 @@ class LandmarkTracker:
         excess = np.square(found.error) * 2 * views / np.maximum(2 * views - 3, 1) / config.pixel_noise**2
         variance = config.pixel_noise**2 * np.maximum(excess, 1) * np.einsum("i,nij,j->n", axis, found.covariance, axis)
         safe = np.maximum(depth, 1e-9)
-        fine = found.ahead & (depth > 0) & (found.error <= config.max_error)
+        fits = found.error <= config.max_error
+        # Two views contradict each other across the epipolar line only; three tell.
+        telling = fits[views > 2] if (views > 2).any() else fits
+        fine = fits & found.ahead & (depth > 0) & (telling.mean() >= config.min_share)
         # Hopeless geometry can make the covariance indefinite.
         fine &= (variance >= 0) & (variance <= np.square(config.max_relative_sigma * safe))
         return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
