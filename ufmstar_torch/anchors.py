@@ -13,6 +13,10 @@ from torch import Tensor
 
 from ufmstar_torch.frame import FrameInput
 
+# An anchor whose standard deviation is as large as its depth, or that is off from the prediction by a factor like this,
+# measures nothing: one alone would decide the mean of all others, and larger values overflow in the state.
+_FARTHEST_OFF = 100.0
+
 
 @dataclass(frozen=True)
 class Anchors:
@@ -112,7 +116,8 @@ class AnchorInput:
         predicted: [B, N] the network's depth there [m]; 1 where not valid.
         depth, variance: [B, N] as given [m], [m^2]; 1 and 0 where not valid.
         own_variance: [B, N] what the network itself claims there, A + E as far as they are used [m^2].
-        valid: [B, N] bool: finite, depth > 0, variance >= 0, on a valid pixel, not masked.
+        valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, off from the prediction by a factor of at most
+            100, on a valid pixel, not masked.
     """
 
     pixel: Tensor
@@ -127,7 +132,8 @@ class AnchorInput:
 def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | None) -> AnchorInput:
     """Anchors of one frame, ready to be used; in float64 on the depth's device.
 
-    An anchor whose values make no sense, or that lies beside the image or on a pixel without a depth, is not valid.
+    An anchor whose values make no sense, that lies beside the image or on a pixel without a depth, or that says nothing
+    (a standard deviation as large as its depth, a depth off from the prediction by a factor of 100), is not valid.
 
     Args:
         anchors: see :class:`Anchors`.
@@ -145,14 +151,17 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
     shape = pixel.shape[:2]
     depth = _like(_on_device("anchors.depth", anchors.depth, frame), "anchors.depth", shape)
     variance = _like(_on_device("anchors.variance", anchors.variance, frame), "anchors.variance", shape)
-    valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance < torch.inf) & pixel.isfinite().all(-1)
+    # Compared as standard deviations: the square of a large depth overflows.
+    valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & pixel.isfinite().all(-1)
     if anchors.valid is not None:
-        valid = valid & _like(_mask("anchors.valid", anchors.valid), "anchors.valid", shape)
+        mask = _like(_mask("anchors.valid", anchors.valid), "anchors.valid", shape)
+        valid = valid & _same_device("anchors.valid", mask, frame)
     pixel = torch.where(valid[..., None], pixel, torch.zeros_like(pixel))
     u, v = pixel.round().long().unbind(-1)
     index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
     predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
     valid = valid & _inside(pixel, frame.size) & torch.gather(frame.valid.flatten(1), 1, index)
+    valid = valid & (depth <= _FARTHEST_OFF * predicted) & (predicted <= _FARTHEST_OFF * depth)
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     own = zero if own_variance is None else torch.gather(own_variance.detach().flatten(1), 1, index).double()
     return AnchorInput(
@@ -179,10 +188,13 @@ def _floating(name: str, value: object) -> Tensor:
 
 
 def _on_device(name: str, value: object, frame: FrameInput) -> Tensor:
-    found = _floating(name, value)
-    if found.device != frame.depth.device:
-        raise ValueError(f"{name} lies on {found.device} but the depth on {frame.depth.device}")
-    return found
+    return _same_device(name, _floating(name, value), frame)
+
+
+def _same_device(name: str, value: Tensor, frame: FrameInput) -> Tensor:
+    if value.device != frame.depth.device:
+        raise ValueError(f"{name} lies on {value.device} but the depth on {frame.depth.device}")
+    return value
 
 
 def _mask(name: str, value: object) -> Tensor:

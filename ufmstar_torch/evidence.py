@@ -39,6 +39,9 @@ SUMS = 3
 # have a similar ratio g/d. Not a distance from the frame's median: a network may be wrong by another factor on each
 # surface, and a small region that differs from the rest is what anchors are to find.
 _NEIGHBOURS, _SUPPORT = 8, 3
+# [px^2] By which an anchor counts as farther away than the one given before it: more than the rounding of a squared
+# distance in an image, less than tells.
+_TIE = 1e-6
 # "Similar" is within 3 sigma of what neighbours differ by. sigma comes from the lower quartile of all such differences,
 # .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
 _SIMILAR_SIGMAS, _LOWER_QUARTILE = 3.0, 0.4506
@@ -84,6 +87,8 @@ def inliers(anchors: AnchorInput) -> Tensor:
     log_ratio = (anchors.depth / anchors.predicted).log()
     both = anchors.valid[:, :, None] & anchors.valid[:, None] & ~torch.eye(n, dtype=torch.bool, device=few.device)
     apart = (anchors.pixel[:, :, None] - anchors.pixel[:, None]).square().sum(-1)
+    # Of neighbours equally near the first given counts: which of them topk takes depends on how far a row is padded.
+    apart = apart + _TIE * torch.arange(n, device=few.device)
     apart = torch.where(both, apart, torch.full_like(apart, torch.inf))
     distance, neighbour = apart.topk(min(_NEIGHBOURS, n - 1), dim=2, largest=False)
     asked = distance < torch.inf

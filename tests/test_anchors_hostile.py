@@ -1,0 +1,77 @@
+"""Anchors that would spoil what others teach: absurd values, padding, and what is beside the rule."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import scenes
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.anchors import AnchorInput, Anchors
+from ufmstar_torch.evidence import inliers
+
+H, W = 48, 64
+ON = UfMStarConfig(anchored=True)
+
+
+def taught(spoilt=None, at=5, frames=8):
+    """B/d^2 on average after every frame of a network that is 20 % off; ``spoilt`` (depth, variance) joins frame 5."""
+    depths, poses, K = scenes.sequence(frames, H, W, 0.0)
+    rng, ufm, found = np.random.default_rng(0), UfMStar(ON), []
+    for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
+        v, u = rng.integers(0, H, 40), rng.integers(0, W, 40)
+        pixel, depth = torch.tensor(np.stack([u, v], -1)[None].astype(float)), torch.tensor(truth[v, u])[None].clone()
+        variance = torch.full_like(depth, 1e-4)
+        if spoilt is not None and i == at:
+            pixel, depth, variance = pixel[:, :1], *(torch.tensor([[x]], dtype=torch.float64) for x in spoilt)
+        anchors = Anchors(pixel, depth, variance)
+        out = ufm(torch.tensor(1.2 * truth)[None], torch.tensor(T), torch.tensor(K), anchors=anchors)
+        found.append(float((out.anchored / out.depth.square())[out.valid].mean()))
+    return found, int(out.statistics.anchors_used[0])
+
+
+@pytest.fixture(scope="module")
+def without():
+    return taught()[0]
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [(1e30, 1e-4), (1e200, 1e-4), (1e4, 1e-4), (1e-30, 0.0), (2.0, 1e300), (2.0, 1e4), (2.0, 4.0), (1e200, 1e300)],
+)
+def test_one_anchor_that_says_nothing_teaches_nothing(spoilt, without):
+    found, used = taught(spoilt)
+    assert np.isfinite(found).all()
+    assert used >= 30
+    # The frame with the bad anchor alone teaches nothing, so the rest stays within what a frame's forty change.
+    np.testing.assert_allclose(found, without, rtol=0.25)
+
+
+def stream(pixel, log_ratio, padded):
+    n = len(log_ratio)
+    fields = [torch.zeros(1, padded, *shape, dtype=torch.float64) for shape in ((2,), (), (), (), ())]
+    fields[0][0, :n], fields[2][0, :n] = torch.tensor(pixel), torch.tensor(np.exp(log_ratio))
+    fields[1] += 1
+    fields[2][0, n:] = 1
+    index, valid = torch.zeros(1, padded, dtype=torch.int64), torch.arange(padded)[None] < n
+    return AnchorInput(fields[0], index, *fields[1:], valid)
+
+
+def test_padding_does_not_decide_which_neighbours_are_asked():
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        n = int(rng.integers(9, 60))
+        pixel = rng.integers(0, 6, (n, 2)).astype(float)  # a grid: many are equally near
+        ratio = np.where(rng.random(n) < 0.5, rng.uniform(-1, 1, n), 0.02 * rng.standard_normal(n))
+        alone = inliers(stream(pixel, ratio, n))
+        for padded in (n + 1, n + 40, 200):
+            assert torch.equal(inliers(stream(pixel, ratio, padded))[:, :n], alone)
+
+
+def test_a_mask_on_another_device_is_named():
+    pixel, one = torch.zeros(1, 4, 2), torch.ones(1, 4)
+    K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    mask = torch.ones(1, 4, dtype=torch.bool, device="meta")
+    with pytest.raises(ValueError, match=r"anchors\.valid lies on meta but the depth on cpu"):
+        UfMStar(ON)(torch.full((1, H, W), 2.0), torch.eye(4), K, anchors=Anchors(pixel, one, 0 * one, mask))
