@@ -205,8 +205,9 @@ class _Parts(LandmarkTracker):
 
     def drop(self, count: int) -> None:
         """Forget the first ``count`` frames: the warm-up."""
-        for times in (*self.wall.values(), *self.cpu.values(), self.refilled):
+        for times in (*self.wall.values(), *self.cpu.values()):
             del times[:count]
+        del self.refilled[:count]
 
     def _followed(self, gray: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
         return self._timed("following", super()._followed, gray)

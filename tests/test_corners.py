@@ -1,0 +1,64 @@
+"""Corners: found away from those that are followed, and followed to where they went."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from ufmstar_torch.corners import find, follow
+
+
+def textured(height, width, seed=0):
+    """Smooth noise, full of corners."""
+    noise = np.random.default_rng(seed).standard_normal((height, width)).astype(np.float32)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def apart(a, b):
+    return np.linalg.norm(a[:, None] - b[None], axis=-1)
+
+
+@pytest.mark.parametrize("size", [(120, 160), (360, 500)], ids=["whole", "halved"])
+def test_new_corners_keep_away_from_each_other_and_from_the_followed(size):
+    image, rng = textured(*size), np.random.default_rng(1)
+    # Also in the corners of the image, where discs reach beyond it.
+    edge = np.array([[0.0, 0.0], [size[1] - 1, size[0] - 1], [size[1] - 1, 0.0]])
+    followed = np.concatenate([rng.uniform(0, np.array(size[::-1]) - 1, (20, 2)), edge])
+    found = find(image, 4000, 9.0, followed)
+    assert len(found) > 20
+    assert apart(found, followed).min() > 9 - 2.5, "a pixel of the searched image for rounding"
+    assert apart(found, found)[~np.eye(len(found), dtype=bool)].min() >= 9 - 1e-9
+    alone = find(image, 4000, 9.0, np.zeros((0, 2)))
+    assert len(alone) > len(found)
+    assert apart(alone, followed).min() < 5, "without them there would be some"
+    np.testing.assert_array_equal(find(image, 7, 9.0, followed), found[:7])
+
+
+def test_the_mask_is_what_opencv_draws(monkeypatch):
+    masks, search = [], cv2.goodFeaturesToTrack
+    monkeypatch.setattr(cv2, "goodFeaturesToTrack", lambda *a, mask: masks.append(mask) or search(*a, mask=mask))
+    followed = np.random.default_rng(2).uniform([0, 0], [159, 119], (30, 2))
+    find(textured(120, 160), 50, 11.4, followed)
+    drawn = np.full((120, 160), 255, np.uint8)
+    for u, v in followed:
+        cv2.circle(drawn, (round(u), round(v)), 11, 0, -1)
+    np.testing.assert_array_equal(masks[0], drawn)
+
+
+def test_a_blank_wall_has_no_corners():
+    assert find(np.full((60, 80), 128, np.uint8), 10, 5.0, np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_corners_move_with_the_image():
+    image = textured(240, 320)
+    moved = cv2.warpAffine(image, np.array([[1, 0, 5.5], [0, 1, -3.25]]), (320, 240), borderMode=cv2.BORDER_REFLECT)
+    start = find(image, 100, 10.0, np.zeros((0, 2)))
+    position, fine = follow(image, moved, start, 0.5)
+    goal = start + np.array([5.5, -3.25])
+    inside = ((goal > 12) & (goal < [307, 227])).all(1)
+    assert fine[inside].mean() > 0.95
+    np.testing.assert_allclose(position[fine & inside], goal[fine & inside], atol=0.15)
+    assert not fine[(goal[:, 0] > 320) | (goal[:, 1] < -1)].any(), "what left the image is not believed"
+    _, gone = follow(image, textured(240, 320, seed=5), start, 0.5)
+    assert gone.mean() < 0.2, "another image leads back to nowhere"
