@@ -42,9 +42,9 @@ _NEIGHBOURS, _SUPPORT = 8, 3
 # [px^2] By which an anchor counts as farther away than the one given before it: more than the rounding of a squared
 # distance in an image, less than tells.
 _TIE = 1e-6
-# "Similar" is within 3 sigma of what neighbours differ by. sigma comes from the lower quartile of all such differences,
+# "Similar" is within 2.5 sigma of what neighbours differ by; sigma is from the lower quartile of all such differences,
 # .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
-_SIMILAR_SIGMAS, _LOWER_QUARTILE = 3.0, 0.4506
+_SIMILAR_SIGMAS, _LOWER_QUARTILE = 2.5, 0.4506
 # Least sigma of log g/d: tracked landmarks are right to some 2 %, whatever variance they state.
 _LEAST_SIGMA = 0.02
 

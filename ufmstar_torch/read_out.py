@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors import AnchorInput
 from ufmstar_torch.backend import Backend
-from ufmstar_torch.camera import unproject
+from ufmstar_torch.camera import focal_and_centre, unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.evidence import Evidence, means, observe
 from ufmstar_torch.frame import FrameInput
@@ -31,8 +31,7 @@ def learn(
     evidence = evidence.padded(mixture_cam.capacity)
     if anchors is None:
         return evidence, none
-    points = torch.gather(_points(frame).double(), 1, anchors.index[..., None].expand(*anchors.index.shape, 3))
-    share = shares(mixture_cam, points, config)
+    share = shares(mixture_cam, _predicted_points(anchors, frame), config)
     gamma = 0.5 ** (1 / config.anchor_half_life)
     evidence, used = observe(evidence, anchors, share, gamma)  # a faulty frame's anchors are not valid
     return evidence, used.sum(1)
@@ -47,6 +46,14 @@ def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> Tensor
         disagreement: M, likewise [m^2].
     """
     return (depth.square() * excess - disagreement).clamp_min(0)
+
+
+def _predicted_points(anchors: AnchorInput, frame: FrameInput) -> Tensor:
+    """[B, N, 3] where the prediction has the anchors' pixels, in the camera frame [m]."""
+    width, d = frame.size[1], anchors.predicted
+    fx, fy, cx, cy = (value.double()[:, None] for value in focal_and_centre(frame.intrinsics))
+    u, v = anchors.index % width, anchors.index.div(width, rounding_mode="floor")
+    return torch.stack([(u - cx) / fx * d, (v - cy) / fy * d, d], dim=-1)
 
 
 def _points(frame: FrameInput) -> Tensor:

@@ -18,6 +18,9 @@ from torch import Tensor
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.corners import find, follow
 
+# Tracks by which a frame's poses are judged.
+_ENOUGH = 5
+
 
 @dataclass(frozen=True)
 class TrackerConfig:
@@ -241,8 +244,8 @@ class LandmarkTracker:
         variance = config.pixel_noise**2 * np.maximum(excess, 1) * np.einsum("i,nij,j->n", axis, found.covariance, axis)
         safe = np.maximum(depth, 1e-9)
         fits = found.error <= config.max_error
-        # Two views contradict each other across the epipolar line only; three tell.
-        telling = fits[views > 2] if (views > 2).any() else fits
+        # Two views contradict each other across the epipolar line only; three tell, if enough tracks have them.
+        telling = fits[views > 2] if (views > 2).sum() >= _ENOUGH else fits
         fine = fits & found.ahead & (depth > 0) & (telling.mean() >= config.min_share)
         # Hopeless geometry can make the covariance indefinite.
         fine &= (variance >= 0) & (variance <= np.square(config.max_relative_sigma * safe))
