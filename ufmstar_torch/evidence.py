@@ -85,13 +85,13 @@ def inliers(anchors: AnchorInput) -> Tensor:
     if n <= _SUPPORT:
         return anchors.valid
     log_ratio = (anchors.depth / anchors.predicted).log()
-    both = anchors.valid[:, :, None] & anchors.valid[:, None] & ~torch.eye(n, dtype=torch.bool, device=few.device)
-    apart = (anchors.pixel[:, :, None] - anchors.pixel[:, None]).square().sum(-1)
+    u, v = anchors.pixel.unbind(-1)
+    apart = (u[:, :, None] - u[:, None]).square_().add_((v[:, :, None] - v[:, None]).square_())
     # Of neighbours equally near the first given counts: which of them topk takes depends on how far a row is padded.
-    apart = apart + _TIE * torch.arange(n, device=few.device)
-    apart = torch.where(both, apart, torch.full_like(apart, torch.inf))
+    apart += _TIE * torch.arange(n, device=few.device)
+    apart.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
     distance, neighbour = apart.topk(min(_NEIGHBOURS, n - 1), dim=2, largest=False)
-    asked = distance < torch.inf
+    asked = (distance < torch.inf) & anchors.valid[:, :, None]
     differ = (log_ratio[:, :, None] - _take(log_ratio, neighbour)).abs()
     quartile = torch.where(asked, differ, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
     noise = anchors.variance / anchors.depth.square()  # of log g: no reason for mistrust
@@ -126,7 +126,7 @@ def observe(evidence: Evidence, anchors: AnchorInput, share: Tensor, memory: flo
     dtype = evidence.overall.dtype
     fresh = used.any(1, keepdim=True).double()
     fade = memory * fresh + (1 - fresh)
-    component = fade[..., None] * evidence.component.double() + torch.einsum("bnk,bns->bks", share.double(), rows)
+    component = fade[..., None] * evidence.component.double() + (rows.mT @ share.double()).mT
     overall = fade * evidence.overall.double() + rows.sum(1)
     return Evidence(component.to(dtype), overall.to(dtype)), used
 
