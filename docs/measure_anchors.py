@@ -33,7 +33,7 @@ OF_UFM: tuple[Mapping[str, Any], ...] = (
     *({**ANCHORED, "anchor_half_life": frames} for frames in (5.0, 10.0, 100.0)),
 )
 OF_TRACKER: tuple[Mapping[str, Any], ...] = (
-    *({"max_relative_sigma": share} for share in (0.1, 0.2, 0.5)),
+    *({"max_relative_sigma": share} for share in (0.1, 0.2, 0.3, 0.5)),
     *({"min_views": views} for views in (3,)),
     *({"max_error": pixels} for pixels in (1.5, 5.0)),
     *({"pixel_noise": pixels} for pixels in (0.5, 2.0)),

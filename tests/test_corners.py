@@ -37,13 +37,36 @@ def test_new_corners_keep_away_from_each_other_and_from_the_followed(size):
 
 def test_the_mask_is_what_opencv_draws(monkeypatch):
     masks, search = [], cv2.goodFeaturesToTrack
-    monkeypatch.setattr(cv2, "goodFeaturesToTrack", lambda *a, mask: masks.append(mask) or search(*a, mask=mask))
+    monkeypatch.setattr(
+        cv2, "goodFeaturesToTrack", lambda *a, mask, **k: masks.append(mask) or search(*a, mask=mask, **k)
+    )
     followed = np.random.default_rng(2).uniform([0, 0], [159, 119], (30, 2))
     find(textured(120, 160), 50, 11.4, followed)
     drawn = np.full((120, 160), 255, np.uint8)
     for u, v in followed:
         cv2.circle(drawn, (round(u), round(v)), 11, 0, -1)
     np.testing.assert_array_equal(masks[0], drawn)
+
+
+def test_a_strong_edge_is_no_row_of_corners():
+    """On a slightly wavy edge the smaller eigenvalue is large all along, since the larger one is huge."""
+    rng, (v, u) = np.random.default_rng(0), np.mgrid[:240, :320].astype(float)
+    wave = cv2.GaussianBlur(rng.normal(0, 1, (240, 1)), (1, 31), 3)
+    across = 0.94 * (u - 160) + 0.34 * (v - 120) + 1.5 * wave / wave.std()
+    picture = 30 + 200 / (1 + np.exp(-across)) + rng.normal(0, 1, across.shape)
+    picture[100:140, 20:60] = 230  # four corners
+    image = picture.clip(0, 255).astype(np.uint8)
+
+    def on_edge(points):
+        near = np.abs(0.94 * (points[:, 0] - 160) + 0.34 * (points[:, 1] - 120)) < 6
+        return int((near & (np.abs(points[:, 1] - 120) < 105)).sum())
+
+    found = find(image, 300, 8.0, np.zeros((0, 2)))
+    corners = np.array([[20.0, 100], [59, 100], [20, 139], [59, 139]])
+    assert (apart(corners, found).min(1) < 3).all()
+    by_eigenvalue = on_edge(cv2.goodFeaturesToTrack(image, 300, 0.01, 8.0)[:, 0])
+    assert by_eigenvalue >= 8
+    assert on_edge(found) <= by_eigenvalue / 3
 
 
 def test_a_blank_wall_has_no_corners():

@@ -16,6 +16,11 @@ from numpy.typing import NDArray
 _PATCH, _LEVELS, _ITERATIONS, _CONVERGED = (8, 16), 3, 10, 0.03
 # [px] Width from which corners are looked for at half the size.
 _HALVED_FROM = 480
+# Harris' response, det - k trace^2, and not the smaller eigenvalue alone: where an edge is strong and the image else is
+# plain, that is large all along the edge, and a corner on an edge slides, to a depth far off, and returns. k asks for a
+# ratio of the eigenvalues of some 1 to 20. The response is of fourth order in contrast: the weakest corner has a
+# hundredth of the strongest one's eigenvalue.
+_HARRIS, _WEAKEST = 0.04, 1e-4
 
 
 def follow(
@@ -72,7 +77,9 @@ def find(gray: NDArray[np.uint8], count: int, spacing: float, followed: NDArray[
     factor = 2 if gray.shape[1] >= _HALVED_FROM else 1
     searched = gray if factor == 1 else cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     free = _away_from((followed + 0.5) / factor - 0.5, round(spacing / factor), searched.shape)
-    corners = cv2.goodFeaturesToTrack(searched, count, 0.01, spacing / factor, mask=free)
+    corners = cv2.goodFeaturesToTrack(
+        searched, count, _WEAKEST, spacing / factor, mask=free, useHarrisDetector=True, k=_HARRIS
+    )
     return np.zeros((0, 2)) if corners is None else (corners[:, 0].astype(np.float64) + 0.5) * factor - 0.5
 
 

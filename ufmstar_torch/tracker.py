@@ -51,7 +51,7 @@ class TrackerConfig:
     back_tolerance: float = 0.5
     pixel_noise: float = 1.0
     max_error: float = 3.0
-    max_relative_sigma: float = 0.3
+    max_relative_sigma: float = 0.4
     min_share: float = 0.2
 
     def __post_init__(self) -> None:
