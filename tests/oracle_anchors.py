@@ -1,0 +1,77 @@
+"""What anchors add to UfM*, in NumPy float64 loops from docs/anchors.md; imports neither torch nor the package."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import oracle
+
+NEIGHBOURS, SUPPORT, SIGMAS, QUARTILE, LEAST = 8, 3, 2.5, 0.4506, 0.02
+
+
+def believed(anchors):
+    """Which (u, v, depth, variance, predicted) enough of their nearest neighbours in the image support."""
+    if len(anchors) <= SUPPORT:
+        return [True] * len(anchors)
+    ratio = [np.log(g / d) for _, _, g, _, d in anchors]
+    noise = [s2 / g**2 for _, _, g, s2, _ in anchors]
+    asked = []
+    for i, (u, v, *_) in enumerate(anchors):
+        others = [j for j in range(len(anchors)) if j != i]
+        others.sort(key=lambda j: ((anchors[j][0] - u) ** 2 + (anchors[j][1] - v) ** 2, j))
+        asked.append(others[:NEIGHBOURS])
+    sigma = np.quantile([abs(ratio[i] - ratio[j]) for i, near in enumerate(asked) for j in near], 0.25) / QUARTILE
+    found = []
+    for i, near in enumerate(asked):
+        limits = [SIGMAS * np.sqrt(sigma**2 + 2 * LEAST**2 + noise[i] + noise[j]) for j in near]
+        agree = sum(abs(ratio[i] - ratio[j]) <= limit for j, limit in zip(near, limits, strict=True))
+        found.append(agree >= SUPPORT)
+    return found
+
+
+class AnchoredOracle(oracle.Oracle):
+    """UfM* with the sums of (1, r, e) beside every component and of the stream."""
+
+    def __init__(self, spgf, *, kappa, half_life, **settings):
+        super().__init__(spgf, **settings)
+        self.kappa, self.memory = kappa, 0.5 ** (1 / half_life)
+        self.sums, self.total = [], np.zeros(3)
+
+    def step_anchored(self, depth, T_world_cam, K, anchors, aleatoric=None):
+        """V, B and the expected r [H, W]; anchors are (u, v, depth, variance)."""
+        own = np.zeros_like(depth) if aleatoric is None else aleatoric
+        V, M = self.step(depth, T_world_cam, K, aleatoric)
+        to_cam = oracle.relative(self.T_first, T_world_cam)
+        mixture = oracle.prepared([oracle.transform(g, *to_cam) for g in self.mixture])
+        self.sums += [np.zeros(3) for _ in range(len(mixture) - len(self.sums))]
+        self._learn(mixture, depth, own, K, anchors)
+        r_stream, e_stream = self.total[1:] / (self.total[0] + self.kappa)
+        B, bias = np.full(depth.shape, np.nan), np.full(depth.shape, np.nan)
+        for v, u in np.argwhere(np.isfinite(M)):
+            shares = self._shares(mixture, depth, K, u, v)
+            r = e = 0.0
+            for w, (n, sum_r, sum_e) in zip(shares, self.sums, strict=True):
+                r += w * (sum_r + self.kappa * r_stream) / (n + self.kappa)
+                e += w * (sum_e + self.kappa * e_stream) / (n + self.kappa)
+            r, e = r + (1 - sum(shares)) * r_stream, e + (1 - sum(shares)) * e_stream
+            B[v, u], bias[v, u] = max(0.0, depth[v, u] ** 2 * e - M[v, u]), r
+        return V + B, B, bias
+
+    def _learn(self, mixture, depth, own, K, anchors):
+        full = [(u, v, g, s2, depth[round(v), round(u)]) for u, v, g, s2 in anchors]
+        used = [anchor for anchor, fine in zip(full, believed(full), strict=True) if fine]
+        if used:
+            self.sums = [self.memory * row for row in self.sums]
+            self.total = self.memory * self.total
+        for u, v, g, s2, d in used:
+            r = (g - d) / d
+            row = np.array([1.0, r, r**2 - (s2 + own[round(v), round(u)]) / d**2])
+            self.total = self.total + row
+            for k, w in enumerate(self._shares(mixture, depth, K, round(u), round(v))):
+                self.sums[k] = self.sums[k] + w * row
+
+    def _shares(self, mixture, depth, K, u, v):
+        d = depth[v, u]
+        x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
+        weights = [g["weight"] * oracle.density(x, g) for g in mixture]
+        return [w / (sum(weights) + self.prior["prior_weight"]) for w in weights]
