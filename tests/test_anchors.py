@@ -125,7 +125,7 @@ def test_the_lesson_outlasts_the_anchors():
 
 
 def test_what_is_claimed_is_the_larger_of_disagreement_and_lesson():
-    ufm, outputs, depths = walk(lambda z, i, rng: z * 1.2 * (1 + 0.1 * rng.standard_normal()), frames=10)
+    _, outputs, depths = walk(lambda z, i, rng: z * 1.2 * (1 + 0.1 * rng.standard_normal()), frames=10)
     once, often = outputs[0], outputs[-1]
     # Seen once, nothing was compared: M is 0 there, not because views agree, and anchors alone speak.
     assert float(once.disagreement[once.valid].max()) == 0
