@@ -81,8 +81,8 @@ class FrameStatistics:
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
         anchors: given and usable; 0 for a standing camera, say.
-        anchors_used: of those, no gross outliers. 0 = nothing new was learnt: V is plain UfM*'s and B what had been
-            learnt before, which at the start is nothing.
+        anchors_used: of those, no gross outliers. 0 = nothing new was learnt: M + A + E is plain UfM*'s and B what had
+            been learnt before, which at the start is nothing.
     """
 
     components: Tensor

@@ -110,8 +110,6 @@ class Landmarks:
         room = n if capacity is None else capacity
         if room < n:
             raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
-        rays = np.concatenate([self.pixel, np.ones((n, 1))], axis=1) @ np.linalg.inv(K_camera).T
-        pixel = (rays @ intrinsics.detach().reshape(3, 3).double().cpu().numpy().T)[:, :2]
 
         def padded(values: NDArray) -> Tensor:
             full = np.zeros((1, room, *values.shape[1:]))
@@ -119,7 +117,8 @@ class Landmarks:
             return torch.from_numpy(full).to(intrinsics.device)
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
-        return Anchors(padded(pixel), padded(self.depth), padded(self.variance), valid)
+        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid)
+        return found.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
 class LandmarkTracker:
@@ -216,7 +215,7 @@ class LandmarkTracker:
         """New corners in free slots, away from those that are followed."""
         followed = self._seen[:, self._view]
         free = np.flatnonzero(~followed)
-        # Not for a few: a search costs a third of following them all.
+        # Not for a few: a search costs half of following them all.
         if len(free) < max(1, self.config.max_points // 5):
             return
         spacing = self.config.spacing * gray.shape[1] / 640

@@ -82,10 +82,11 @@ class AnchorSource:
             truth: [h, w] at their pixels [m], 0 = none.
         """
         if self._tracks is None:
-            return self._placed(self._sampled(truth, frame.index), predicted), None
+            return self._sampled(truth, frame.index).to(predicted.depth.device), None
         landmarks, ms = self._tracks.of(frame, T_world_cam)
         landmarks = self._thinned(self._disturbed(landmarks, frame.index), frame.index)
-        return self._placed(landmarks.anchors(frame.intrinsics, predicted.intrinsics), predicted), ms
+        anchors = landmarks.anchors(frame.intrinsics, predicted.intrinsics)
+        return anchors.to(predicted.depth.device), ms
 
     def _sampled(self, truth: NDArray[np.float32], index: int) -> Anchors:
         v, u = np.nonzero(truth > 0)
@@ -116,11 +117,6 @@ class AnchorSource:
 
     def _drawn(self, index: int, what: int) -> np.random.Generator:
         return np.random.default_rng([self._setting.seed, index, what])
-
-    def _placed(self, anchors: Anchors, predicted: Predicted) -> Anchors:
-        device = predicted.depth.device
-        valid = None if anchors.valid is None else anchors.valid.to(device)
-        return Anchors(anchors.pixel.to(device), anchors.depth.to(device), anchors.variance.to(device), valid)
 
 
 def anchor_sources(rows: Iterable[Row]) -> dict[Row, AnchorSource]:
