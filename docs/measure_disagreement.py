@@ -18,7 +18,7 @@ from clips import Clip, Map, add_sources, clips, estimate, judge, line, shown
 from numpy.typing import NDArray
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.eval.ufm import UfM
+from ufmstar_torch.eval.methods.ufm import UfM
 
 COLUMNS = ("rms", "delta1", "ece_delta", "overconfidence", "ece_q", "spearman", "ause_rmse", "nll_left_out_share")
 LITERAL = {"segment": {"min_pixels": 2000, "min_rows": 32, "prune": "either"}}

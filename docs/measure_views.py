@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ufmstar_torch import UfMStar
 from ufmstar_torch.backend import select
 from ufmstar_torch.camera import relative_pose
-from ufmstar_torch.eval.ufm import UfM
+from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.gaussian import wasserstein_squared
 
 Array = NDArray[np.float64]

@@ -9,9 +9,9 @@ import torch
 from torch import nn
 
 from ufmstar_torch import DepthPrediction, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.run import Job
-from ufmstar_torch.eval.run_maps import MapSource, own_depth_source
-from ufmstar_torch.eval.run_source import NetworkSource
+from ufmstar_torch.eval.commands.run import Job
+from ufmstar_torch.eval.engine.run_maps import MapSource, own_depth_source
+from ufmstar_torch.eval.engine.run_source import NetworkSource
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageEnhance
 from torch import Tensor
 
-from ufmstar_torch.eval import synthetic
+from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.train.augment import (
     Augmentation,
     AugmentationConfig,

@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval import benchmark
-from ufmstar_torch.eval.benchmark_anchors import PARTS, TrackedTour, measure_anchors, measure_tracker, one_thread
-from ufmstar_torch.eval.benchmark_frames import RenderedRoom
-from ufmstar_torch.eval.benchmark_report import format_report
-from ufmstar_torch.eval.benchmark_timing import pinned_threads
+from ufmstar_torch.eval.bench import benchmark
+from ufmstar_torch.eval.bench.benchmark_anchors import PARTS, TrackedTour, measure_anchors, measure_tracker, one_thread
+from ufmstar_torch.eval.bench.benchmark_frames import RenderedRoom
+from ufmstar_torch.eval.bench.benchmark_report import format_report
+from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
 from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
 
 TIMES = {f"{clock}{name}_ms" for clock in ("", "cpu_") for name in ("median", "p90", "mean", "min")}
@@ -48,7 +48,7 @@ def report(one_core):
     before, seen = threads(), rendered()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackedTour, "frames", lambda _, count: seen[:count])
-        patch.setattr("ufmstar_torch.eval.benchmark_step.reference_networks", lambda size, fastdepth: ({}, {}))
+        patch.setattr("ufmstar_torch.eval.bench.benchmark_step.reference_networks", lambda size, fastdepth: ({}, {}))
         found = benchmark.run_benchmark(options)
     assert threads() == before
     return found
@@ -98,7 +98,7 @@ def test_the_standard_scene_keeps_300_corners():
 def test_parts_are_parts_of_the_whole(monkeypatch):
     """With a clock that moves by one at every look, parts and the whole are numbers of looks."""
     ticks = iter(range(10**6))
-    monkeypatch.setattr("ufmstar_torch.eval.benchmark_anchors.perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr("ufmstar_torch.eval.bench.benchmark_anchors.perf_counter", lambda: float(next(ticks)))
     found = measure_tracker(rendered()[:14], 60)
     # Following, searching and triangulating take a tick each; the whole update, from its own first look at the clock to
     # its last, seven.

@@ -17,7 +17,8 @@ from runs import Brightness, outputs, read_summary
 from shared_data import require_shared
 
 from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
-from ufmstar_torch.eval import run_source, writers
+from ufmstar_torch.eval.engine import run_source
+from ufmstar_torch.eval.results import writers
 from ufmstar_torch.models import Preprocess
 
 
@@ -276,10 +277,10 @@ def test_layouts_are_found(ufmstar, tmp_path, write):
 
 def test_bench_is_handed_on(monkeypatch, ufmstar):
     seen = []
-    module = types.ModuleType("ufmstar_torch.eval.benchmark")
+    module = types.ModuleType("ufmstar_torch.eval.bench.benchmark")
     module.main = lambda words: seen.append(words)
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr("ufmstar_torch.eval.benchmark", module, raising=False)
+    monkeypatch.setattr("ufmstar_torch.eval.bench.benchmark", module, raising=False)
     assert ufmstar("bench", "--frames", "3")[0] == 0
     assert seen == [["--frames", "3"]]
 

@@ -14,7 +14,7 @@ import pytest
 from shared_data import require_shared
 
 from ufmstar_torch.cli import main
-from ufmstar_torch.eval.data_check import check_data
+from ufmstar_torch.eval.check.data_check import check_data
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.register import register_depth

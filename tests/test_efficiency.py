@@ -12,15 +12,15 @@ from efficiency_cases import SIZE, network, room_sequence, rows_of
 from tiny_networks import Linear
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.efficiency.contender import Contender
-from ufmstar_torch.eval.efficiency.measure import Plan, measure
-from ufmstar_torch.eval.efficiency.multiview import state_bytes
-from ufmstar_torch.eval.efficiency.power import CPU, GPU, NOT_MEASURABLE, PowerMeter, Rail, Source
-from ufmstar_torch.eval.efficiency.race import DEPTH, EVERY, MULTIVIEW, ONCE, PROCESSOR, run_race
-from ufmstar_torch.eval.efficiency.table import efficiency_table, efficiency_tables
-from ufmstar_torch.eval.suite.method import Method
-from ufmstar_torch.eval.suite.row import Row
-from ufmstar_torch.eval.suite.setting import Setting
+from ufmstar_torch.eval.bench.contender import Contender
+from ufmstar_torch.eval.bench.measure import Plan, measure
+from ufmstar_torch.eval.bench.multiview import state_bytes
+from ufmstar_torch.eval.bench.power import CPU, GPU, NOT_MEASURABLE, PowerMeter, Rail, Source
+from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, ONCE, PROCESSOR, run_race
+from ufmstar_torch.eval.bench.efficiency_table import efficiency_table, efficiency_tables
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.preprocess import Preprocess
 

@@ -61,6 +61,36 @@ def test_layers_import_leftward_only(path):
         assert "cli" not in names or module != "ufmstar_torch"
 
 
+# Inside eval/, imports go one way too: a package may import from its own line and the lines above.
+EVAL_ORDER = (
+    ("sequences", "metrics", "gaussians"),
+    ("tour", "methods"),
+    ("engine",),
+    ("results",),
+    ("bench", "check", "report"),
+    ("commands",),
+)
+# What today's files still do against that order, "importer -> imported". This list only shrinks.
+EVAL_VIOLATIONS: frozenset[str] = frozenset()
+
+
+def test_imports_inside_eval_go_one_way():
+    rank = {name: number for number, names in enumerate(EVAL_ORDER) for name in names}
+    found = set()
+    for path in sorted((ROOT / "eval").rglob("*.py")):
+        own = path.relative_to(ROOT / "eval").with_suffix("").parts
+        if own == ("__init__",):
+            continue
+        for module, names in imported(path):
+            parts = module.split(".")
+            if parts[:2] != ["ufmstar_torch", "eval"]:
+                continue
+            for target in [parts[2]] if len(parts) > 2 else names:
+                if rank[target] > rank[own[0]] or (rank[target] == rank[own[0]] and target != own[0]):
+                    found.add(f"{'.'.join(own)} -> {'.'.join(parts[2:]) or target}")
+    assert found == EVAL_VIOLATIONS
+
+
 def test_no_slow_tier_imports_a_fast_one():
     for path in sources():
         if path.parent == ROOT / "ufmstar_torch" and path.stem.startswith(REFERENCE):

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from shared_data import require_shared
 
-from ufmstar_torch.eval.colours import (
+from ufmstar_torch.eval.report.colours import (
     DEPTH_MAP,
     ERROR_MAP,
     INVALID_GREY,
@@ -21,8 +21,8 @@ from ufmstar_torch.eval.colours import (
     colour_table,
     robust_range,
 )
-from ufmstar_torch.eval.plots import FramePanel, contact_sheet, fit_scales
-from ufmstar_torch.eval.video import VideoWriter, preview_frame, write_video
+from ufmstar_torch.eval.report.plots import FramePanel, contact_sheet, fit_scales
+from ufmstar_torch.eval.report.video import VideoWriter, preview_frame, write_video
 
 
 def panel(name: str = "a", *, error: bool = True, size: tuple[int, int] = (24, 32), seed: int = 0) -> FramePanel:

@@ -38,9 +38,9 @@ from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.sums import Merged
 from ufmstar_torch.eval.report.sweep_lines import Point, change, level, points, sweeps
 from ufmstar_torch.eval.report.write import write_report
-from ufmstar_torch.eval.suite.method import BASES, Method
-from ufmstar_torch.eval.suite.row import Row
-from ufmstar_torch.eval.suite.setting import Setting
+from ufmstar_torch.eval.methods.method import BASES, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
 
 ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")
 ALONE, UFM, UFM_STAR, DEPTH, STAR_OF_DEPTH = ROWS

@@ -24,7 +24,7 @@ from ufmstar_torch.eval.report.markup import Ids, Markup, join, tag, typeset
 from ufmstar_torch.eval.report.page import write_page
 from ufmstar_torch.eval.report.page_parts import command
 from ufmstar_torch.eval.report.picture import STRIP, Picture, write_index
-from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.results.record import Record
 
 VOID = {"br", "hr", "img", "meta", "input"}
 HOSTILE = "<script>alert('x')</script>&\"amp;"

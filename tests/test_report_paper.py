@@ -15,7 +15,7 @@ from ufmstar_torch.eval.report.markdown import markdown
 from ufmstar_torch.eval.report.paper import BY_SUITE, TABLE_1, TABLE_2, TABLE_2_NETWORKS, TABLE_3, TABLE_4, Quoted
 from ufmstar_torch.eval.report.paper_efficiency import paper_efficiency_tables
 from ufmstar_torch.eval.report.write import write_tables
-from ufmstar_torch.eval.suite.method import Method
+from ufmstar_torch.eval.methods.method import Method
 
 ALONE = rows_of("Ensemble")[0]
 

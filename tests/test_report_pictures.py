@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ufmstar_torch.eval.colours import INVALID_GREY
+from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.metrics import NLL
 from ufmstar_torch.eval.report.compare import draw_comparison, largest_difference
 from ufmstar_torch.eval.report.example import Example, RowMaps, find_examples
@@ -26,10 +26,10 @@ from ufmstar_torch.eval.report.pictures import choose, strip_rows, write_picture
 from ufmstar_torch.eval.report.projection import SIGMAS, View, project, views_of
 from ufmstar_torch.eval.report.rooms import Snapshot, below_ceiling, choose_times, draw_room, find_rooms, painted
 from ufmstar_torch.eval.report.strips import NLL_SCALE, draw_breakdown, draw_strip, figures_of, fit_scales, mean_nll
-from ufmstar_torch.eval.suite.record import Record
-from ufmstar_torch.eval.suite.row import Row
-from ufmstar_torch.eval.suite.setting import Setting
-from ufmstar_torch.eval.suite.worklist import WorkItem
+from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.results.worklist import WorkItem
 
 SHAPE = (12, 16)
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])

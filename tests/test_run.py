@@ -16,16 +16,16 @@ from runs import CONFIG, Brightness, job_of, network_job, outputs, own_depth_job
 
 from scenes import render
 from ufmstar_torch import UfMStar, UncertainDepth
-from ufmstar_torch.eval import run_folder, writers
-from ufmstar_torch.eval.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.results import run_folder, writers
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.pictures import field_of_view, square_pixels
-from ufmstar_torch.eval.run import Progress, run
-from ufmstar_torch.eval.run_folder import FolderError
-from ufmstar_torch.eval.run_maps import folder_source
-from ufmstar_torch.eval.run_source import NetworkSource
+from ufmstar_torch.eval.report.run_pictures import field_of_view, square_pixels
+from ufmstar_torch.eval.commands.run import Progress, run
+from ufmstar_torch.eval.results.run_folder import FolderError
+from ufmstar_torch.eval.engine.run_maps import folder_source
+from ufmstar_torch.eval.engine.run_source import NetworkSource
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.writers import read_frame
+from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.models import Preprocess
 
 TESTS = Path(__file__).parent
@@ -274,7 +274,7 @@ def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):
 
 
 def test_maps_are_brought_to_a_size(path, tmp_path):
-    from ufmstar_torch.eval.run_maps import own_depth_source
+    from ufmstar_torch.eval.engine.run_maps import own_depth_source
 
     summary = run(job_of(open_sequence(path), own_depth_source(CONFIG, size=(12, 16))), tmp_path / "out")
     assert summary["prediction"]["size"] == [12, 16]
@@ -458,7 +458,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from runs import Brightness, network_job
-from ufmstar_torch.eval.run import run
+from ufmstar_torch.eval.commands.run import run
 
 def kill():
     os.kill(os.getpid(), signal.SIGKILL)

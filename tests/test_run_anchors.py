@@ -11,19 +11,19 @@ import torch
 from runs import Brightness, job_of, outputs, read_summary
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
-from ufmstar_torch.eval import run_anchors
-from ufmstar_torch.eval.pictures import Finished
-from ufmstar_torch.eval.plots import fit_scales, map_columns
-from ufmstar_torch.eval.run import run
-from ufmstar_torch.eval.run_folder import FolderError
-from ufmstar_torch.eval.run_job import job_from
-from ufmstar_torch.eval.run_maps import MapSource, PredictedMap
-from ufmstar_torch.eval.run_options import parse_run, run_parser
-from ufmstar_torch.eval.run_source import NetworkSource
+from ufmstar_torch.eval.engine import run_anchors
+from ufmstar_torch.eval.report.run_pictures import Finished
+from ufmstar_torch.eval.report.plots import fit_scales, map_columns
+from ufmstar_torch.eval.commands.run import run
+from ufmstar_torch.eval.results.run_folder import FolderError
+from ufmstar_torch.eval.commands.run_job import job_from
+from ufmstar_torch.eval.engine.run_maps import MapSource, PredictedMap
+from ufmstar_torch.eval.commands.run_options import parse_run, run_parser
+from ufmstar_torch.eval.engine.run_source import NetworkSource
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.summary import table
-from ufmstar_torch.eval.video import preview_frame
-from ufmstar_torch.eval.writers import read_frame
+from ufmstar_torch.eval.results.summary import table
+from ufmstar_torch.eval.report.video import preview_frame
+from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
 
@@ -271,10 +271,10 @@ def test_images_and_opencv_are_needed(tour, monkeypatch, tmp_path):
     words = [TOUR, "--depth", "self", "--anchors", "--out", str(tmp_path / "out")]
     options = parse_run(run_parser(), words)
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
-    monkeypatch.setattr("ufmstar_torch.eval.run_job.open_sequence", lambda *_, **__: blind)
+    monkeypatch.setattr("ufmstar_torch.eval.commands.run_job.open_sequence", lambda *_, **__: blind)
     with pytest.raises(ValueError, match=r"--anchors tracks corners of images, of which the sequence .* has none"):
         job_from(options)
-    monkeypatch.setattr("ufmstar_torch.eval.run_job.open_sequence", lambda *_, **__: tour)
+    monkeypatch.setattr("ufmstar_torch.eval.commands.run_job.open_sequence", lambda *_, **__: tour)
     monkeypatch.setattr(run_anchors, "find_spec", lambda _: None)
     with pytest.raises(ModuleNotFoundError, match=r"--anchors needs OpenCV: pip install 'ufmstar-torch\[eval\]'"):
         job_from(options)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from layouts_more import DRIVE, T_car_rect, write_kitti360
 
-from ufmstar_torch.eval.sequences import FrameError, check_sequence, find_sequences, open_sequence
+from ufmstar_torch.eval.check.check import check_sequence
+from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
 from ufmstar_torch.eval.sequences.laser import read_scan, unroll
 from ufmstar_torch.eval.sequences.register import project
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from shared_data import require_shared
 
-from ufmstar_torch.eval.sequences import DepthFolder, check_sequence, open_sequence
+from ufmstar_torch.eval.check.check import check_sequence
+from ufmstar_torch.eval.sequences import DepthFolder, open_sequence
 
 # folder, layout, frames, K (fx, fy, cx, cy), a depth scale that is wrong, and by how much
 RECORDINGS = {

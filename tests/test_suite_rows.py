@@ -15,10 +15,10 @@ from scipy.stats import kstest
 from tiny_suite import CPU, base_network, row, write_network, write_networks
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.suite.estimator import make_estimator, ufm_star_config
-from ufmstar_torch.eval.suite.networks import BaseNetwork, NetworkChoice
-from ufmstar_torch.eval.suite.perturb import perturbed, rotation, selects
-from ufmstar_torch.eval.suite.setting import Setting
+from ufmstar_torch.eval.engine.estimator import make_estimator, ufm_star_config
+from ufmstar_torch.eval.engine.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.methods.perturb import perturbed, rotation, selects
+from ufmstar_torch.eval.methods.setting import Setting
 
 POSE = np.block([[Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix(), np.array([[1.0], [2], [3]])], [np.eye(4)[3:]]])
 

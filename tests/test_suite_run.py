@@ -15,16 +15,16 @@ import torch
 from layouts_more import write_nyu
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 
-from ufmstar_torch.eval.output_folder import FolderError
+from ufmstar_torch.eval.results.output_folder import FolderError
 from ufmstar_torch.eval.report.load import load_results
-from ufmstar_torch.eval.suite.cache import CacheError
-from ufmstar_torch.eval.suite.evaluate import SequenceError, evaluate_sequence
-from ufmstar_torch.eval.suite.options import eval_parser, job_from, parse_eval
-from ufmstar_torch.eval.suite.record import Record
-from ufmstar_torch.eval.suite.run_suite import DIED, failures, with_references
-from ufmstar_torch.eval.suite.store import EvalFolder
-from ufmstar_torch.eval.suite.suite import rows_of
-from ufmstar_torch.eval.suite.worklist import Shard, content_digest
+from ufmstar_torch.eval.results.cache import CacheError
+from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
+from ufmstar_torch.eval.commands.eval_options import eval_parser, job_from, parse_eval
+from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.results.run_suite import DIED, failures, with_references
+from ufmstar_torch.eval.results.store import EvalFolder
+from ufmstar_torch.eval.methods.suite import rows_of
+from ufmstar_torch.eval.results.worklist import Shard, content_digest
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
 
 
 def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
-    from ufmstar_torch.eval.suite.cache import PredictionCache
+    from ufmstar_torch.eval.results.cache import PredictionCache
 
     job = replace(job_on(rooms, tmp_path / "out"), frames=slice(1, None, 2), examples=1)
     go(job, evaluate_sequence)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.suite.method import BASES, MANY
-from ufmstar_torch.eval.suite.setting import DEFAULT, Setting
-from ufmstar_torch.eval.suite.suite import Suite, configured, default_of, rows_of, setting_from, value_of
-from ufmstar_torch.eval.suite.suite_file import suite_from_file
-from ufmstar_torch.eval.suite.suites import ROTATIONS, SKIPS, TRANSLATIONS, names, suite_named
+from ufmstar_torch.eval.methods.method import BASES, MANY
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
+from ufmstar_torch.eval.methods.suite import Suite, configured, default_of, rows_of, setting_from, value_of
+from ufmstar_torch.eval.methods.suite_file import suite_from_file
+from ufmstar_torch.eval.methods.suites import ROTATIONS, SKIPS, TRANSLATIONS, names, suite_named
 
 # The rows of the paper's tables, written off.
 TABLE_1 = """

@@ -10,8 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ufmstar_torch.eval.sequences import check_sequence, open_sequence
-from ufmstar_torch.eval.synthetic import intrinsics, look
+from ufmstar_torch.eval.check.check import check_sequence
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.tour.box_room import intrinsics, look
 from ufmstar_torch.eval.tour import Tour, TourStyle, make_tour, render, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.intersect import entry
 from ufmstar_torch.eval.tour.sensor import develop

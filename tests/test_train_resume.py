@@ -15,7 +15,7 @@ import pytest
 import torch
 from trainings import RECIPE, tiny_job, with_network, write_frames
 
-from ufmstar_torch.eval.run_folder import FolderError
+from ufmstar_torch.eval.results.run_folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, ResumeError, read_checkpoint
 from ufmstar_torch.train.fit import fit

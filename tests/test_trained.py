@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from ufmstar_torch import UncertainDepth, cli
-from ufmstar_torch.eval.writers import read_frame
+from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.models import NetworkSpec, build_network, load_network, load_trained, read_info, save_trained
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, BatchEnsembleMember
 from ufmstar_torch.models.checkpoints import CheckpointError

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import scenes
-from ufmstar_torch.eval.ufm import UfM, UfMConfig
-from ufmstar_torch.eval.ufm_cloud import Cloud
+from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
+from ufmstar_torch.eval.methods.ufm_cloud import Cloud
 
 H, W, FRAMES = 15, 20, 36
 CAP = 420

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import scenes
-from ufmstar_torch.eval.ufm import UfM, UfMConfig
+from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.pipeline import combine
 from ufmstar_torch.prediction import DepthPrediction
 

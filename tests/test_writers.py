@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ufmstar_torch.eval import files
-from ufmstar_torch.eval.files import to_json, write_atomic, write_json_atomic
-from ufmstar_torch.eval.writers import (
+from ufmstar_torch.eval.results import files
+from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
+from ufmstar_torch.eval.results.writers import (
     FULL,
     FrameWriter,
     fitting_unit,

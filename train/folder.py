@@ -20,8 +20,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.files import to_json, write_json_atomic
-from ufmstar_torch.eval.run_folder import FolderError, flatten
+from ufmstar_torch.eval.results.files import to_json, write_json_atomic
+from ufmstar_torch.eval.results.run_folder import FolderError, flatten
 from ufmstar_torch.train.member import WEIGHTS, Job
 
 MANIFEST, SUMMARY, LOCK = "training.json", "summary.json", "lock"

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.files import write_atomic
+from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.nyu import INTRINSICS, NATIVE_SIZE, PARTS, part_files, read_h5
 from ufmstar_torch.train.samples import RawSample, SampleError

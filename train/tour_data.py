@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.files import write_together
+from ufmstar_torch.eval.results.files import write_together
 from ufmstar_torch.eval.tour.style import TourStyle, style_of
 from ufmstar_torch.train.samples import RawSample, SampleError
 
@@ -68,10 +68,9 @@ class TourSettings:
     def digest(self) -> str:
         """16 hexadecimal digits that change with every setting and with the renderer's source."""
         import ufmstar_torch.eval.tour as package
-        from ufmstar_torch.eval import synthetic
 
         told = {**asdict(self), "style": asdict(style_of(self.style))}
-        sources = [Path(str(synthetic.__file__)), *sorted(Path(str(package.__file__)).parent.glob("*.py"))]
+        sources = sorted(Path(str(package.__file__)).parent.glob("*.py"))
         digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
         for source in (*sources, Path(__file__)):
             digest.update(source.read_bytes())

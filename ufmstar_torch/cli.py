@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.suite.launch import Ended
+    from ufmstar_torch.eval.results.launch import Ended
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 _HELP = """usage: ufmstar COMMAND ...
@@ -59,7 +59,7 @@ def run(arguments: Sequence[str]) -> int:
     """depth and variance of a sequence of posed images, onto disk"""
     from jsonargparse import ArgumentError
 
-    from ufmstar_torch.eval.run_options import check_options, parse_run, run_parser
+    from ufmstar_torch.eval.commands.run_options import check_options, parse_run, run_parser
 
     try:
         options = parse_run(run_parser(), arguments)
@@ -78,7 +78,7 @@ def run(arguments: Sequence[str]) -> int:
 
 def bench(arguments: Sequence[str]) -> int:
     """time per stage and memory, beside the depth network's own"""
-    from ufmstar_torch.eval import benchmark
+    from ufmstar_torch.eval.bench import benchmark
 
     return int(benchmark.main(list(arguments)) or OK)
 
@@ -102,7 +102,7 @@ def train(arguments: Sequence[str]) -> int:
         raise UsageError(_one_line(error)) from error
     from lightning.pytorch.utilities import rank_zero_only
 
-    from ufmstar_torch.eval.terminal import stop_signals
+    from ufmstar_torch.eval.commands.terminal import stop_signals
     from ufmstar_torch.train.fit import fit, report
     from ufmstar_torch.train.start import missing_start
 
@@ -131,19 +131,19 @@ def evaluate(arguments: Sequence[str]) -> int:
     """the rows of a table or figure of the paper, on your own sequences"""
     from jsonargparse import ArgumentError
 
-    from ufmstar_torch.eval.suite.options import check_options, eval_parser, parse_eval
+    from ufmstar_torch.eval.commands.eval_options import check_options, eval_parser, parse_eval
 
     try:
         options = parse_eval(eval_parser(), arguments)
         if options["list"]:
-            from ufmstar_torch.eval.suite.suites import listing
+            from ufmstar_torch.eval.methods.suites import listing
 
             print(listing())
             return OK
         check_options(options)
     except (ArgumentError, ValueError) as error:
         raise UsageError(_one_line(error)) from error
-    from ufmstar_torch.eval.suite.cache import CacheError
+    from ufmstar_torch.eval.results.cache import CacheError
 
     try:
         _set_threads(options["threads"])
@@ -162,7 +162,7 @@ def evaluate(arguments: Sequence[str]) -> int:
 
 def report(arguments: Sequence[str]) -> int:
     """tables, figures and a page from what eval has left"""
-    from ufmstar_torch.eval.report.options import parse_report
+    from ufmstar_torch.eval.commands.report_options import parse_report
 
     options = parse_report(arguments)
     from ufmstar_torch.eval.report.load import ResultsError, load_results
@@ -183,7 +183,7 @@ def report(arguments: Sequence[str]) -> int:
 
 def demo(arguments: Sequence[str]) -> int:
     """the main job on rendered rooms, with nothing but this package"""
-    from ufmstar_torch.eval.demo_options import parse_demo
+    from ufmstar_torch.eval.commands.demo_options import parse_demo
 
     options = parse_demo(arguments)
     try:
@@ -192,7 +192,7 @@ def demo(arguments: Sequence[str]) -> int:
         if options.debug:
             traceback.print_exc()
         return _told(f"ufmstar demo: failed: {_one_line(error)}", FAILED)
-    from ufmstar_torch.eval.demo_report import explanation, table
+    from ufmstar_torch.eval.report.demo_report import explanation, table
 
     print(table(summary), explanation(summary), sep="\n\n")
     return OK
@@ -200,8 +200,8 @@ def demo(arguments: Sequence[str]) -> int:
 
 def data(arguments: Sequence[str]) -> int:
     """check: whether a sequence's poses, depth and images fit together"""
-    from ufmstar_torch.eval.data_command import check
-    from ufmstar_torch.eval.data_options import parse_data
+    from ufmstar_torch.eval.commands.data_command import check
+    from ufmstar_torch.eval.commands.data_options import parse_data
 
     try:
         own, options = parse_data(arguments)
@@ -229,10 +229,10 @@ def _run(options: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         UsageError: it cannot be opened.
     """
-    from ufmstar_torch.eval.run import run as run_job
-    from ufmstar_torch.eval.run_folder import FolderError
-    from ufmstar_torch.eval.run_job import job_from
-    from ufmstar_torch.eval.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.commands.run import run as run_job
+    from ufmstar_torch.eval.results.run_folder import FolderError
+    from ufmstar_torch.eval.commands.run_job import job_from
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 
     try:
         _set_threads(options["threads"])
@@ -262,8 +262,8 @@ def _evaluate(options: Mapping[str, Any]) -> int:
         FileNotFoundError, ValueError: it cannot be begun.
         CacheError, ImportError, OSError, RuntimeError: it cannot be finished.
     """
-    from ufmstar_torch.eval.suite.launch import evaluate_suite
-    from ufmstar_torch.eval.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.results.launch import evaluate_suite
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
 
     with Bars() as bars, stop_signals(bars.say) as stop:
         ended = evaluate_suite(options, stop=stop, tell=bars.say, progress=bars.frames)
@@ -274,7 +274,7 @@ def _evaluate(options: Mapping[str, Any]) -> int:
 
 def _tell(ended: Ended, threads: int | None, *, draws: bool) -> int:
     """The table, the measurements and pictures that belong to it, and what is broken; the exit code."""
-    from ufmstar_torch.eval.suite.outcome import draw, measure, table
+    from ufmstar_torch.eval.commands.outcome import draw, measure, table
 
     print(table(ended), flush=True)
     if ended.finished:
@@ -300,9 +300,9 @@ def _dry_run(options: Mapping[str, Any]) -> int:
     """
     import torch
 
-    from ufmstar_torch.eval.suite.dry_run import dry_run
-    from ufmstar_torch.eval.suite.options import job_from
-    from ufmstar_torch.eval.suite.worklist import Shard
+    from ufmstar_torch.eval.commands.dry_run import dry_run
+    from ufmstar_torch.eval.commands.eval_options import job_from
+    from ufmstar_torch.eval.results.worklist import Shard
 
     job = job_from(options)
     print(dry_run(job, job.load(torch.device("cpu")), Shard.parse(options["shard"] or "1/1")))
@@ -315,9 +315,9 @@ def _demo(options: Any) -> dict[str, Any]:
     Raises:
         UsageError: the options do not fit, or what they name is not there.
     """
-    from ufmstar_torch.eval.demo import DemoOptions, run_demo
-    from ufmstar_torch.eval.demo_folder import DemoError
-    from ufmstar_torch.eval.terminal import Bars
+    from ufmstar_torch.eval.commands.demo import DemoOptions, run_demo
+    from ufmstar_torch.eval.results.demo_folder import DemoError
+    from ufmstar_torch.eval.commands.terminal import Bars
 
     try:
         _set_threads(options.threads)
@@ -340,8 +340,8 @@ def _demo(options: Any) -> dict[str, Any]:
 
 def _report(summary: Mapping[str, Any], out: str) -> int:
     """Print the table and where the outputs are; the exit code."""
-    from ufmstar_torch.eval.summary import FINISHED, table
-    from ufmstar_torch.eval.summary import INTERRUPTED as STOPPED
+    from ufmstar_torch.eval.results.summary import FINISHED, table
+    from ufmstar_torch.eval.results.summary import INTERRUPTED as STOPPED
 
     if summary["frames"]["done"]:
         print(table(summary))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.colours import ColourScale, robust_range
+from ufmstar_torch.eval.report.colours import ColourScale, robust_range
 from ufmstar_torch.eval.report.example import Example
 from ufmstar_torch.eval.report.grid import Bar, Box, GridRow, Panel, draw_grid
 from ufmstar_torch.eval.report.strips import figures_of, fit_scales

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ufmstar_torch.eval.suite.row import Row
+from ufmstar_torch.eval.methods.row import Row
 
 LOWER, HIGHER = "lower", "higher"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ufmstar_torch.eval.files import write_atomic
+from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.report.aggregate import value_of
 from ufmstar_torch.eval.report.embed import MOST_BYTES, Embedder
 from ufmstar_torch.eval.report.findings import count, join

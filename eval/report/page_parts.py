@@ -124,7 +124,7 @@ def efficiency_part(results: Results) -> Part | None:
     """Latency, power, energy and memory, where the suite measured them."""
     if results.efficiency is None:
         return None
-    from ufmstar_torch.eval.efficiency.table import efficiency_tables
+    from ufmstar_torch.eval.bench.efficiency_table import efficiency_tables
 
     tables = efficiency_tables(results.efficiency)
     return Part("Efficiency", [html_table(table) for table in tables]) if tables else None

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from hashlib import sha256
 from pathlib import Path
 
-from ufmstar_torch.eval.files import write_json_atomic
+from ufmstar_torch.eval.results.files import write_json_atomic
 
 INDEX = "pictures.json"
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"

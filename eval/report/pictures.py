@@ -14,10 +14,10 @@ from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.picture import BREAKDOWN, COMPARE, ROOM, STRIP, Picture, file_name, write_index
 from ufmstar_torch.eval.report.rooms import choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.report.strips import draw_breakdown, draw_strip, mean_nll
-from ufmstar_torch.eval.suite.method import ALONE, UFM, UFM_STAR, Method
-from ufmstar_torch.eval.suite.row import Row
-from ufmstar_torch.eval.suite.setting import DEFAULT
-from ufmstar_torch.eval.suite.worklist import WorkItem
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import DEFAULT
+from ufmstar_torch.eval.results.worklist import WorkItem
 
 # So that a report of a hundred sequences stays one that can be read, and mailed.
 MOST_FRAMES, MOST_ROOMS = 4, 3

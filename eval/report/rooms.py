@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.colours import ERROR_MAP, ColourScale, require_matplotlib, robust_range
-from ufmstar_torch.eval.files import write_atomic
-from ufmstar_torch.eval.plots import FAINT, INK
+from ufmstar_torch.eval.report.colours import ERROR_MAP, ColourScale, require_matplotlib, robust_range
+from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.report.plots import FAINT, INK
 from ufmstar_torch.eval.report.example import load_arrays
 from ufmstar_torch.eval.report.projection import Ellipses, View, project, views_of
 

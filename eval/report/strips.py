@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.report.example import Example, Map, RowMaps, deviation
 from ufmstar_torch.eval.report.grid import Bar, GridRow, Panel, draw_grid
 

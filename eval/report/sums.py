@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.packed_sums import unpack
+from ufmstar_torch.eval.metrics.packed_sums import unpack
 
 METRICS = "metrics"
 BY_ERROR = "nll_by_error:"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.files import write_atomic
+from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.report.latex import latex
 from ufmstar_torch.eval.report.load import Results, load_results
 from ufmstar_torch.eval.report.markdown import markdown
@@ -81,7 +81,7 @@ def write_tables(results: Results) -> list[Path]:
 
 def _efficiency(measured: Mapping[str, Any]) -> list[Table]:
     """Ours, and the paper's below."""
-    from ufmstar_torch.eval.efficiency.table import efficiency_tables
+    from ufmstar_torch.eval.bench.efficiency_table import efficiency_tables
 
     return [*efficiency_tables(measured), *paper_efficiency_tables(row["network"] for row in measured["rows"])]
 

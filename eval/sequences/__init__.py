@@ -6,8 +6,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.sequences.check import SequenceCheck as SequenceCheck
-    from ufmstar_torch.eval.sequences.check import check_sequence as check_sequence
     from ufmstar_torch.eval.sequences.conventions import CONVENTIONS as CONVENTIONS
     from ufmstar_torch.eval.sequences.depth_folder import DepthFolder as DepthFolder
     from ufmstar_torch.eval.sequences.find import Found as Found
@@ -25,9 +23,7 @@ _HOME = {
     "Frame": "frame",
     "FrameError": "frame",
     "Sequence": "frame",
-    "SequenceCheck": "check",
     "Skipped": "frame",
-    "check_sequence": "check",
     "find_sequences": "find",
     "open_sequence": "layout",
 }

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Size, make_sequence
-from ufmstar_torch.eval.synthetic import intrinsics
+from ufmstar_torch.eval.tour.box_room import intrinsics
 from ufmstar_torch.eval.tour.path import tour_path
 from ufmstar_torch.eval.tour.style import TourStyle
 from ufmstar_torch.eval.tour.tour import Tour, make_tour

@@ -1,0 +1,1 @@
+"""``ufmstar bench`` and the efficiency tables: time, energy and memory."""

@@ -1,0 +1,224 @@
+"""``ufmstar bench``: times of the stages and of the whole UfM* step beside two networks' forward passes.
+
+Nothing here passes or fails: absolute times depend on the machine and on what else it does. See
+docs/benchmark.md for what each figure means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
+
+# Milliseconds and ratios at 224 x 224, bytes and ratios for one room; the tracker's mean processor time for 300 corners
+# at 640 x 480. For information.
+_TARGETS = {
+    "spgf_ms": 1.5,
+    "step_ms": 10.0,
+    "step/resnet50": 1 / 3,
+    "components_bytes": 30_000.0,
+    "long_run_ratio": 1.2,
+    "tracker_cpu_ms": 3.0,
+}
+_TARGET_SIZE, _TARGET_CORNERS = 224, 300
+_WARM_UP, _TORCH_ROUNDS = 3, 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the benchmark to a parser."""
+    parser.add_argument("--sequence", type=Path, help="recorded sequence (default: a rendered room)")
+    parser.add_argument(
+        "--weights", type=Path, help="FastDepth's weights (default: random); with --sequence it then predicts the depth"
+    )
+    parser.add_argument("--sizes", type=int, nargs="+", default=[224, 518], help="image sizes [px]")
+    parser.add_argument(
+        "--backends", nargs="+", choices=["numba", "torch"], default=["numba", "torch"], help="kernels to time"
+    )
+    parser.add_argument("--frames", type=int, default=40, help="timed frames (the torch backend: at most 3)")
+    parser.add_argument("--in-view", type=int, default=100, help="components in view from which on frames are timed")
+    parser.add_argument("--history", type=int, default=400, help="frames that may pass before that at most")
+    parser.add_argument("--boxes", type=int, default=40, help="things in the rendered room")
+    parser.add_argument("--threads", type=int, help="of torch and numba (default: the cores of this process)")
+    parser.add_argument("--seed", type=int, default=0, help="of the rendered room")
+    parser.add_argument(
+        "--long", type=int, nargs="?", const=1000, help="also time this many frames in one room (1000 without a number)"
+    )
+    parser.add_argument(
+        "--anchors", type=int, nargs="?", const=_TARGET_CORNERS, metavar="CORNERS",
+        help="also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one "
+        f"thread ({_TARGET_CORNERS} without a number; needs OpenCV)",
+    )  # fmt: skip
+    parser.add_argument("--skip-compile", action="store_true", help="do not time compilation (some tens of seconds)")
+    parser.add_argument("--json", type=Path, help="write the report here")
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options of the benchmark from arguments without the program's name; None = the process's."""
+    parser = argparse.ArgumentParser(prog="ufmstar bench", description=__doc__)
+    add_arguments(parser)
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the benchmark, print its table and write its JSON; returns 0, or 2 for arguments that do not fit.
+
+    Args:
+        argv: arguments without the program's name; None = those of the process.
+    """
+    options = parse(argv)
+    try:
+        report = run_benchmark(options, progress=lambda text: print(text, file=sys.stderr, flush=True))
+    except (ValueError, FileNotFoundError, ModuleNotFoundError) as error:
+        print(f"ufmstar bench: {error}", file=sys.stderr)
+        return 2
+    from ufmstar_torch.eval.bench.benchmark_report import format_report
+
+    print(format_report(report))
+    if options.json is not None:
+        from ufmstar_torch.eval.results.files import write_json_atomic
+
+        write_json_atomic(options.json, report)
+    return 0
+
+
+def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
+    """Measure what the options (see :func:`add_arguments`) ask for.
+
+    Args:
+        progress: is told what is measured next.
+
+    Returns:
+        The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run" and
+        "anchors" where asked for, and "targets".
+
+    Raises:
+        ValueError: an option is out of range.
+        FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
+    """
+    from ufmstar_torch import UfMStarConfig
+    from ufmstar_torch.eval.bench import benchmark_machine as machine
+    from ufmstar_torch.eval.bench.benchmark_compile import measure_compilation
+    from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
+
+    _check(options)
+    config = UfMStarConfig()
+    threads = machine.available_cores() if options.threads is None else options.threads
+    report: dict[str, Any] = {
+        "schema": 1,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": machine.versions(),
+        "hardware": machine.hardware(),
+        "load_average": {"before": machine.load_average()},
+        "settings": {"threads": threads, "seed": options.seed, "config": config.to_dict()},
+        "compilation": None,
+        "long_run": None,
+        "anchors": None,
+    }
+    if "numba" in options.backends and not options.skip_compile:
+        progress("compilation")
+        report["compilation"] = measure_compilation()
+    with pinned_threads(threads):
+        fastdepth, source = _inputs(options)
+        report["settings"]["source"] = source.describe()
+        report["results"] = _results(options, config, fastdepth, source, progress)
+        if options.long is not None:
+            progress(f"long run of {options.long} frames")
+            backend = config.replace(backend=options.backends[0])
+            report["long_run"] = measure_long_run(source, backend, size=_TARGET_SIZE, frames=options.long)
+        if options.anchors is not None:
+            report["anchors"] = _anchors(options, config, source, progress)
+    report["load_average"]["after"] = machine.load_average()
+    report["targets"] = targets(report)
+    return report
+
+
+def _check(options: argparse.Namespace) -> None:
+    for name in ("frames", "boxes", "history", "in_view", "anchors"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+    if min(options.sizes) < 16:
+        raise ValueError(f"--sizes must be at least 16 pixels, got {options.sizes}")
+
+
+def _inputs(options: argparse.Namespace) -> tuple[Any, Any]:
+    """FastDepth, with random weights of the pruned network's shape if none are given, and the frames' source."""
+    from ufmstar_torch.eval.bench.benchmark_frames import RecordedSequence, RenderedRoom
+    from ufmstar_torch.models import FastDepth, FastDepthWidths, load_network
+
+    if options.weights is None:
+        fastdepth = FastDepth(FastDepthWidths.pruned()).eval()
+    else:
+        loaded = load_network("fastdepth", options.weights)
+        assert isinstance(loaded, FastDepth)
+        fastdepth = loaded
+    if options.sequence is None:
+        return fastdepth, RenderedRoom(boxes=options.boxes, seed=options.seed)
+    if not options.sequence.exists():
+        raise FileNotFoundError(f"--sequence {options.sequence} does not exist")
+    return fastdepth, RecordedSequence(options.sequence, None if options.weights is None else fastdepth)
+
+
+def _results(
+    options: argparse.Namespace, config: Any, fastdepth: Any, source: Any, progress: Callable[[str], object]
+) -> list[dict[str, Any]]:
+    from ufmstar_torch.eval.bench.benchmark_step import Plan, build_up, measure_step, reference_networks
+
+    results = []
+    for size in options.sizes:
+        progress(f"{size} x {size}, building up the mixture")
+        networks, about = reference_networks(size, fastdepth)
+        rounds = _WARM_UP + options.frames
+        built, frames, history = build_up(
+            source, config, size=size, in_view=options.in_view, history=options.history, rounds=rounds
+        )
+        for backend in options.backends:
+            progress(f"{size} x {size}, {backend}")
+            timed = options.frames if backend == "numba" else min(options.frames, _TORCH_ROUNDS)
+            plan = Plan(size, backend, _WARM_UP if backend == "numba" else 1, timed)
+            result = measure_step(plan, built, frames, networks)
+            results.append({**result, "history": history, "networks_about": about})
+    return results
+
+
+def _anchors(
+    options: argparse.Namespace, config: Any, source: Any, progress: Callable[[str], object]
+) -> dict[str, Any]:
+    from ufmstar_torch.eval.bench.benchmark_anchors import measure_anchors
+
+    progress(f"{options.anchors} corners and anchors")
+    return measure_anchors(
+        source, config.replace(backend=options.backends[0]), points=options.anchors, frames=options.frames,
+        history=options.history, in_view=options.in_view, step_size=_TARGET_SIZE,
+    )  # fmt: skip
+
+
+def targets(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """The figures that have a target, for information: name, value (None = not measured), target, met."""
+    wanted = (r for r in report["results"] if r["size"] == _TARGET_SIZE and r["backend"] == "numba")
+    result, long_run, anchors = next(wanted, None), report["long_run"], report["anchors"]
+    values: dict[str, float | None] = dict.fromkeys(_TARGETS)
+    if result is not None:
+        values["spgf_ms"] = result["kernels"]["spgf"]["median_ms"]
+        values["step_ms"] = result["step"]["median_ms"]
+        values["components_bytes"] = result["memory"]["in_use"]
+        if "step/resnet50" in result["ratios"]:
+            values["step/resnet50"] = result["ratios"]["step/resnet50"]["median"]
+    if long_run is not None:
+        values["long_run_ratio"] = long_run["ratio"]
+        values["components_bytes"] = long_run["memory"]["in_use"]
+    if anchors is not None and anchors["points"] == _TARGET_CORNERS:
+        values["tracker_cpu_ms"] = anchors["tracker"]["update"]["cpu_mean_ms"]
+    return [
+        {"name": name, "value": value, "target": target, "met": None if value is None else value <= target}
+        for (name, value), target in zip(values.items(), _TARGETS.values(), strict=True)
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""What the benchmark feeds to UfM*: a rendered room, or the frames of a recorded sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.tour import box_room as synthetic
+from ufmstar_torch.eval.sequences import Sequence
+from ufmstar_torch.models import FastDepth, Preprocess
+
+
+@dataclass(frozen=True)
+class PosedDepth:
+    """One frame of one stream.
+
+    Attributes:
+        depth: [1, H, W] float32 [m], 0 where there is none.
+        T_world_cam: [4, 4] float64 camera-to-world [m].
+        intrinsics: [3, 3] float64 of the depth map [px].
+    """
+
+    depth: Tensor
+    T_world_cam: Tensor
+    intrinsics: Tensor
+
+
+class FrameSource(Protocol):
+    """Where frames come from.
+
+    Attributes:
+        available: how many there are, None = as many as one likes.
+    """
+
+    @property
+    def available(self) -> int | None: ...
+
+    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
+        """The first ``count`` frames at size x size pixels, or fewer where there are not so many."""
+
+    def describe(self) -> dict[str, object]:
+        """What it is, for the report."""
+
+
+@dataclass(frozen=True)
+class RenderedRoom:
+    """Frames of a room with things in it, whose depth flickers as a network's does.
+
+    Attributes:
+        boxes: number of things.
+        period: frames per turn of the camera.
+        flicker: standard deviation of the smooth relative error of the depth.
+        seed: of the room and of the flicker.
+    """
+
+    boxes: int = 40
+    period: int = 100
+    flicker: float = 0.03
+    seed: int = 0
+
+    @property
+    def available(self) -> int | None:
+        """None: it goes on for ever."""
+        return None
+
+    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
+        """The first ``count`` frames at size x size pixels."""
+        room = synthetic.Room.furnished(self.boxes, self.seed)
+        K = synthetic.intrinsics(size, size)
+        rng = np.random.default_rng(self.seed)
+        for T in synthetic.walk(count, self.period):
+            depth = synthetic.flicker(synthetic.render(room, T, K, size, size), self.flicker, rng)
+            yield PosedDepth(torch.from_numpy(depth).float()[None], torch.from_numpy(T), torch.from_numpy(K))
+
+    def describe(self) -> dict[str, object]:
+        """The settings, for the report."""
+        return {"kind": "rendered room", **asdict(self)}
+
+
+@dataclass(frozen=True)
+class RecordedSequence:
+    """Frames on disk with their own depth, or with FastDepth's prediction from their images.
+
+    Attributes:
+        path: the sequence, any layout that ``open_sequence`` knows.
+        network: predicts the depth at its own resolution; None = the sequence's depth maps.
+    """
+
+    path: Path
+    network: FastDepth | None = None
+
+    @property
+    def available(self) -> int | None:
+        """The number of its frames."""
+        return len(self._open())
+
+    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
+        """The first ``count`` frames, cropped to the centre and resized to size x size pixels.
+
+        Raises:
+            ValueError: they have no depth maps and no network predicts any.
+        """
+        sequence = self._open()
+        if self.network is None and sequence.without_depth:
+            raise ValueError(
+                f"{self.path} has frames without a depth map: give weights to predict depth from the images"
+            )
+        for index in range(min(count, len(sequence))):
+            frame = sequence[index]
+            T = torch.from_numpy(frame.T_world_cam)
+            if self.network is None:
+                assert frame.depth is not None  # checked above
+                own = frame.intrinsics if frame.depth_intrinsics is None else frame.depth_intrinsics
+                yield _square(torch.from_numpy(frame.depth)[None], T, torch.from_numpy(own), size)
+            else:
+                assert frame.image is not None  # every layout has images
+                yield _predicted(self.network, frame.image, T, torch.from_numpy(frame.intrinsics), size)
+
+    def describe(self) -> dict[str, object]:
+        """What was read, for the report; the folder's name only, not where it lies on this machine."""
+        depth = "of the sequence" if self.network is None else "predicted by FastDepth"
+        return {"kind": "recorded sequence", "name": self.path.name, "depth": depth}
+
+    def _open(self) -> Sequence:
+        from ufmstar_torch.eval.sequences import open_sequence
+
+        return open_sequence(self.path)
+
+
+def _square(depth: Tensor, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDepth:
+    preprocess = Preprocess(resize_height=size, crop=(size, size))
+    return PosedDepth(preprocess.apply_depth(depth), T_world_cam, preprocess.apply_intrinsics(K, *depth.shape[-2:]))
+
+
+def _predicted(network: FastDepth, image: np.ndarray, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDepth:
+    """FastDepth at the resolution it was trained for, enlarged linearly."""
+    rgb = torch.from_numpy(image).permute(2, 0, 1)[None]
+    x, K = network.preprocess(rgb, K)
+    with torch.inference_mode():
+        depth = network(x).depth
+    enlarged = Preprocess(size=(size, size), antialias=False)
+    resized = torch.nn.functional.interpolate(depth[None], (size, size), mode="bilinear")[0]
+    return PosedDepth(resized.clone(), T_world_cam, enlarged.apply_intrinsics(K, *depth.shape[-2:]))

@@ -1,0 +1,117 @@
+"""The benchmark's report as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ufmstar_torch.eval.bench.benchmark_timing import STAGES
+
+_COLUMNS = ("median_ms", "p90_ms", "mean_ms", "min_ms", "cpu_median_ms", "cpu_p90_ms", "cpu_mean_ms", "cpu_min_ms")
+
+
+def format_report(report: Mapping[str, Any]) -> str:
+    """A table per size and backend, the long run, and the targets."""
+    machine, load = report["hardware"], report["load_average"]
+    versions = ", ".join(f"{name} {value}" for name, value in report["versions"].items() if value)
+    lines = [
+        f"{machine['cpu']}, {machine['cores']} cores, {report['settings']['threads']} threads, {machine['platform']}",
+        versions,
+        f"load average {_number(load['before'])} before, {_number(load['after'])} after",
+    ]
+    if load["before"] is not None and load["before"] > machine["cores"] / 2:
+        lines.append("the machine was busy: compare ratios, minima and processor times, not medians")
+    if report["compilation"] is not None:
+        c = report["compilation"]
+        lines.append(f"first steps of a process: {c['cold_s']:.1f} s compiling, {c['warm_s']:.1f} s with compiled code")
+    for result in report["results"]:
+        lines += ["", *_result(result)]
+    if report["long_run"] is not None:
+        lines += ["", *_long_run(report["long_run"])]
+    if report["anchors"] is not None:
+        lines += ["", *_anchors(report["anchors"])]
+    lines += ["", f"{'target (for information)':26}{'value':>12}{'target':>12}"]
+    for row in report["targets"]:
+        told = {None: "not measured", True: "met", False: "missed"}[row["met"]]
+        lines.append(f"{row['name']:26}{_number(row['value']):>12}{_number(row['target']):>12}  {told}")
+    return "\n".join(lines)
+
+
+def _result(result: Mapping[str, Any]) -> list[str]:
+    counts, memory = result["counts"], result["memory"]
+    lines = [
+        f"{result['size']} x {result['size']}, backend {result['backend']}, {result['frames']['timed']} frames: "
+        f"{counts['in_view']['median']:.0f} components in view ({counts['in_view']['min']:.0f} to "
+        f"{counts['in_view']['max']:.0f}), {counts['components']['max']:.0f} in total, "
+        f"{counts['segments']['median']:.0f} segments per frame",
+        f"  {'[ms]':24}{'median':>9}{'IQR':>9}{'minimum':>9}{'CPU':>9}",
+        _row("whole step", result["step"]),
+        *(_row(f"  {name}", result["stages"][name]) for name in STAGES),
+        _row("  sum of stages", result["stages_total"]),
+        *(_row(f"  kernel {name}", times) for name, times in result["kernels"].items()),
+        _row(f"mean of {result['mean_uncertainty']['pixels']} pixels", result["mean_uncertainty"]),
+        *(_row(f"{name} forward", times) for name, times in result["networks"].items()),
+    ]
+    ratios = (
+        f"{name} {r['median']:.3f} ({r['q1']:.3f} to {r['q3']:.3f}; CPU {r['cpu_median']:.3f})"
+        for name, r in result["ratios"].items()
+    )
+    lines.append("  ratios, median and quartiles: " + "; ".join(ratios))
+    lines.append(
+        f"  memory: {memory['components']} components of {memory['bytes_per_component']} B = "
+        f"{memory['in_use'] / 1e3:.1f} kB in use, {memory['allocated'] / 1e3:.1f} kB allocated, "
+        f"moving average {memory['moving_average'] / 1e3:.1f} kB"
+    )
+    return lines
+
+
+def _long_run(run: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"long run, {run['size']} x {run['size']}, {run['frames']} frames in one room: last steps / early ones = "
+        f"{run['ratio']:.2f} (CPU {run['cpu_ratio']:.2f}), {run['memory']['in_use'] / 1e3:.1f} kB in use",
+        f"  {'frames':>12}{'step [ms]':>11}{'CPU [ms]':>10}{'total':>8}{'in view':>9}{'segments':>10}{'new':>7}",
+    ]
+    for row in run["rows"]:
+        low, high = row["frames"]
+        lines.append(
+            f"  {f'{low}-{high}':>12}{row['step_median_ms']:11.2f}{row['step_cpu_median_ms']:10.2f}"
+            f"{row['components']:8d}{row['in_view_mean']:9.0f}{row['segments_mean']:10.1f}{row['new_mean']:7.2f}"
+        )
+    return lines
+
+
+def _anchors(found: Mapping[str, Any]) -> list[str]:
+    tracker, step, (height, width) = found["tracker"], found["step"], found["tour"]["size"]
+    followed, ratio, extra = tracker["followed"], step["ratio"], step["extra_bytes"]
+    rows = {
+        "tracker, a frame": tracker["update"],
+        **{f"  {name}": times for name, times in tracker["parts"].items()},
+        "step without anchors": step["plain"],
+        "step with anchors": step["anchored"],
+    }
+    return [
+        f"anchors, one thread: {followed['mean']:.0f} corners followed at {width} x {height} ({followed['min']:.0f} to "
+        f"{followed['max']:.0f}), {tracker['landmarks']['mean']:.0f} of them triangulated, new ones found in "
+        f"{tracker['refills']:.0%} of {found['frames']} frames",
+        f"  {'[ms]':24}{'median':>9}{'90 %':>9}{'mean':>9}{'minimum':>9}{'CPU:':>6}{'median':>9}{'90 %':>9}{'mean':>9}"
+        f"{'minimum':>9}",
+        *(_anchor_row(name, times) for name, times in rows.items()),
+        f"  step of {step['size']} x {step['size']} with {step['anchors']} anchors ({step['used']['mean']:.0f} used) / "
+        f"without: {ratio['median']:.2f} ({ratio['q1']:.2f} to {ratio['q3']:.2f}; CPU {ratio['cpu_median']:.2f}); "
+        f"{extra['total'] / 1e3:.1f} kB more state ({extra['per_slot']} B a component), "
+        f"tracker {tracker['state_bytes'] / 1e3:.0f} kB",
+    ]
+
+
+def _anchor_row(name: str, times: Mapping[str, Any]) -> str:
+    wall, cpu = ("".join(f"{times[c]:9.2f}" for c in half) for half in (_COLUMNS[:4], _COLUMNS[4:]))
+    return f"  {name:24}{wall}{'':6}{cpu}"
+
+
+def _row(name: str, times: Mapping[str, Any]) -> str:
+    cpu = f"{times['cpu_median_ms']:9.2f}" if "cpu_median_ms" in times else ""
+    return f"  {name:24}{times['median_ms']:9.2f}{times['iqr_ms']:9.2f}{times['min_ms']:9.2f}{cpu}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

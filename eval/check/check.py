@@ -1,0 +1,280 @@
+"""Do a sequence's depth, poses and images fit together? Checked by warping depth between its frames.
+
+Wrong conventions are silent: inverted poses or millimetres read as metres give a variance map that is
+merely wrong. Depth of one frame, moved into a later one, must agree with that frame's depth; the check
+also tries what people get wrong (inverse poses, other axes, another depth scale) and names what fits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ufmstar_torch.eval.check.alignment import Alignment, alignment
+from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
+
+AS_GIVEN = CONVENTIONS[OURS].told
+_READINGS = {convention.told: convention.convert for convention in CONVENTIONS.values()}
+_SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
+_POINTS = 2000
+# Share of a frame's points that must land on valid depth, of those that would if all fell into the image, or a pair
+# tells nothing; a laser's map has values at few pixels only.
+_MIN_OVERLAP = 0.3
+_GAPS = (5, 3, 2, 1)
+# A reading is no better than another within this factor and this relative error (depth's own noise).
+_SAME_FACTOR, _SAME_ERROR = 1.5, 0.003
+_MAX_ERROR = 0.05  # above it no reading explains the data; registered sequences are at .001 to .02
+# Nearer to 1 a scale is noise (1.15 was estimated from four pairs of fr1/xyz) or calibration, no mistake.
+_SCALE_TOLERANCE = 1.25
+# See alignment(): with 10 frames, registered recordings have at least .5, displaced ones at most .2.
+_ALIGNED, _NOT_ALIGNED, _REGISTRATION_FRAMES = 0.4, 0.25, 12
+_MIN_EDGES, _MIN_CONTRAST = 500, 0.03  # contrast observed: .04 to .25
+
+
+@dataclass(frozen=True)
+class SequenceCheck:
+    """What :func:`check_sequence` found.
+
+    Attributes:
+        pairs: pairs of frames compared, ``gap`` frames apart.
+        gap: see ``pairs``.
+        error: median relative error of warped depth, as the sequence is given; inf without overlap.
+        reading: the reading of the poses that fits best, and ``scale``, by which depth must be multiplied
+            then; ``best_error`` is the error with both.
+        scale: see ``reading``.
+        best_error: see ``reading``.
+        registration: how depth lies on the image, or None where it was not checked.
+        unreadable: files that could not be decoded.
+        problems: what is wrong, in words; empty if nothing.
+        undecided: what this sequence cannot tell, in words.
+    """
+
+    pairs: int
+    gap: int
+    error: float
+    reading: str
+    scale: float
+    best_error: float
+    registration: Alignment | None
+    unreadable: tuple[str, ...]
+    problems: tuple[str, ...]
+    undecided: tuple[str, ...]
+
+    @property
+    def convention(self) -> str:
+        """The reading by the name that ``open_sequence`` takes as ``poses``."""
+        return next(name for name, convention in CONVENTIONS.items() if convention.told == self.reading)
+
+    @property
+    def ok(self) -> bool:
+        """Whether no problem was found (something may still be undecided)."""
+        return not self.problems
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Points of one frame [3, N] and the frame in which they are looked up."""
+
+    points: np.ndarray
+    T_world_a: np.ndarray
+    T_world_b: np.ndarray
+    K_b: np.ndarray
+    depth_b: np.ndarray
+
+
+def check_sequence(sequence: Sequence, pairs: int = 8) -> SequenceCheck:
+    """Checks pose convention, depth scale and registration on evenly spaced pairs of frames.
+
+    Of a sequence without poses only the registration is checked; there are no pairs then, and ``error`` is NaN.
+
+    Args:
+        sequence: at least two frames with depth (or one, without poses).
+        pairs: how many pairs to compare, at least 1.
+
+    Raises:
+        ValueError: fewer than two frames with depth can be read; ``pairs`` is not positive.
+    """
+    if pairs < 1:
+        raise ValueError(f"pairs must be at least 1, got {pairs}")
+    unreadable: list[str] = []
+    if not sequence.posed:
+        return _without_poses(_registration(sequence, unreadable), unreadable)
+    errors: dict[str, np.ndarray] = {}
+    loaded: list[_Pair] = []
+    gap = 0
+    for gap in _GAPS:
+        loaded = _load_pairs(sequence, gap, pairs, unreadable)
+        errors = {name: _errors(loaded, name, _SCALES) for name in _READINGS} if loaded else {}
+        if any(np.isfinite(curve).any() for curve in errors.values()):
+            break
+    if not loaded:
+        raise ValueError(f"sequence {sequence.name!r} has no two readable frames with depth to compare")
+    registration = _registration(sequence, unreadable)
+    return _judge(loaded, gap, errors, registration, tuple(dict.fromkeys(unreadable)))
+
+
+def _without_poses(registration: Alignment | None, unreadable: list[str]) -> SequenceCheck:
+    problems: list[str] = []
+    undecided = ["there are no poses: methods that compare views cannot be run"]
+    if registration is not None:
+        _registration_verdict(registration, problems, undecided)
+    return SequenceCheck(
+        pairs=0,
+        gap=0,
+        error=float("nan"),
+        reading=AS_GIVEN,
+        scale=1.0,
+        best_error=float("nan"),
+        registration=registration,
+        unreadable=tuple(dict.fromkeys(unreadable)),
+        problems=tuple(problems),
+        undecided=tuple(undecided),
+    )
+
+
+def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> float:
+    """Median |log(z warped / depth there)| of a pair; inf where too few points land on valid depth.
+
+    Depth times ``scale`` with poses is the same as depth with positions divided by ``scale``, which leaves
+    the comparison in the unit of the files.
+    """
+    convert = _READINGS[reading]
+    T_b_a = np.linalg.inv(convert(pair.T_world_b)) @ convert(pair.T_world_a)
+    x, y, z = T_b_a[:3, :3] @ pair.points + T_b_a[:3, 3:] / scale
+    front = z > 1e-6
+    z_safe = np.where(front, z, 1)
+    column = np.rint(pair.K_b[0, 0] * x / z_safe + pair.K_b[0, 2])
+    row = np.rint(pair.K_b[1, 1] * y / z_safe + pair.K_b[1, 2])
+    height, width = pair.depth_b.shape
+    inside = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found = pair.depth_b[row[inside].astype(int), column[inside].astype(int)]
+    valid = found > 0
+    filled = np.count_nonzero(pair.depth_b > 0) / pair.depth_b.size
+    if valid.sum() < max(1, _MIN_OVERLAP * filled * pair.points.shape[1]):
+        return float("inf")
+    return float(np.median(np.abs(np.log(z[inside][valid] / found[valid]))))
+
+
+def _load_pairs(sequence: Sequence, gap: int, count: int, unreadable: list[str]) -> list[_Pair]:
+    if len(sequence) <= gap:
+        return []
+    found = []
+    for i in np.unique(np.linspace(0, len(sequence) - 1 - gap, count).astype(int)):
+        first, second = _read(sequence, int(i), unreadable), _read(sequence, int(i) + gap, unreadable)
+        if first is not None and second is not None:
+            found.append(_pair(*first, *second))
+    return found
+
+
+def _read(sequence: Sequence, index: int, unreadable: list[str]) -> tuple[Frame, np.ndarray] | None:
+    """A frame and its depth, if it has any; one that cannot be decoded is noted."""
+    try:
+        frame = sequence[index]
+    except FrameError as error:
+        unreadable.append(str(error))
+        return None
+    return None if frame.depth is None or not (frame.depth > 0).any() else (frame, frame.depth)
+
+
+def _pair(first: Frame, first_depth: np.ndarray, second: Frame, second_depth: np.ndarray) -> _Pair:
+    v, u = np.nonzero(first_depth > 0)
+    keep = np.unique(np.linspace(0, len(v) - 1, _POINTS).astype(int))
+    z = first_depth[v[keep], u[keep]].astype(np.float64)
+    K_a = first.intrinsics if first.depth_intrinsics is None else first.depth_intrinsics
+    K_b = second.intrinsics if second.depth_intrinsics is None else second.depth_intrinsics
+    points = np.linalg.inv(K_a) @ np.stack([u[keep] * z, v[keep] * z, z])
+    return _Pair(points, first.T_world_cam, second.T_world_cam, K_b, second_depth)
+
+
+def _errors(pairs: list[_Pair], reading: str, scales: np.ndarray) -> np.ndarray:
+    """[len(scales)] the median over pairs of the warp error."""
+    return np.median([[warp_error(pair, reading, scale) for scale in scales] for pair in pairs], axis=0)
+
+
+def _registration(sequence: Sequence, unreadable: list[str]) -> Alignment | None:
+    """Alignment of depth and image, where the depth maps claim to lie on the images."""
+    if sequence.depth_intrinsics is not None:
+        return None
+    indices = np.unique(np.linspace(0, len(sequence) - 1, _REGISTRATION_FRAMES).astype(int))
+    found = [_read(sequence, int(i), unreadable) for i in indices]
+    both = [(one[0].image, one[1]) for one in found if one is not None and one[0].image is not None]
+    return alignment(both) if both else None
+
+
+def _judge(
+    pairs: list[_Pair],
+    gap: int,
+    errors: dict[str, np.ndarray],
+    registration: Alignment | None,
+    unreadable: tuple[str, ...],
+) -> SequenceCheck:
+    reading = min(errors, key=lambda name: float(errors[name].min()))
+    around = _SCALES[int(np.argmin(errors[reading]))]
+    fine = around * 10.0 ** np.linspace(-0.125, 0.125, 21)
+    fine_errors = _errors(pairs, reading, fine)
+    scale, best = float(fine[int(np.argmin(fine_errors))]), float(fine_errors.min())
+    given = float(_errors(pairs, AS_GIVEN, np.ones(1))[0])
+    if _as_good(given, best):
+        reading = AS_GIVEN
+    if _as_good(float(_errors(pairs, reading, np.ones(1))[0]), best):
+        scale = 1.0
+    problems, undecided = _geometry_verdict(errors, given, best, reading, scale)
+    if registration is not None:
+        _registration_verdict(registration, problems, undecided)
+    return SequenceCheck(
+        pairs=len(pairs),
+        gap=gap,
+        error=given,
+        reading=reading,
+        scale=scale,
+        best_error=best,
+        registration=registration,
+        unreadable=unreadable,
+        problems=tuple(problems),
+        undecided=tuple(undecided),
+    )
+
+
+def _as_good(error: float, best: float) -> bool:
+    return error <= max(_SAME_FACTOR * best, best + _SAME_ERROR)
+
+
+def _geometry_verdict(
+    errors: dict[str, np.ndarray], given: float, best: float, reading: str, scale: float
+) -> tuple[list[str], list[str]]:
+    """Problems and undecided questions of poses and depth scale."""
+    problems: list[str] = []
+    undecided: list[str] = []
+    if not np.isfinite(best):
+        return ["no two frames overlap under any reading of the poses"], undecided
+    as_given = f"by {given:.1%} as given" if np.isfinite(given) else "as given frames do not overlap"
+    told = f"warped depth is off by {best:.1%} then, {as_given}"
+    if best > _MAX_ERROR:
+        problems.append(f"depth and poses disagree under every reading tried ({told})")
+        return problems, undecided
+    if reading != AS_GIVEN:
+        problems.append(f"the poses look {reading} ({told})")
+    if not 1 / _SCALE_TOLERANCE < scale < _SCALE_TOLERANCE:
+        problems.append(f"depth looks too {'small' if scale > 1 else 'large'}: times {scale:.3g} fits ({told})")
+    others = [name for name in errors if name != reading and _as_good(float(errors[name].min()), best)]
+    if others:
+        undecided.append(f"the motion does not tell the poses from {', or '.join(others)}")
+    fitting = _SCALES[[_as_good(float(error), best) for error in errors[reading]]]
+    if fitting.size and fitting.max() / fitting.min() > 4:
+        undecided.append("the motion is too small, beside the depth, to tell the depth's scale")
+    return problems, undecided
+
+
+def _registration_verdict(registration: Alignment, problems: list[str], undecided: list[str]) -> None:
+    """Appends what the alignment of depth and image says."""
+    if registration.edges < _MIN_EDGES or registration.contrast < _MIN_CONTRAST:
+        undecided.append("too few edges, or too many, to tell whether depth is registered to the images")
+    elif registration.quality < _NOT_ALIGNED:
+        problems.append(
+            f"depth looks not registered to the images: zoomed by {registration.zoom:.2f} and shifted by "
+            f"({registration.shift_x:.0f}, {registration.shift_y:.0f}) px its edges fit better"
+        )
+    elif registration.quality < _ALIGNED:
+        undecided.append("depth edges meet image edges too weakly to tell whether depth is registered")

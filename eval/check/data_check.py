@@ -1,0 +1,269 @@
+"""``ufmstar data check``: what a sequence holds, what is wrong with it, and which option puts it right."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
+from ufmstar_torch.eval.sequences.conventions import OURS
+from ufmstar_torch.eval.sequences.frame import FrameError, Sequence
+from ufmstar_torch.eval.sequences.layout import open_sequence
+
+_SAMPLED = 12  # frames whose depth is looked at for its range
+_DECODED = 500  # frames that are read to see that they can be; of more, as many evenly spaced ones: seconds
+_QUANTILES = (0.01, 0.99)
+# Scales that are customary [m per unit]; one within the check's own tolerance of what was found is meant.
+_CUSTOMARY = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1 / 5000, 1 / 256, 1 / 4000, 1 / 1024)
+_CUSTOMARY_WITHIN = 1.1
+_FEW = 0.5  # share of the frames on disk that must be usable, or the trajectory is another recording's
+
+
+@dataclass(frozen=True)
+class DataReport:
+    """What was found out about a sequence; lengths in metres, sizes (H, W).
+
+    Attributes:
+        name: of the sequence.
+        path: as given.
+        layout: "" where it could not be opened.
+        frames: usable ones, ``on_disk`` counts all.
+        on_disk: see ``frames``.
+        skipped: number of frames left out, by reason.
+        without_depth: number of usable frames without a depth map.
+        posed: whether there are poses; ``walked`` is their path's length [m].
+        walked: see ``posed``.
+        image_size, depth_size: or None.
+        intrinsics: fx, fy, cx, cy of the images [px].
+        depth_intrinsics: those of the depth maps, or None if they are the images'.
+        depth_range: 1 % and 99 % quantiles of the sampled depth [m], or None; ``filled`` is the share of valid pixels.
+        filled: see ``depth_range``.
+        checked: what ``check_sequence`` measured, plain values; {} where it could not.
+        problems: what is wrong, in words.
+        remedies: what to do about it; options are named as on the command line.
+        undecided: what the data cannot tell.
+    """
+
+    name: str
+    path: str
+    layout: str = ""
+    frames: int = 0
+    on_disk: int = 0
+    skipped: Mapping[str, int] = field(default_factory=dict)
+    without_depth: int = 0
+    posed: bool = True
+    walked: float = 0.0
+    image_size: tuple[int, int] | None = None
+    depth_size: tuple[int, int] | None = None
+    intrinsics: tuple[float, ...] = ()
+    depth_intrinsics: tuple[float, ...] | None = None
+    depth_range: tuple[float, ...] | None = None
+    filled: float = 0.0
+    checked: Mapping[str, Any] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+    remedies: tuple[str, ...] = ()
+    undecided: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether no problem was found."""
+        return not self.problems
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; what is not finite is None."""
+        return {"ok": self.ok, **_plain(asdict(self))}
+
+
+def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
+    """Opens a sequence and looks at all that can be told without a network.
+
+    A sequence that cannot be opened is a report with that problem.
+
+    Args:
+        path: as ``open_sequence`` takes it.
+        name: instead of the sequence's own.
+        pairs: of frames that are compared.
+        options: of ``open_sequence``.
+
+    Raises:
+        FileNotFoundError: no such path.
+        ValueError: ``pairs`` is not positive.
+    """
+    if pairs < 1:
+        raise ValueError(f"pairs must be at least 1, got {pairs}")
+    if not str(path).startswith("tour:") and not Path(path).exists():
+        raise FileNotFoundError(f"no such file or folder: {path}")
+    try:
+        sequence = open_sequence(path, **options)
+    except (FrameError, FileNotFoundError, ImportError, ValueError) as error:
+        return DataReport(name or Path(path).name, str(path), problems=(f"cannot be opened: {error}",))
+    depth_range, filled = _depth_statistics(sequence)
+    problems, remedies, undecided, checked = _verdict(sequence, path, pairs, options)
+    return DataReport(
+        name=name or sequence.name,
+        path=str(path),
+        layout=sequence.layout,
+        frames=len(sequence),
+        on_disk=len(sequence.names_on_disk),
+        skipped=dict(Counter(frame.reason for frame in sequence.skipped)),
+        without_depth=len(sequence.without_depth),
+        posed=sequence.posed,
+        walked=_walked(sequence),
+        image_size=sequence.image_size,
+        depth_size=sequence.depth_size,
+        intrinsics=_pinhole(sequence.intrinsics),
+        depth_intrinsics=None if sequence.depth_intrinsics is None else _pinhole(sequence.depth_intrinsics),
+        depth_range=depth_range,
+        filled=filled,
+        checked=checked,
+        problems=tuple(problems),
+        remedies=tuple(remedies),
+        undecided=tuple(undecided),
+    )
+
+
+def _verdict(
+    sequence: Sequence, path: str | Path, pairs: int, options: Mapping[str, Any]
+) -> tuple[list[str], list[str], list[str], dict[str, Any]]:
+    """Problems, remedies, what is undecided, and the check's figures."""
+    problems: list[str] = []
+    remedies: list[str] = []
+    if len(sequence) < _FEW * len(sequence.names_on_disk):
+        problems.append(f"only {len(sequence)} of {len(sequence.names_on_disk)} frames are usable")
+        remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --max-pose-gap")
+    try:
+        found = check_sequence(sequence, pairs)
+    except ValueError as error:
+        return problems, remedies, [f"nothing was compared: {error}"], {}
+    read, broken = _read_frames(sequence)
+    if broken:
+        problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
+        remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
+    problems += found.problems
+    remedies += _remedies(found, sequence, path, options)
+    return problems, remedies, list(found.undecided), {**_measured(found), "read": read, "unreadable": broken}
+
+
+def _remedies(found: SequenceCheck, sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
+    remedies = []
+    if found.convention != OURS:
+        given = options.get("poses", OURS)
+        remedies.append(f"--poses {found.convention}" if given == OURS else f"leave --poses {given} out")
+    if any("depth looks too" in problem for problem in found.problems):
+        remedies.append(_scale_remedy(found.scale, sequence, path, options))
+    if any("disagree" in problem or "no two frames overlap" in problem for problem in found.problems):
+        remedies.append(
+            "the trajectory may be another recording's, or shifted in time: --trajectory, --time-offset; or the "
+            "intrinsics belong to other images: --intrinsics"
+        )
+    if any("not registered" in problem for problem in found.problems):
+        remedies.append(
+            "if the depth camera is another one, say so: --depth-intrinsics; if it stands beside the colour camera, "
+            "warp its maps into that first (7-Scenes: --T-color-depth)"
+        )
+    return remedies
+
+
+def _scale_remedy(factor: float, sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> str:
+    """What brings depth and positions to one scale: depth times ``factor``."""
+    positions = f"divide the positions of the poses by {factor:.4g}"
+    if options.get("trajectory") is not None:
+        return f"a single camera's trajectory has no scale: {positions}"
+    unit = _metres_per_unit(sequence, path, options)
+    if unit is None:
+        return positions
+    scale = unit * factor
+    near = min(_CUSTOMARY, key=lambda customary: abs(math.log(customary / scale)))
+    if max(near / scale, scale / near) < _CUSTOMARY_WITHIN:
+        scale = near
+    if scale > 1 or near == unit:
+        return positions
+    return f"--depth-scale {scale:.4g}"
+
+
+def _metres_per_unit(sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> float | None:
+    """The scale with which depth files are read now; None where it has no say (a laser, a rendered tour)."""
+    if sequence.layout == "tour" or (sequence.layout == "kitti360" and options.get("depth") is None):
+        return None
+    raw = open_sequence(path, **{**options, "depth_scale": 1.0})
+    for entry, stored in zip(sequence.entries, raw.entries, strict=True):
+        if entry.load_depth is None or stored.load_depth is None:
+            continue
+        try:
+            depth, values = entry.load_depth(), stored.load_depth()
+        except FrameError:  # counted by the check
+            continue
+        valid = (depth > 0) & (values > 0)
+        if valid.any():
+            return float(np.median(depth[valid].astype(np.float64) / values[valid]))
+    return None
+
+
+def _measured(found: SequenceCheck) -> dict[str, Any]:
+    lies = found.registration
+    return {
+        "pairs": found.pairs,
+        "gap": found.gap,
+        "error": found.error,
+        "poses": found.convention,
+        "scale": found.scale,
+        "best_error": found.best_error,
+        "registration": None if lies is None else asdict(lies),
+    }
+
+
+def _read_frames(sequence: Sequence) -> tuple[int, list[str]]:
+    """How many frames were read, and what was said of those that cannot be; a rendered frame always can."""
+    if sequence.layout == "tour":
+        return 0, []
+    chosen = np.unique(np.linspace(0, len(sequence) - 1, min(_DECODED, len(sequence))).astype(int))
+    broken = []
+    for index in chosen:
+        try:
+            sequence[int(index)]
+        except FrameError as error:
+            broken.append(str(error))
+    return len(chosen), broken
+
+
+def _depth_statistics(sequence: Sequence) -> tuple[tuple[float, ...] | None, float]:
+    """Quantiles of depth [m] and the share of valid pixels, over evenly spaced frames."""
+    with_depth = [entry for entry in sequence.entries if entry.load_depth is not None]
+    values, pixels = [], 0
+    for i in np.unique(np.linspace(0, len(with_depth) - 1, min(_SAMPLED, len(with_depth))).astype(int)):
+        load = with_depth[i].load_depth
+        try:
+            depth = None if load is None else load()
+        except FrameError:  # counted by the check
+            continue
+        if depth is not None:
+            values.append(depth[depth > 0])
+            pixels += depth.size
+    found = np.concatenate(values) if values else np.zeros(0)
+    if found.size == 0:
+        return None, 0.0
+    return tuple(float(q) for q in np.quantile(found, _QUANTILES)), found.size / pixels
+
+
+def _walked(sequence: Sequence) -> float:
+    positions = np.array([entry.T_world_cam[:3, 3] for entry in sequence.entries])
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def _pinhole(K: np.ndarray) -> tuple[float, ...]:
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON can hold it."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,78 @@
+"""What an evaluation would do: its rows, its sequences, and how large the cache of predictions gets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.frame import Sequence as Frames
+from ufmstar_torch.eval.engine.networks import BaseNetwork
+from ufmstar_torch.eval.methods.perturb import selects
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.results.run_suite import EvalJob
+from ufmstar_torch.eval.results.worklist import Shard
+
+_FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file systems allot
+
+
+def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> str:
+    """Open every sequence, predict one frame, and tell.
+
+    Args:
+        job: what would be evaluated.
+        networks: loaded for the job.
+        shard: of the sequences.
+    """
+    lines = [f"{job.suite.name}: {job.suite.title}", f"{len(job.suite.rows)} rows:"]
+    lines += [f"  {row.label}  [{networks[row.method.base].label}]" for row in job.suite.rows]
+    if job.missing_bases:
+        lines.append(f"left out, without a network: the rows of {', '.join(job.missing_bases)}")
+    items = shard.of(job.items)
+    lines.append(f"{len(items)} sequences:" if len(items) == len(job.items) else f"{len(items)} of {len(job.items)}:")
+    frames, size = 0, 0
+    sample: dict[str, int] | None = None
+    for item in items:
+        try:
+            sequence = item.open()
+        except (OSError, ValueError) as error:
+            lines.append(f"  {item.label}: cannot be opened: {' '.join(str(error).split())}")
+            continue
+        count = len(range(len(sequence))[job.frames])
+        lines.append(f"  {item.label}: {count} frames")
+        sample = _bytes_per_file(sequence, networks) if sample is None else sample
+        frames += count
+        size += _cached(job.suite.rows, networks, count, sample or {})
+    lines.append(f"{frames} frames, {len(items) * len(job.suite.rows)} records")
+    told = "no frame can be read" if sample is None else f"up to {size / 1e6:.1f} MB"
+    lines.append(f"cache of predictions: {told}")
+    return "\n".join(lines)
+
+
+def predictions(rows: Iterable[Row], network: BaseNetwork, frames: int) -> int:
+    """How many predictions of a network the rows need on so many frames, all members on an image counting as one."""
+    needed: set[tuple[int, int | None]] = set()
+    for row in rows:
+        every = row.method.every_member and network.passes > 1
+        taken = [number for number in range(frames) if selects(row.setting, number)]
+        needed |= {(number, None if every else network.turn(place)) for place, number in enumerate(taken)}
+    return len(needed)
+
+
+def _cached(rows: Sequence[Row], networks: Mapping[str, BaseNetwork], frames: int, sample: Mapping[str, int]) -> int:
+    """Bytes of the predictions of a sequence."""
+    by_base = {base: [row for row in rows if row.method.base == base] for base in sample}
+    return sum(predictions(own, networks[base], frames) * sample[base] for base, own in by_base.items())
+
+
+def _bytes_per_file(sequence: Frames, networks: Mapping[str, BaseNetwork]) -> dict[str, int] | None:
+    """By base, from the first frame that can be read; None if none can."""
+    for index in range(len(sequence)):
+        try:
+            frame = sequence[index]
+            made = {base: network.one(frame, 0) for base, network in networks.items() if network.cacheable}
+        except FrameError:
+            continue
+        # All members together have an epistemic variance, whatever one of them says.
+        counts = {base: max(len(one.maps()), 3 if networks[base].passes > 1 else 1) for base, one in made.items()}
+        return {base: _FILE_BYTES + 4 * counts[base] * one.depth.numel() for base, one in made.items()}
+    return None

@@ -1,0 +1,59 @@
+"""What ``ufmstar eval`` says in the end: the table over sequences, and where everything lies."""
+
+from __future__ import annotations
+
+from ufmstar_torch.eval.report.load import ResultsError, load_results
+from ufmstar_torch.eval.report.write import summary, write_report, written
+from ufmstar_torch.eval.results.launch import Ended
+
+
+def table(ended: Ended) -> str:
+    """The suite's table (mean and 95 % confidence interval over sequences), what was left out, and the folder."""
+    job = ended.job
+    try:
+        lines = [summary(load_results(job.out, with_sums=False))]
+    except ResultsError as error:
+        lines = [str(error)]
+    if job.missing_bases:
+        lines.append(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
+    lines.append(f"{job.out}: eval.json, records/DATASET/SEQUENCE/ with a record for every row")
+    return "\n".join(lines)
+
+
+def measure(ended: Ended, threads: int | None = None) -> str | None:
+    """Measure what a suite about efficiency asks for, unless it is there; a line if it cannot be had.
+
+    Not while sequences are still to be evaluated: other parts (``--shard``) are at them, and would be timed along.
+
+    Args:
+        ended: the evaluation.
+        threads: of the CPU; None = all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    from ufmstar_torch.eval.bench.measure import Plan
+    from ufmstar_torch.eval.bench.efficiency_step import EFFICIENCY, measure_job
+
+    if not ended.job.suite.efficiency or (ended.job.out / EFFICIENCY).exists():
+        return None
+    try:
+        if load_results(ended.job.out, with_sums=False).missing:
+            return f"no {EFFICIENCY} yet: it is measured when all sequences are evaluated"
+        measure_job(ended.job, Plan(threads=threads))
+    except (ResultsError, ValueError) as error:
+        return f"no {EFFICIENCY}: {' '.join(str(error).split())}"
+    return None
+
+
+def draw(ended: Ended) -> str:
+    """Draw tables and figures; a line that says where, or why there are none.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    try:
+        files = write_report(ended.job.out)
+    except (ImportError, ResultsError) as error:
+        return f"no report: {' '.join(str(error).split())}"
+    return written(ended.job.out, files)

@@ -1,0 +1,172 @@
+"""Depth that is already there as a run's source: a folder of maps that another program predicted, or the sequence's
+own depth."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ufmstar_torch.camera import resize_intrinsics
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
+from ufmstar_torch.eval.engine.run_source import Source
+from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
+from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
+from ufmstar_torch.pipeline import UncertainPrediction
+from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.ufmstar import UfMStar
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedMap:
+    """A depth map from elsewhere.
+
+    Attributes:
+        depth: [H, W] float32 [m], 0 = no prediction.
+        variance: [H, W] float32 [m^2], or None.
+        intrinsics: [3, 3] float64 of the map [px].
+    """
+
+    depth: np.ndarray
+    variance: np.ndarray | None
+    intrinsics: np.ndarray
+
+    def resized(self, size: Size | None) -> PredictedMap:
+        """At another size (h, w), by taking the nearest pixel."""
+        old = (self.depth.shape[0], self.depth.shape[1])
+        if size is None or size == old:
+            return self
+        K = resize_intrinsics(torch.from_numpy(self.intrinsics), old, size).numpy()
+        variance = None if self.variance is None else resample_nearest(self.variance, self.intrinsics, K, size)
+        return PredictedMap(resample_nearest(self.depth, self.intrinsics, K, size), variance, K)
+
+
+class MapSource(Source):
+    """Depth that is already there.
+
+    Args:
+        read: the map of a frame.
+        config: of UfM*.
+        size: (h, w) to which the maps are brought; None = as they are.
+        device, identity: see :class:`Source`.
+        is_truth: the maps are the sequence's own depth.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[Frame], PredictedMap],
+        config: UfMStarConfig,
+        device: torch.device,
+        identity: Mapping[str, Any],
+        *,
+        size: Size | None = None,
+        is_truth: bool = False,
+    ) -> None:
+        ufm = UfMStar(config)
+        super().__init__(ufm, ufm, device, identity)
+        self._read, self._size, self.is_truth = read, size, is_truth
+
+    def predict(self, frame: Frame) -> UncertainPrediction:
+        """See :meth:`Source.predict`."""
+        found = self._read(frame).resized(self._size)
+        depth = torch.from_numpy(found.depth)[None].to(self.device)
+        variance = None if found.variance is None else torch.from_numpy(found.variance)[None].to(self.device)
+        pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(found.intrinsics)[None]
+        anchors = self.anchors_of(frame)
+        if anchors is not None:
+            anchors = anchors.moved(torch.from_numpy(frame.intrinsics), K)
+        with torch.no_grad():
+            ufm = self.ufm(depth, pose, K, variance, anchors=anchors)
+        return UncertainPrediction(DepthPrediction(depth, variance), ufm, K, None)
+
+
+def folder_source(
+    sequence: Sequence,
+    folder: str | Path,
+    config: UfMStarConfig,
+    *,
+    variance: str | Path | None = None,
+    scale: float | None = None,
+    intrinsics: IntrinsicsLike | None = None,
+    size: Size | None = None,
+    device: str = "cpu",
+) -> MapSource:
+    """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
+
+    Without ``intrinsics``, the maps must show the whole image; theirs are then the image's, scaled by the
+    sizes' ratio.
+
+    Args:
+        sequence: the frames.
+        folder, scale, variance: as :class:`DepthFolder` takes them.
+        config: of UfM*.
+        intrinsics: of the maps [px], where the network saw a part of the image.
+        size, device: see :class:`MapSource`.
+
+    Raises:
+        NotADirectoryError: no such folder.
+        ValueError: no maps, maps that fit no frame, or (the first one) of another aspect ratio than the images.
+    """
+    maps = DepthFolder(folder, scale, variance).for_frames(sequence.names, sequence.names_on_disk)
+    K_given = None if intrinsics is None else read_intrinsics(intrinsics)
+
+    def read(frame: Frame) -> PredictedMap:
+        depth, spread = maps[frame.index]
+        if K_given is not None:
+            return PredictedMap(depth, spread, K_given)
+        try:
+            K = scaled_to_map(frame.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
+        except ValueError as error:
+            raise FrameError(maps.depth_files[frame.index], _cropped(sequence, depth)) from error
+        return PredictedMap(depth, spread, K)
+
+    _check_first(sequence, maps, K_given is not None)
+    files = (*maps.depth_files, *maps.variance_files)
+    listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
+    identity = {
+        "maps": {"count": len(maps.depth_files), "names_and_sizes": hashlib.sha256(listing.encode()).hexdigest()},
+        "with_variance": variance is not None,
+        "scale": scale,
+        "intrinsics": K_given,
+        "size": size,
+    }
+    return MapSource(read, config, torch.device(device), identity, size=size)
+
+
+def _check_first(sequence: Sequence, maps: DepthMaps, any_shape: bool) -> None:
+    """Raises ValueError at once where the first map has another shape than the images, as then all have."""
+    try:
+        depth, _ = maps[0]
+        if not any_shape:
+            scaled_to_map(sequence.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
+    except FrameError:  # counted when its turn comes
+        return
+    except ValueError as error:
+        raise ValueError(f"{maps.depth_files[0]}: {_cropped(sequence, depth)}") from error
+
+
+def _cropped(sequence: Sequence, depth: np.ndarray) -> str:
+    height, width = sequence.image_size or (0, 0)
+    return (
+        f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the whole "
+        "image, so its own intrinsics must be given"
+    )
+
+
+def own_depth_source(config: UfMStarConfig, *, size: Size | None = None, device: str = "cpu") -> MapSource:
+    """The sequence's own depth as the prediction: what UfM* says of perfect depth, the method's floor."""
+
+    def read(frame: Frame) -> PredictedMap:
+        if frame.depth is None:
+            raise FrameError(frame.name, "no depth map")
+        return PredictedMap(frame.depth, None, depth_camera(frame))
+
+    identity = {"maps": "the sequence's own depth", "size": size}
+    return MapSource(read, config, torch.device(device), identity, size=size, is_truth=True)

@@ -1,0 +1,105 @@
+"""What an ablation does to the frames: leaves some out, and disturbs the poses of the others."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.methods.setting import Setting
+
+# What is drawn of a frame beside its noise, as a third number of the seed; 1 and 2 are of its anchors.
+_DRIFT = 3
+
+
+def selects(setting: Setting, number: int) -> bool:
+    """Whether image ``number`` (0, 1, ... of those to be judged) is used: ``skip`` are left out after each one."""
+    return number % (setting.skip + 1) == 0
+
+
+def perturbed(T_world_cam: NDArray[np.float64], setting: Setting, index: int) -> NDArray[np.float64]:
+    """A pose with noise, (R exp([w]x), t + n), w and n drawn from normal distributions.
+
+    The noise depends on the setting's seed and the frame's index alone, not on what was run before, and only its size
+    on the setting's standard deviations: along a sweep it is the same noise, stronger and stronger.
+
+    Args:
+        T_world_cam: [4, 4] camera-to-world [m].
+        setting: with the standard deviations of w [deg], about the camera's axes, and n [m], along the world's.
+        index: of the frame in its sequence.
+
+    Returns:
+        [4, 4], the pose itself where the setting has no noise.
+    """
+    if not (setting.rotation_noise or setting.translation_noise):
+        return T_world_cam
+    drawn = np.random.default_rng([setting.seed, index]).standard_normal(6)
+    noisy = T_world_cam.copy()
+    noisy[:3, :3] = T_world_cam[:3, :3] @ rotation(math.radians(setting.rotation_noise) * drawn[:3])
+    noisy[:3, 3] += setting.translation_noise * drawn[3:]
+    return noisy
+
+
+class Drift:
+    """Poses as odometry gives them: each step from a frame to the next errs a little, and moves all that follow.
+
+    Frame j after frame i has the pose T'_j = T'_i (T_i^-1 T_j) (exp([w]x), n): the pose relative to the frame before
+    has the noise w, n, about and along the camera's axes. Both are sums of one normal increment for every frame of the
+    sequence from i + 1 to j, used or not, so variances grow linearly with frames. An increment depends on the seed and
+    its frame's index alone, and only its size on the setting. The first pose is exact. Orientations err by a random
+    walk; positions by another one, and by where wrong orientations lead.
+
+    Unlike independent noise, of which two neighbours differ by as much as any two frames, it leaves nearby views nearly
+    consistent: what a SLAM system does between two loops.
+
+    Args:
+        setting: with the standard deviations of an increment of w [deg] and n [m].
+    """
+
+    def __init__(self, setting: Setting) -> None:
+        self._setting = setting
+        self._last: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
+
+    def of(self, T_world_cam: NDArray[np.float64], index: int) -> NDArray[np.float64]:
+        """The pose with drift.
+
+        Args:
+            T_world_cam: [4, 4] camera-to-world of the next frame [m].
+            index: of the frame in its sequence, larger than that of the one before.
+
+        Returns:
+            [4, 4], the pose itself where the setting has no drift.
+
+        Raises:
+            ValueError: frames do not come in order.
+        """
+        setting = self._setting
+        if not (setting.rotation_drift or setting.translation_drift):
+            return T_world_cam
+        if self._last is None:
+            drifted = T_world_cam
+        else:
+            before, T_before, drifted_before = self._last
+            if index <= before:
+                raise ValueError(f"frames with drift must come in order, got index {index} after {before}")
+            drawn = np.sum([self._increment(i) for i in range(before + 1, index + 1)], axis=0)
+            step = np.eye(4)
+            step[:3, :3] = rotation(math.radians(setting.rotation_drift) * drawn[:3])
+            step[:3, 3] = setting.translation_drift * drawn[3:]
+            drifted = drifted_before @ np.linalg.solve(T_before, T_world_cam) @ step
+        self._last = index, T_world_cam, drifted
+        return drifted
+
+    def _increment(self, index: int) -> NDArray[np.float64]:
+        return np.random.default_rng([self._setting.seed, index, _DRIFT]).standard_normal(6)
+
+
+def rotation(w: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[3, 3] exp([w]x) of a rotation vector [3] [rad], by Rodrigues' formula."""
+    angle = float(np.linalg.norm(w))
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = w / angle
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * K + (1 - math.cos(angle)) * (K @ K)

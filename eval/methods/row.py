@@ -1,0 +1,46 @@
+"""A row of a suite: a method under a setting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is judged.
+
+    Attributes:
+        method: which network, how often it is run, and what judges its views.
+        setting: what an ablation changes about it.
+    """
+
+    method: Method
+    setting: Setting = DEFAULT
+
+    @property
+    def slug(self) -> str:
+        """A name for files: "UfMstar-Ensemble", "UfMstar-Ensemble@0c3f..." where the setting is not the default."""
+        name, setting = self.method.name.replace("*", "star"), self.setting.slug
+        return f"{name}@{setting}" if setting else name
+
+    @property
+    def name(self) -> str:
+        """The method's name, with what anchors it if that are tracked corners: "UfM*-Anchored-Ensemble"."""
+        anchored = self.setting.anchors == TRACKED
+        return self.method.name.replace("UfM*-", "UfM*-Anchored-", 1) if anchored else self.method.name
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """Settings that are not the default, less what ``name`` says."""
+        values = self.setting.to_dict()
+        return {name: value for name, value in values.items() if (name, value) != ("anchors", TRACKED)}
+
+    @property
+    def label(self) -> str:
+        """For people: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
+        changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
+        return f"{self.name} ({changed})" if changed else self.name

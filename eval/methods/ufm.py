@@ -1,0 +1,287 @@
+"""UfM, the pointwise predecessor of UfM*, as a baseline: called like :class:`ufmstar_torch.UfMStar`.
+
+Sudhakar, Karaman, Sze, "Uncertainty from Motion for DNN Monocular Depth Estimation" (ICRA 2022). Where UfM* keeps a few
+hundred Gaussians, UfM keeps every pixel it has ever seen as a point: 40 bytes each (float32), 4.0 MB at the
+100,000 points that the authors allow at 224 x 224. ``ufm_cloud`` has the equations and the deliberate differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.camera import relative_pose
+from ufmstar_torch.eval.methods.ufm_cloud import MOMENTS, Cloud, Taken, View, take_in
+from ufmstar_torch.eval.methods.ufm_config import UfMConfig as UfMConfig
+from ufmstar_torch.frame import FrameInput, check_frame
+from ufmstar_torch.stateful import StatefulModule, full_precision
+from ufmstar_torch.step import raise_faults
+
+_STATE = ("moments", "count", "points", "T_world_first", "started", "frames", "skipped")
+
+
+@dataclass(frozen=True)
+class UfMStatistics:
+    """What happened to one frame, per stream [B].
+
+    Attributes:
+        points: kept after the frame.
+        memory: of these points [bytes].
+        fused: points that met a valid pixel.
+        new: pixels that no point had landed on, appended.
+        dropped: points pruned.
+        valid_pixels: pixels used.
+        fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
+        rotation_deviation: max |R^T R - I| of the pose as given.
+    """
+
+    points: Tensor
+    memory: Tensor
+    fused: Tensor
+    new: Tensor
+    dropped: Tensor
+    valid_pixels: Tensor
+    fault: Tensor
+    rotation_deviation: Tensor
+
+
+@dataclass(frozen=True)
+class UfMOutput:
+    """The prediction of one frame with its variance. Maps have the layout in which ``depth`` was given.
+
+    Attributes:
+        depth: the depth as given [m].
+        variance: S_zz of the newest point at each pixel, s^2 where there was none [m^2]; NaN where not valid.
+        aleatoric, epistemic: A and E as given [m^2], or None.
+        valid: True where the pixel was used.
+        statistics: per-stream counts of this frame.
+    """
+
+    depth: Tensor
+    variance: Tensor
+    aleatoric: Tensor | None
+    epistemic: Tensor | None
+    valid: Tensor
+    statistics: UfMStatistics
+
+    @property
+    def std(self) -> Tensor:
+        """sqrt(variance) [m]."""
+        return self.variance.sqrt()
+
+
+class UfM(StatefulModule):
+    """Uncertainty from Motion: feed it one predicted depth map per image, read a variance per pixel.
+
+    The points of all streams lie behind each other in buffers, which ``.to()``, ``deepcopy`` and ``state_dict``
+    carry. A frame that raises leaves the state as it was. No gradient flows through it.
+
+    Args:
+        config: see :class:`UfMConfig`; None = its defaults.
+        dtype: of the points and of the computation, torch.float32 or torch.float64.
+        device: of the state until ``.to()``; it follows the first frame otherwise.
+
+    Raises:
+        TypeError: config is something else.
+        ValueError: another dtype.
+    """
+
+    STATE = _STATE
+    config: UfMConfig
+    moments: Tensor
+    count: Tensor
+    points: Tensor
+    T_world_first: Tensor
+    started: Tensor
+    frames: Tensor
+    skipped: Tensor
+
+    def __init__(
+        self,
+        config: UfMConfig | None = None,
+        *,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        if config is not None and not isinstance(config, UfMConfig):
+            raise TypeError(f"config must be a UfMConfig or None, got {type(config).__name__}")
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+        self.config = config if config is not None else UfMConfig()
+        for name, value in _empty(0, dtype, torch.device(device or "cpu")).items():
+            self.register_buffer(name, value)
+
+    def forward(
+        self,
+        depth: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        aleatoric: Tensor | None = None,
+        epistemic: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> UfMOutput:
+        """Take in one predicted depth map per stream and return its variance.
+
+        Args:
+            depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype.
+                Pixels that are NaN, infinite, zero or negative are left out.
+            pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m].
+            intrinsics: [B, 3, 3] or [3, 3] in pixels of this depth map, first pixel's centre at (0, 0).
+            aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it is not a finite
+                number >= 0 are left out.
+            epistemic: likewise E [m^2].
+            valid: like ``depth``, bool, True = use.
+
+        Raises:
+            TypeError: wrong kind of argument or dtype.
+            ValueError: wrong shape or device; another number of streams than before (:meth:`reset` first); a pose
+                that is not rigid or bad intrinsics (``config.on_bad_frame == "skip"``: counted instead).
+        """
+        frame = check_frame(
+            depth, pose, intrinsics, aleatoric, epistemic, valid, None,
+            feature_count=0, rotation_tolerance=self.config.rotation_tolerance,
+        )  # fmt: skip
+        with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
+            if self.config.on_bad_frame == "raise":
+                raise_faults(frame.fault.tolist())
+            variance, statistics = self._advance(frame)
+        return UfMOutput(
+            depth=depth,
+            variance=variance.to(frame.depth.dtype).reshape(depth.shape),
+            aleatoric=aleatoric,
+            epistemic=epistemic,
+            valid=frame.valid.reshape(depth.shape),
+            statistics=statistics,
+        )
+
+    def clouds(self) -> list[Cloud]:
+        """The points of every stream in the frame of its first camera (``T_world_first`` takes it to the world)."""
+        sizes = self.points.tolist()
+        pairs = zip(self.moments.split(sizes), self.count.split(sizes), strict=True)
+        return [Cloud(moments, count) for moments, count in pairs]
+
+    def reset(self, streams: Sequence[int] | Tensor | None = None) -> None:
+        """Forget everything, or only some streams.
+
+        Args:
+            streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
+
+        Raises:
+            IndexError: an index is out of range.
+            ValueError: a mask of the wrong length.
+        """
+        dtype, device, b = self.moments.dtype, self.moments.device, len(self.points)
+        with torch.inference_mode(False), torch.no_grad():  # buffers must outlive the caller's inference mode
+            if streams is None:
+                self._store(_empty(0, dtype, device))
+                return
+            chosen = torch.as_tensor(streams, device=device)
+            if chosen.dtype == torch.bool and chosen.shape != (b,):
+                raise ValueError(f"streams as a mask must have shape ({b},), got {tuple(chosen.shape)}")
+            keep = torch.ones(b, dtype=torch.bool, device=device)
+            keep[chosen if chosen.numel() else chosen.long()] = False
+            of_point = keep.repeat_interleave(self.points)
+            fresh = _empty(b, dtype, device)
+            kept = {"moments": self.moments[of_point], "count": self.count[of_point]}
+            for name in _STATE[2:]:
+                old = getattr(self, name)
+                kept[name] = torch.where(keep.view(-1, *[1] * (old.dim() - 1)), old, fresh[name])
+            self._store(kept)
+
+    def _advance(self, frame: FrameInput) -> tuple[Tensor, UfMStatistics]:
+        """One frame, whose state is stored when all streams are through; variance [B, H, W]."""
+        clouds, state = self._streams(frame)
+        fine = frame.fault == 0
+        first = torch.where((fine & ~state["started"])[:, None, None], frame.T_world_cam, state["T_world_first"])
+        R, t = relative_pose(frame.T_world_cam, first)
+        s2 = self._observation_variance(frame)
+        taken = []
+        for b, (cloud, used) in enumerate(zip(clouds, fine.tolist(), strict=True)):
+            if used:
+                view = View(frame.depth[b], s2[b], frame.valid[b], frame.intrinsics[b], R[b], t[b])
+                taken.append(take_in(cloud, view, self.config.max_points))
+            else:
+                none = torch.zeros((), dtype=torch.int64, device=s2.device)
+                taken.append(Taken(cloud, torch.full_like(s2[b], torch.nan), none, none, none))
+        updated = _joined([one.cloud for one in taken])
+        statistics = _statistics(taken, updated["points"], frame)
+        self._store(
+            {
+                **updated,
+                "T_world_first": first,
+                "started": state["started"] | fine,
+                "frames": state["frames"] + fine,
+                "skipped": state["skipped"] + ~fine,
+            }
+        )
+        return torch.stack([one.variance for one in taken]), statistics
+
+    def _observation_variance(self, frame: FrameInput) -> Tensor:
+        """[B, H, W] s^2 of one observation [m^2]: what the network states, 0 if it states nothing."""
+        s2 = torch.zeros_like(frame.depth)
+        if frame.aleatoric is not None and self.config.add_aleatoric:
+            s2 = s2 + frame.aleatoric.detach()
+        if frame.epistemic is not None and self.config.add_epistemic:
+            s2 = s2 + frame.epistemic.detach()
+        return s2
+
+    def _streams(self, frame: FrameInput) -> tuple[list[Cloud], dict[str, Tensor]]:
+        """The clouds and the rest of the state, fresh at the start.
+
+        Raises:
+            ValueError: the frame has another number of streams or lies on another device.
+        """
+        streams, device, held = frame.depth.shape[0], frame.depth.device, len(self.points)
+        if held == 0:
+            fresh = _empty(streams, self.moments.dtype, device)
+            return [Cloud(fresh["moments"], fresh["count"])] * streams, fresh
+        if held != streams:
+            raise ValueError(f"depth has {streams} streams but the state holds {held}: call reset() first")
+        if self.moments.device != device:
+            raise ValueError(f"depth lies on {device} but the state on {self.moments.device}: move one with .to()")
+        return self.clouds(), {name: getattr(self, name) for name in _STATE}
+
+    def extra_repr(self) -> str:
+        """Streams and points."""
+        return f"streams={len(self.points)}, points={self.points.tolist()}, max_points={self.config.max_points}"
+
+
+def _empty(streams: int, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
+    """The state of streams that have seen nothing."""
+    counter = torch.zeros(streams, dtype=torch.int64, device=device)
+    return {
+        "moments": torch.zeros(0, MOMENTS, dtype=dtype, device=device),
+        "count": torch.zeros(0, dtype=torch.int32, device=device),
+        "points": counter,
+        "T_world_first": torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
+        "started": counter.bool(),
+        "frames": counter.clone(),
+        "skipped": counter.clone(),
+    }
+
+
+def _joined(clouds: Sequence[Cloud]) -> dict[str, Tensor]:
+    """Clouds as buffers: all points behind each other, and how many each stream has."""
+    device = clouds[0].count.device
+    return {
+        "moments": torch.cat([cloud.moments for cloud in clouds]) if len(clouds) > 1 else clouds[0].moments,
+        "count": torch.cat([cloud.count for cloud in clouds]) if len(clouds) > 1 else clouds[0].count,
+        "points": torch.tensor([len(cloud.count) for cloud in clouds], device=device),
+    }
+
+
+def _statistics(taken: Sequence[Taken], points: Tensor, frame: FrameInput) -> UfMStatistics:
+    return UfMStatistics(
+        points=points,
+        memory=points * taken[0].cloud.bytes_per_point,
+        fused=torch.stack([one.fused for one in taken]),
+        new=torch.stack([one.new for one in taken]),
+        dropped=torch.stack([one.dropped for one in taken]),
+        valid_pixels=frame.valid.sum((1, 2)),
+        fault=frame.fault,
+        rotation_deviation=frame.rotation_deviation,
+    )

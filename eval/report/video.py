@@ -1,0 +1,197 @@
+"""The preview video: image, depth, sigma and error side by side, on scales that stay the same throughout."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator, Iterable
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.report.colours import ColourScale, colour_table, require_matplotlib
+from ufmstar_torch.eval.report.plots import Column, FramePanel, PanelScales, map_columns
+
+GAP, HEAD, FOOT, BAR = 4, 22, 36, 8  # pixels
+PAPER, INK, FAINT = (255, 255, 255), (26, 26, 26), (107, 107, 107)
+
+
+def preview_frame(
+    panel: FramePanel, scales: PanelScales, *, cell_height: int | None = None, with_error: bool | None = None
+) -> NDArray[np.uint8]:
+    """One video frame: image | depth | sigma | error with names, colour bars and units; sqrt(B) where the panel has it.
+
+    Args:
+        panel: the frame.
+        scales: fixed for the whole video, from ``fit_scales`` of a few frames, say.
+        cell_height: height of each map [px], its width follows; None = 240, or less for maps wider than 16:9.
+        with_error: keep a column for the error; None = if the panel has one. All frames of a video need the same.
+
+    Returns:
+        [H, W, 3] uint8 RGB, H and W even.
+
+    Raises:
+        ImportError: Pillow or matplotlib is missing.
+    """
+    from PIL import Image, ImageDraw
+
+    error = panel.error is not None if with_error is None else with_error
+    columns = map_columns(scales, with_error=error, with_anchored=panel.anchored is not None)
+    height, width = panel.depth.shape
+    if cell_height is None:
+        cell_height = min(240, max(1, round(427 * height / width)))
+    cell_width = max(1, round(cell_height * width / height))
+    total = (1 + len(columns)) * (cell_width + GAP) - GAP
+    canvas = Image.new("RGB", (total + total % 2, (HEAD + cell_height + FOOT + 1) // 2 * 2), PAPER)
+    draw = ImageDraw.Draw(canvas)
+    pictures = [panel.image, *(column.rgb(panel) for column in columns)]
+    for number, picture in enumerate(pictures):
+        left = number * (cell_width + GAP)
+        if picture is not None:
+            # Maps keep their pixels, since blending would invent colours between valid and invalid.
+            kind = Image.Resampling.BILINEAR if number == 0 else Image.Resampling.NEAREST
+            canvas.paste(Image.fromarray(picture).resize((cell_width, cell_height), kind), (left, HEAD))
+        else:
+            _text(draw, (left + cell_width // 2, HEAD + cell_height // 2), "no ground truth", FAINT, "mm")
+    for number, column in enumerate(columns, start=1):
+        _draw_bar(canvas, draw, number * (cell_width + GAP), cell_width, HEAD + cell_height, column)
+    _text(draw, (4, HEAD // 2), panel.name, INK, "lm")
+    _text(draw, (4, HEAD + cell_height + 11), panel.note, FAINT, "lm")
+    return np.asarray(canvas)
+
+
+def _draw_bar(canvas: Any, draw: Any, left: int, width: int, top: int, column: Column) -> None:
+    """Name above the cell; below it the colour bar with the values of its ends."""
+    from PIL import Image
+
+    _text(draw, (left + width // 2, HEAD // 2), f"{column.label} [m]", INK, "mm")
+    table = colour_table(column.scale.colour_map)
+    strip = table[np.linspace(0, 255, width).astype(np.intp)][None]
+    canvas.paste(Image.fromarray(strip).resize((width, BAR)), (left, top + 4))
+    low, high = _ends(column.scale)
+    _text(draw, (left + 1, top + BAR + 15), low, FAINT, "lm")
+    _text(draw, (left + width - 1, top + BAR + 15), high, FAINT, "rm")
+
+
+def _ends(scale: ColourScale) -> tuple[str, str]:
+    """The ends of a scale in words; beyond them the colour does not change."""
+    low = "0" if scale.low == 0 else f"≤ {scale.low:.2g}"
+    return low, f"≥ {scale.high:.2g}"
+
+
+def _text(draw: Any, at: tuple[int, int], text: str, colour: tuple[int, int, int], anchor: str) -> None:
+    draw.text(at, text, fill=colour, anchor=anchor, font=_font(12))
+
+
+@cache
+def _font(size: int) -> Any:
+    """DejaVu Sans, which matplotlib brings: Pillow's own font has neither σ nor ≥."""
+    from PIL import ImageFont
+
+    return ImageFont.truetype(Path(require_matplotlib().get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
+
+
+class VideoWriter:
+    """Writes an H.264 mp4 frame by frame; a context manager.
+
+    The file appears under its name when the block ends, also when it ends by Ctrl-C or an error: it then
+    holds the frames so far. Without a frame there is no file.
+
+    Args:
+        path: ends in .mp4; its folder must exist.
+        fps: frames per second.
+
+    Raises:
+        ImportError: imageio-ffmpeg is missing; names the extra that brings it.
+        ValueError: another ending, or fps is not positive.
+    """
+
+    def __init__(self, path: str | Path, fps: float) -> None:
+        self.path = Path(path)
+        if self.path.suffix != ".mp4":
+            raise ValueError(f"path must end in .mp4, got {self.path.name}")
+        if not fps > 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        _require_ffmpeg()
+        self.fps = fps
+        self._size: tuple[int, int] | None = None
+        self._pipe: Generator[None, Any, None] | None = None
+        # ffmpeg goes by the ending, so it comes last here.
+        self._temporary = self.path.with_name(f".{self.path.stem}.{os.getpid()}.tmp.mp4")
+
+    def add(self, frame: NDArray[np.uint8]) -> None:
+        """Append a frame [H, W, 3] uint8 RGB, H and W even and the same for all.
+
+        Raises:
+            ValueError: wrong shape or type.
+            OSError: ffmpeg stopped, on a full disk, say.
+        """
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or any(n % 2 for n in frame.shape[:2]):
+            raise ValueError(f"frame must be uint8 [H, W, 3] of even size, got {frame.dtype} {frame.shape}")
+        size = (frame.shape[1], frame.shape[0])
+        if self._pipe is None:
+            self._pipe, self._size = self._open(size), size
+        if size != self._size:
+            raise ValueError(f"frame must have the size of the first, {self._size}, got {size}")
+        self._pipe.send(np.ascontiguousarray(frame))
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises:
+            OSError: ffmpeg wrote no file.
+        """
+        if self._pipe is None:
+            return
+        pipe, self._pipe = self._pipe, None
+        try:
+            pipe.close()
+            if not self._temporary.is_file() or self._temporary.stat().st_size == 0:
+                raise OSError(f"ffmpeg wrote no video for {self.path}")
+            os.replace(self._temporary, self.path)
+        finally:
+            self._temporary.unlink(missing_ok=True)
+
+    def _open(self, size: tuple[int, int]) -> Generator[None, Any, None]:
+        pipe: Generator[None, Any, None] = _require_ffmpeg().write_frames(
+            str(self._temporary),
+            size,
+            fps=self.fps,
+            codec="libx264",
+            pix_fmt_in="rgb24",
+            pix_fmt_out="yuv420p",  # what browsers and slide programs play
+            macro_block_size=2,
+            quality=7,
+            ffmpeg_log_level="error",
+        )
+        pipe.send(None)
+        return pipe
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> int:
+    """Write frames [H, W, 3] uint8 RGB of one even size as an mp4; returns how many. See ``VideoWriter``."""
+    count = 0
+    with VideoWriter(path, fps) as video:
+        for frame in frames:
+            video.add(frame)
+            count += 1
+    return count
+
+
+def _require_ffmpeg() -> Any:
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'") from error
+    return imageio_ffmpeg

@@ -1,0 +1,145 @@
+"""Predictions on disk, so that a network sees an image once, however often the rows on it are changed.
+
+One file for each network, frame and member: ``NETWORK/SEQUENCE/FRAME@MEMBER.maps``, which begins with the SHA-256
+of the rest, an npz with the maps in float32. What is read is bit for bit what was written, or is not used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.sequences.frame import Frame, Sequence
+from ufmstar_torch.eval.engine.predicted import Predicted
+
+_DIGEST = 32  # bytes of a SHA-256
+_SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
+
+
+class CacheError(Exception):
+    """The folder cannot be used; says which one and why."""
+
+
+@dataclass(frozen=True)
+class PredictionKey:
+    """What a prediction depends on.
+
+    Attributes:
+        network: digest of the network(s).
+        sequence: ``sequence_digest``.
+        frame: its name.
+        member: "0", "1", ..., or "all".
+        content: ``frame_digest``.
+    """
+
+    network: str
+    sequence: str
+    frame: str
+    member: str
+    content: str
+
+    @property
+    def path(self) -> Path:
+        """Within the cache's folder."""
+        return Path(self.network[:_SHOWN], self.sequence[:_SHOWN], f"{self.frame}@{self.member}.maps")
+
+
+class PredictionCache:
+    """Files of predictions. Several processes may use one folder: a file is whole or absent, and those who write
+    the same one write the same.
+
+    Args:
+        folder: made if it is not there; None = nothing is kept.
+
+    Attributes:
+        hits: predictions that were read.
+        misses: that were not there, or belong to another image of that name.
+        damaged: files that were cut off or changed; they are written anew.
+
+    Raises:
+        CacheError: the folder cannot be made or written.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        self.hits = self.misses = self.damaged = 0
+        if folder is None:
+            return
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            # Asked by writing: permissions do not tell of file systems that are mounted read-only.
+            probe = folder / ".writable"
+            write_atomic(probe, lambda file: file.write(b""))
+        except OSError as error:
+            raise CacheError(_cannot(folder, error)) from error
+
+    def load(self, key: PredictionKey, device: torch.device) -> Predicted | None:
+        """The prediction, or None where it has to be made."""
+        if self.folder is None:
+            return None
+        try:
+            content = (self.folder / key.path).read_bytes()
+        except FileNotFoundError:
+            self.misses += 1
+            return None
+        except OSError:  # a bad disk: as good as a damaged file
+            self.damaged += 1
+            return None
+        if len(content) < _DIGEST or hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+            self.damaged += 1
+            return None
+        with np.load(io.BytesIO(content[_DIGEST:]), allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        if bytes(arrays.pop("content")).decode() != key.content:
+            self.misses += 1
+            return None
+        self.hits += 1
+        K = torch.from_numpy(arrays.pop("intrinsics"))
+        maps = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
+        return Predicted(maps["depth"], maps.get("aleatoric"), maps.get("epistemic"), K)
+
+    def store(self, key: PredictionKey, predicted: Predicted) -> None:
+        """Keep a prediction.
+
+        Raises:
+            CacheError: it cannot be written.
+        """
+        if self.folder is None:
+            return
+        arrays = {name: value.cpu().numpy() for name, value in predicted.maps().items()}
+        arrays["intrinsics"] = predicted.intrinsics.numpy()
+        arrays["content"] = np.frombuffer(key.content.encode(), np.uint8)
+        packed = io.BytesIO()
+        np.savez(packed, allow_pickle=False, **arrays)
+        body = packed.getvalue()
+        path = self.folder / key.path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(path, lambda file: file.write(hashlib.sha256(body).digest() + body))
+        except OSError as error:
+            raise CacheError(_cannot(self.folder, error)) from error
+
+
+def sequence_digest(sequence: Sequence) -> str:
+    """Hex digest of a sequence's name, layout, camera and frames' names."""
+    told = (sequence.name, sequence.layout, sequence.image_size, sequence.intrinsics.tolist(), sequence.names)
+    return hashlib.sha256(repr(told).encode()).hexdigest()
+
+
+def frame_digest(frame: Frame) -> str:
+    """Hex digest of what a network sees of a frame: pixels and intrinsics (and the index, which seeds samples)."""
+    digest = hashlib.sha256(repr((frame.index, None if frame.image is None else frame.image.shape)).encode())
+    digest.update(np.ascontiguousarray(frame.intrinsics).tobytes())
+    if frame.image is not None:
+        digest.update(np.ascontiguousarray(frame.image).tobytes())
+    return digest.hexdigest()
+
+
+def _cannot(folder: Path, error: OSError) -> str:
+    return f"the cache of predictions cannot be written to {folder} ({error}): choose another folder, or none"

@@ -1,0 +1,68 @@
+"""What is kept of one row on one sequence: the line from which every table and figure is made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ufmstar_torch.eval.results.files import write_json_atomic
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Record:
+    """One row of a table on one sequence.
+
+    Attributes:
+        suite: its name, as "paper-table-1".
+        dataset: as "scannet"; ``sequence``: its name within it.
+        sequence: see ``dataset``.
+        network: as shown, "FastDepth" or "ResNet50-Monodepth2".
+        method: the row's name, ``Method.name``.
+        setting: ``Setting.to_dict()``; {} = as the paper runs it.
+        frames: "selected", "done", "skipped" (counts) and "reasons" (count by reason).
+        figures: ``SequenceMetrics.compute()``: "delta1", "nll", "ece_delta", ... (NaN is kept as None).
+        curves: ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE", "error_by_error:REFERENCE" over the
+            pixels of which the method REFERENCE is confident.
+        state: of the multiview method: "bytes_mean", "bytes_max", "bytes_end" [B], "count_mean", "count_max",
+            "count_end" (points or components), "smoothing_bytes" (the map kept for smoothing) [B]; {} if alone.
+        ms: median time per frame [ms] by stage: "network" (one inference, or all of them), "uncertainty".
+        provenance: "versions", "machine", "device", digests of networks and sequence.
+    """
+
+    suite: str
+    dataset: str
+    sequence: str
+    network: str
+    method: str
+    setting: Mapping[str, Any] = field(default_factory=dict)
+    frames: Mapping[str, Any] = field(default_factory=dict)
+    figures: Mapping[str, float | None] = field(default_factory=dict)
+    curves: Mapping[str, Any] = field(default_factory=dict)
+    state: Mapping[str, float] = field(default_factory=dict)
+    ms: Mapping[str, float] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON, whole or not at all."""
+        write_json_atomic(path, {"format": FORMAT, **asdict(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Record:
+        """Read one.
+
+        Raises:
+            ValueError: the file is not a record of this format; the message names it.
+        """
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path} is not a record: {error}") from error
+        names = {f.name for f in fields(cls)}
+        if not isinstance(values, dict) or values.pop("format", None) != FORMAT or values.keys() != names:
+            raise ValueError(f"{path} is not a record of format {FORMAT}")
+        return cls(**values)

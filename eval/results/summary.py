@@ -1,0 +1,276 @@
+"""summary.json and the table at the end of a run: what came out, from what, with which settings and versions."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from statistics import mean, median
+from typing import Any
+
+from ufmstar_torch.eval.engine.judge import ALONE, UFM
+from ufmstar_torch.eval.sequences import Sequence as Frames
+from ufmstar_torch.mixture import GaussianMixture
+
+FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
+# [m] A sigma below it claims more than any depth network knows.
+NEAR_ZERO = 1e-3
+# [nats] Above it, the mean NLL tells of a few pixels with almost no variance, and of nothing else.
+_NLL_DOMINATED = 100.0
+STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
+_PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
+_COLUMNS = {
+    "delta1": "delta1",
+    "abs_rel": "AbsRel",
+    "rmse": "RMSE [m]",
+    "nll": "NLL",
+    "ece_delta": "ECE_delta",
+    "ece_q": "ECE_q",
+    "spearman": "Spearman",
+}
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended: "finished", "interrupted" or "failed", and why."""
+
+    state: str
+    reason: str
+
+
+def summarise(
+    *,
+    ending: Ending,
+    settings: Mapping[str, Any],
+    sequence: Frames,
+    selected: int,
+    source: Mapping[str, Any],
+    records: Sequence[Mapping[str, Any]],
+    sessions: Sequence[Mapping[str, float]],
+    mixture: GaussianMixture,
+    figures: Mapping[str, Mapping[str, float]],
+    outputs: Mapping[str, str | None],
+) -> dict[str, Any]:
+    """Everything that summary.json says; a pure function of what the run has kept.
+
+    Args:
+        ending: of the run.
+        settings: what the user chose.
+        sequence: the frames, of which ``selected`` were asked for.
+        selected: see above.
+        source: what the depth came from.
+        records: the lines of frames.jsonl.
+        sessions: of every start of the program.
+        mixture: at the end.
+        figures: metrics by method.
+        outputs: by file, None if it is there, or why it is not.
+    """
+    done = [record for record in records if record["state"] == "done"]
+    return {
+        "program": "ufmstar run",
+        "state": ending.state,
+        "reason": ending.reason,
+        "sequence": _sequence(sequence),
+        "frames": _frames(records, selected),
+        "source": source,
+        "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
+        "metrics": figures.get(UFM),
+        "metrics_reason": None if UFM in figures else "no ground truth",
+        "network_alone": figures.get(ALONE),
+        "network_alone_reason": None if ALONE in figures else _why_not_alone(done, UFM in figures),
+        "uncertainty": _uncertainty(done),
+        "anchors": _anchors(done),
+        "mixture": _mixture(done, mixture),
+        "rotation_deviation_max": max((record["rotation_deviation"] for record in done), default=None),
+        "time": _time(done, sessions),
+        "outputs": outputs,
+        "settings": settings,
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Of the packages that matter (None = not installed), of Python, and the platform."""
+    found: dict[str, str | None] = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    return {**found, "python": platform.python_version(), "platform": platform.platform()}
+
+
+def _sequence(sequence: Frames) -> dict[str, Any]:
+    return {
+        "name": sequence.name,
+        "layout": sequence.layout,
+        "frames": len(sequence),
+        "image_size": sequence.image_size,
+        "intrinsics": sequence.intrinsics,
+        "depth_intrinsics": sequence.depth_intrinsics,
+        "without_depth": len(sequence.without_depth),
+        "left_out": dict(Counter(frame.reason for frame in sequence.skipped)),
+    }
+
+
+def _frames(records: Sequence[Mapping[str, Any]], selected: int) -> dict[str, Any]:
+    skipped = [record for record in records if record["state"] == "skipped"]
+    return {
+        "selected": selected,
+        "done": len(records) - len(skipped),
+        "skipped": dict(Counter(record["reason"] for record in skipped)),
+        "skipped_frames": [{"name": record["name"], "reason": record["reason"]} for record in skipped],
+        "with_ground_truth": sum(record.get("ground_truth", False) for record in records),
+    }
+
+
+def _why_not_alone(done: Sequence[Mapping[str, Any]], judged: bool) -> str:
+    if any(record["mean_network_sigma"] is not None for record in done):
+        return "no ground truth" if not judged else "no variance where there is ground truth"
+    return "the depth comes without a variance of its own"
+
+
+def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over all valid pixels of all frames. With perfect depth, they are the method's floor."""
+    saturated = {kind: sum(record["saturated"][kind] for record in done) for kind in ("depth", "sigma")}
+    return {
+        "mean_disagreement": _pixel_mean(done, "mean_disagreement"),
+        "mean_sigma": _pixel_mean(done, "mean_sigma"),
+        "mean_network_sigma": _pixel_mean(done, "mean_network_sigma"),
+        "units": "disagreement m^2, sigma m",
+        "near_zero_share": _near_zero_share(done),
+        "valid_pixels": sum(record["valid_pixels"] for record in done),
+        "saturated_png_pixels": saturated,
+    }
+
+
+def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """What anchors did over all frames, the first ones included; None of a run without."""
+    records = [record["anchors"] for record in done if "anchors" in record]
+    if not records:
+        return None
+    first = next((number for number, record in enumerate(records) if record["used"]), None)
+    means = {f"{key}_per_frame": mean(r[key] for r in records) for key in ("tracked", "found", "usable", "used")}
+    return {
+        **means,
+        "frames_before_the_first": len(records) if first is None else first,
+        "frames_without": dict(Counter(record["without"] for record in records if record["without"] is not None)),
+        "mean_anchored": _pixel_mean(done, "mean_anchored"),
+        "mean_bias": _pixel_mean(done, "mean_bias"),
+        "units": "mean_anchored m^2 (B), mean_bias 1 (r: true depth over predicted, less 1)",
+    }
+
+
+def _near_zero_share(done: Sequence[Mapping[str, Any]]) -> float | None:
+    """Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component: there, the prior says 0."""
+    pixels = sum(record["valid_pixels"] for record in done)
+    return sum(record["near_zero"] for record in done) / pixels if pixels else None
+
+
+def _pixel_mean(done: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Mean over pixels; a frame without a valid pixel has no mean of its own."""
+    known = [(record[key], record["valid_pixels"]) for record in done if record[key] is not None]
+    pixels = sum(count for _, count in known)
+    return sum(mean * count for mean, count in known) / pixels if pixels else None
+
+
+def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dict[str, Any]:
+    last = done[-1]["components"] if done else 0
+    counts = {key: sum(record[key] for record in done) for key in ("segments", "matched", "pairs", "new", "dropped")}
+    size = mixture.bytes_per_component()
+    return {
+        "components": last,
+        "components_over_time": [record["components"] for record in done],
+        **counts,
+        "bytes_in_use": last * size,
+        "bytes_allocated": mixture.capacity * size,
+    }
+
+
+def _time(done: Sequence[Mapping[str, Any]], sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Medians by stage; "prepare" is preprocessing, or reading the predicted map.
+
+    The rate is that of the median frame: the first one also loads libraries and compiled kernels.
+    """
+    seconds = sum(session["seconds"] for session in sessions)
+    stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
+    total = median(sum(record["ms"].values()) for record in done) if done else None
+    return {
+        "median_ms": {stage: median(times) if times else None for stage, times in stages.items()} | {"frame": total},
+        "frames_per_second": 1000 / total if total else None,
+        "frames_per_second_with_start": len(done) / seconds if seconds else None,
+        "wall_seconds": seconds,
+        "sessions": list(sessions),
+    }
+
+
+def table(summary: Mapping[str, Any]) -> str:
+    """A few lines for the terminal: methods by metrics, and the figures of the run."""
+    lines = []
+    uncertainty = summary["uncertainty"]
+    if summary["metrics"] is not None:
+        name = "UfM*" if summary["anchors"] is None else "UfM*, anchored"
+        rows = [(name, summary["metrics"], uncertainty["mean_sigma"])]
+        if summary["network_alone"] is not None:
+            rows.append(("network alone", summary["network_alone"], uncertainty["mean_network_sigma"]))
+        head = ["", *_COLUMNS.values(), "sigma [m]"]
+        body = [[name, *(number(figures.get(key)) for key in _COLUMNS), number(sigma)] for name, figures, sigma in rows]
+        lines += aligned([head, *body])
+        if summary["network_alone"] is None:
+            lines.append(f"network alone: no row, {summary['network_alone_reason']}")
+        if (summary["metrics"]["nll"] or 0) > _NLL_DOMINATED:
+            lines.append(
+                f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
+                f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
+            )
+    else:
+        sigma = number(uncertainty["mean_sigma"])
+        lines.append(f"no metrics: {summary['metrics_reason']}; mean sigma {sigma} m")
+    mixture, time = summary["mixture"], summary["time"]
+    stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
+    rate = time["frames_per_second"]
+    lines += [] if summary["anchors"] is None else _told(summary["anchors"], summary["frames"]["done"])
+    lines += [
+        f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
+        f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "
+        f"{number(uncertainty['mean_disagreement'])} m^2",
+        f"{summary['frames']['done']} frames{f' at {rate:.1f} per second' if rate else ''}; median ms: {stages}",
+    ]
+    lines += [f"skipped {count}: {reason}" for reason, count in summary["frames"]["skipped"].items()]
+    lines += [f"left out {count}: {reason}" for reason, count in summary["sequence"]["left_out"].items()]
+    return "\n".join(lines)
+
+
+def _told(anchors: Mapping[str, Any], frames: int) -> list[str]:
+    """What anchors did, in a line, and in another one which frames had none."""
+    used, found, tracked = (anchors[f"{key}_per_frame"] for key in ("used", "found", "tracked"))
+    line = f"anchors: {used:.1f} used a frame, of {found:.1f} triangulated and {tracked:.1f} tracked"
+    if used and anchors["mean_bias"] is not None:
+        way = "nearer" if anchors["mean_bias"] < 0 else "farther"
+        expected = f"{abs(anchors['mean_bias']):.0%} {way} than predicted"
+        line += f"; mean B {number(anchors['mean_anchored'])} m^2, true depth expected {expected}"
+    without, before = anchors["frames_without"], anchors["frames_before_the_first"]
+    if not without:
+        return [line]
+    why = "; ".join(f"{count} x {reason}" for reason, count in without.items())
+    later = sum(without.values()) - before
+    told = f"without anchors: {before + later} of {frames} frames ({why})"
+    told += f"; {before} before the first anchors: plain UfM*" if before else ""
+    return [line, told + (f"; {later} later: with what was learnt before" if later else "")]
+
+
+def number(value: float | None) -> str:
+    """Three digits, a dash for no value."""
+    return "-" if value is None or math.isnan(value) else f"{value:.3g}"
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table: the first column to the left, the others to the right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
+        for row in rows
+    ]

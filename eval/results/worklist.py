@@ -1,0 +1,190 @@
+"""The sequences that are evaluated, and how they are shared out."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ufmstar_torch.eval.sequences.frame import Sequence as Frames
+from ufmstar_torch.eval.results.cache import sequence_digest
+
+TOUR = "tour"
+_ROOT = re.compile(r"(?P<dataset>[A-Za-z0-9][A-Za-z0-9._-]*)=(?P<path>.+)")
+_UNSAFE = re.compile(r"[^A-Za-z0-9._+-]+")
+_SHARD = re.compile(r"(\d+)/(\d+)")
+
+
+@dataclass(frozen=True, order=True)
+class WorkItem:
+    """A sequence that is not opened yet; items are in the order of data set and name.
+
+    Attributes:
+        dataset: as "scannet".
+        sequence: its name, unique within the data set.
+        path: what ``open_sequence`` takes, ``tour:SEED`` included.
+        layout: likewise.
+        opening: further options of ``open_sequence``, by name.
+    """
+
+    dataset: str
+    sequence: str
+    path: str
+    layout: str
+    opening: tuple[tuple[str, Any], ...] = field(default=(), compare=False)
+
+    @property
+    def folder(self) -> Path:
+        """DATASET/SEQUENCE below the outputs' "records", both in letters that every file system takes."""
+        return Path(_safe(self.dataset), _safe(self.sequence))
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return f"{self.dataset}/{self.sequence}"
+
+    def open(self) -> Frames:
+        """Open it.
+
+        Raises:
+            FileNotFoundError, ValueError: it cannot be opened.
+        """
+        from ufmstar_torch.eval.sequences.layout import open_sequence
+
+        return open_sequence(self.path, self.layout, **dict(self.opening))
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several equal parts of the work.
+
+    Attributes:
+        index: which, from 1.
+        count: how many there are.
+
+    Raises:
+        ValueError: no such part.
+    """
+
+    index: int = 1
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.index <= self.count:
+            raise ValueError(f"--shard must be 1/n to n/n, got {self.index}/{self.count}")
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """From "i/n", i from 1 to n.
+
+        Raises:
+            ValueError: another form.
+        """
+        found = _SHARD.fullmatch(text)
+        if found is None:
+            raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
+        return cls(int(found[1]), int(found[2]))
+
+    def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
+        """Its items: every n-th, so that all parts get neighbours of each."""
+        return list(items[self.index - 1 :: self.count])
+
+
+def find_work(
+    roots: Iterable[str],
+    *,
+    sample: int | None = None,
+    seed: int = 0,
+    only: Iterable[str] | None = None,
+) -> list[WorkItem]:
+    """All sequences below the roots, sorted.
+
+    Args:
+        roots: ``[DATASET=]PATH``: a folder below which sequences are, a sequence, or ``tour:SEED``. Without DATASET it
+            is the layout's name. "./" before a path with "=" in it keeps it whole.
+        sample: of each data set, take as many at random (all where it has fewer).
+        seed: of the sample: the same names give the same sample, wherever they lie.
+        only: names of sequences (or DATASET/NAME) to take, instead of all; the sample is drawn from them.
+
+    Raises:
+        FileNotFoundError: no such root.
+        ValueError: no sequence below a root, a name in ``only`` that is not there, one name twice in a data set, a
+            sample below 1.
+    """
+    items = sorted({item for root in roots for item in _below(root)})
+    twice = [key for key, n in Counter(item.folder for item in items).items() if n > 1]
+    if twice:
+        paths = ", ".join(item.path for item in items if item.folder == twice[0])
+        raise ValueError(f"--root: {twice[0].as_posix()} stands for {paths}: name their data sets, DATASET=DIR")
+    if only is not None:
+        items = _chosen(items, list(only))
+    if sample is None:
+        return items
+    if sample < 1:
+        raise ValueError(f"--sequences must be at least 1, got {sample}")
+    taken: list[WorkItem] = []
+    for dataset in dict.fromkeys(item.dataset for item in items):
+        there = [item for item in items if item.dataset == dataset]
+        # By names, which are sorted: random.sample draws positions.
+        taken += sorted(random.Random(seed).sample(there, min(sample, len(there))))
+    return taken
+
+
+def read_names(file: Path) -> list[str]:
+    """The lines of a file, without comments (# ...) and empty ones.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: it names nothing.
+    """
+    lines = [line.partition("#")[0].strip() for line in file.read_text(encoding="utf-8").splitlines()]
+    found = [line for line in lines if line]
+    if not found:
+        raise ValueError(f"--sequence-list {file} names no sequence")
+    return found
+
+
+def content_digest(sequence: Frames) -> str:
+    """Hex digest of what can be told of a sequence without decoding it: frames, cameras and poses."""
+    digest = hashlib.sha256(sequence_digest(sequence).encode())
+    digest.update(
+        repr((None if (K := sequence.depth_intrinsics) is None else K.tolist(), sequence.depth_size)).encode()
+    )
+    for entry in sequence.entries:
+        digest.update(entry.T_world_cam.tobytes() + bytes([entry.load_depth is not None]))
+    return digest.hexdigest()
+
+
+def _below(root: str) -> list[WorkItem]:
+    """The sequences of one root."""
+    found = _ROOT.fullmatch(root)
+    dataset, path = (found["dataset"], found["path"]) if found else (None, root)
+    if path.startswith(f"{TOUR}:"):
+        return [WorkItem(dataset or TOUR, path, path, "auto")]
+    from ufmstar_torch.eval.sequences.find import find_sequences
+
+    there = find_sequences(path)
+    if not there:
+        raise ValueError(f"--root {root}: no sequence of a known layout is there or below")
+    return [WorkItem(dataset or f.layout, f.name, str(f.path.absolute()), f.layout) for f in there]
+
+
+def _chosen(items: list[WorkItem], only: list[str]) -> list[WorkItem]:
+    """Those that are named; every name must be there."""
+    named = {name: [item for item in items if name in (item.sequence, item.label)] for name in only}
+    missing = [name for name, found in named.items() if not found]
+    if missing:
+        told = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+        raise ValueError(f"--sequence-list names sequences that are not there: {told}")
+    return sorted({item for found in named.values() for item in found})
+
+
+def _safe(name: str) -> str:
+    """The name where it is fit for a folder, else with dashes and a few digits that keep it unique."""
+    plain = _UNSAFE.sub("-", name).strip(".-")[:100]
+    return name if plain == name else f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
