@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from measure_views import surface_points
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.metrics.sequence import mean_and_ci
 from ufmstar_torch.eval.methods.ufm import UfM
+from ufmstar_torch.eval.metrics.sequence import mean_and_ci
 
 EDGES = np.logspace(-4, 1, 21)  # [m^2] of the variance
 FEWEST = 2000  # pixels of a bin that is drawn

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences import Frame, Sequence, open_sequence
-from ufmstar_torch.eval.tour.box_room import intrinsics
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour import Tour, make_tour, render, tour_path
+from ufmstar_torch.eval.tour.box_room import intrinsics
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:"

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from tiny_networks import Linear
 
-from ufmstar_torch.eval.tour import box_room as synthetic
-from ufmstar_torch.eval.sequences.frame import Entry, Sequence, make_sequence
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.sequences.frame import Entry, Sequence, make_sequence
+from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models.heads import UncertaintyNetwork, with_head
 from ufmstar_torch.models.network import Backbone
 from ufmstar_torch.models.preprocess import Preprocess

@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.results.files import write_json_atomic
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.report.load import Results
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
 
 Maps = tuple[Tensor, Tensor | None, Tensor]
 # How far sigma falls short of the error: 1 is calibrated.

@@ -17,13 +17,20 @@ from layouts import write_tum
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.backend import TORCH, Backend
 from ufmstar_torch.eval.bench import benchmark
-from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.eval.bench.benchmark_frames import PosedDepth, RecordedSequence, RenderedRoom
 from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
 from ufmstar_torch.eval.bench.benchmark_machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.bench.benchmark_report import format_report
 from ufmstar_torch.eval.bench.benchmark_step import build_up, components_in_view, memory
-from ufmstar_torch.eval.bench.benchmark_timing import STAGES, StageClock, Stopwatch, paired_ratio, pinned_threads, spread
+from ufmstar_torch.eval.bench.benchmark_timing import (
+    STAGES,
+    StageClock,
+    Stopwatch,
+    paired_ratio,
+    pinned_threads,
+    spread,
+)
+from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, FastDepthWidths
 
 SPREAD = {"median_ms", "iqr_ms", "q1_ms", "q3_ms", "min_ms", "count"}

@@ -13,18 +13,18 @@ import torch
 from runs import read_summary
 
 from ufmstar_torch import UncertainDepth, cli
-from ufmstar_torch.eval.report import calibration_plot, colours, plots
 from ufmstar_torch.eval.commands import demo
-from ufmstar_torch.eval.results import demo_folder
-from ufmstar_torch.eval.report.calibration_plot import draw_calibration
 from ufmstar_torch.eval.commands.demo import DemoOptions, sheet_rows, surface_kinds
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, METHODS, NETWORK, UFM, UFM_STAR, Comparison, Tally
+from ufmstar_torch.eval.methods.ufm import UfM
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report import calibration_plot, colours, plots
+from ufmstar_torch.eval.report.calibration_plot import draw_calibration
 from ufmstar_torch.eval.report.demo_pictures import FILES
 from ufmstar_torch.eval.report.demo_report import explanation, table
-from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.results import demo_folder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
-from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
 SIZE, FRAMES, SEED = (64, 96), 7, 5

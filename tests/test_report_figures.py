@@ -14,6 +14,9 @@ from evaluations import confident, draw_maps, in_memory, judge, record_of, rows_
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ufmstar_torch.eval.methods.method import BASES, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.figure_style import (
     label_ends,
     new_figure,
@@ -38,9 +41,6 @@ from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.sums import Merged
 from ufmstar_torch.eval.report.sweep_lines import Point, change, level, points, sweeps
 from ufmstar_torch.eval.report.write import write_report
-from ufmstar_torch.eval.methods.method import BASES, Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
 
 ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")
 ALONE, UFM, UFM_STAR, DEPTH, STAR_OF_DEPTH = ROWS

@@ -10,12 +10,12 @@ from evaluations import check_latex, in_memory, parsed, rows_of
 from shared_data import require_shared
 from test_efficiency_table import line as measured_line
 
+from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.report.latex import latex
 from ufmstar_torch.eval.report.markdown import markdown
 from ufmstar_torch.eval.report.paper import BY_SUITE, TABLE_1, TABLE_2, TABLE_2_NETWORKS, TABLE_3, TABLE_4, Quoted
 from ufmstar_torch.eval.report.paper_efficiency import paper_efficiency_tables
 from ufmstar_torch.eval.report.write import write_tables
-from ufmstar_torch.eval.methods.method import Method
 
 ALONE = rows_of("Ensemble")[0]
 

@@ -15,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from ufmstar_torch.eval.report.colours import INVALID_GREY
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
+from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.compare import draw_comparison, largest_difference
 from ufmstar_torch.eval.report.example import Example, RowMaps, find_examples
 from ufmstar_torch.eval.report.grid import break_name, draw_grid
@@ -27,8 +29,6 @@ from ufmstar_torch.eval.report.projection import SIGMAS, View, project, views_of
 from ufmstar_torch.eval.report.rooms import Snapshot, below_ceiling, choose_times, draw_room, find_rooms, painted
 from ufmstar_torch.eval.report.strips import NLL_SCALE, draw_breakdown, draw_strip, figures_of, fit_scales, mean_nll
 from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.results.worklist import WorkItem
 
 SHAPE = (12, 16)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from evaluations import in_memory
 
-from ufmstar_torch.eval.report.figures import write_figures
-from ufmstar_torch.eval.report.figures_sweep import draw_sweep
-from ufmstar_torch.eval.report.load import Results
-from ufmstar_torch.eval.report.names import ECE_DELTA
-from ufmstar_torch.eval.report.sweep_lines import default_value, level, points, sweep_lines, sweeps
 from ufmstar_torch.eval.engine.anchor_source import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import setting_from
 from ufmstar_torch.eval.methods.suites import COUNTS, ROTATION_DRIFTS, TRACK_NOISES, suite_named
+from ufmstar_torch.eval.report.figures import write_figures
+from ufmstar_torch.eval.report.figures_sweep import draw_sweep
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.names import ECE_DELTA
+from ufmstar_torch.eval.report.sweep_lines import default_value, level, points, sweep_lines, sweeps
 from ufmstar_torch.tracker import TrackerConfig
 
 STAR = Method.parse("UfM*-DepthOnly")

@@ -14,6 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.methods.suites import names, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.aggregate import better, difference, has_variance, mean_of, references
 from ufmstar_torch.eval.report.latex import escape, latex
@@ -23,10 +27,6 @@ from ufmstar_torch.eval.report.names import ECE_DELTA, NLL, SPEARMAN, row_label
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, mark_best, number
 from ufmstar_torch.eval.report.tables import difference_table, extra_table, main_table, sequence_tables
 from ufmstar_torch.eval.report.write import summary, write_report
-from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.methods.suites import names, suite_named
 
 ENSEMBLE = rows_of("Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
 ALONE, UFM, UFM_100K, UFM_STAR = ENSEMBLE

@@ -16,16 +16,16 @@ from runs import CONFIG, Brightness, job_of, network_job, outputs, own_depth_job
 
 from scenes import render
 from ufmstar_torch import UfMStar, UncertainDepth
-from ufmstar_torch.eval.results import run_folder, writers
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
-from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.run_pictures import field_of_view, square_pixels
 from ufmstar_torch.eval.commands.run import Progress, run
-from ufmstar_torch.eval.results.run_folder import FolderError
 from ufmstar_torch.eval.engine.run_maps import folder_source
 from ufmstar_torch.eval.engine.run_source import NetworkSource
-from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report.run_pictures import field_of_view, square_pixels
+from ufmstar_torch.eval.results import run_folder, writers
+from ufmstar_torch.eval.results.run_folder import FolderError
 from ufmstar_torch.eval.results.writers import read_frame
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.models import Preprocess
 
 TESTS = Path(__file__).parent

@@ -11,19 +11,19 @@ import torch
 from runs import Brightness, job_of, outputs, read_summary
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
-from ufmstar_torch.eval.engine import run_anchors
-from ufmstar_torch.eval.report.run_pictures import Finished
-from ufmstar_torch.eval.report.plots import fit_scales, map_columns
 from ufmstar_torch.eval.commands.run import run
-from ufmstar_torch.eval.results.run_folder import FolderError
 from ufmstar_torch.eval.commands.run_job import job_from
-from ufmstar_torch.eval.engine.run_maps import MapSource, PredictedMap
 from ufmstar_torch.eval.commands.run_options import parse_run, run_parser
+from ufmstar_torch.eval.engine import run_anchors
+from ufmstar_torch.eval.engine.run_maps import MapSource, PredictedMap
 from ufmstar_torch.eval.engine.run_source import NetworkSource
-from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.results.summary import table
+from ufmstar_torch.eval.report.plots import fit_scales, map_columns
+from ufmstar_torch.eval.report.run_pictures import Finished
 from ufmstar_torch.eval.report.video import preview_frame
+from ufmstar_torch.eval.results.run_folder import FolderError
+from ufmstar_torch.eval.results.summary import table
 from ufmstar_torch.eval.results.writers import read_frame
+from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
 

@@ -10,9 +10,9 @@ import pytest
 from layouts import truncate
 
 from scenes import look
+from ufmstar_torch.eval.check.alignment import alignment, depth_edges
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.check.alignment import alignment, depth_edges
 from ufmstar_torch.eval.sequences.register import register_depth
 
 SIZE = (120, 160)

@@ -8,15 +8,15 @@ import torch
 from layouts import truncate
 from layouts_more import write_h5, write_nyu
 
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.commands.run_job import job_from
 from ufmstar_torch.eval.commands.run_options import parse_run, run_parser
-from ufmstar_torch.eval.check.check import check_sequence
-from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
-from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.results.cache import PredictionCache
+from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.nyu import NyuFrames
 

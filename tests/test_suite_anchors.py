@@ -12,20 +12,20 @@ from tiny_suite import CPU, base_network, evaluate, row, write_network
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.load import setting_of
-from ufmstar_torch.eval.report.names import row_label
-from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.engine.anchor_source import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
 from ufmstar_torch.eval.engine.estimator import make_estimator, ufm_star_config
+from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.perturb import perturbed
-from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.methods.suite import configured, default_of, rows_of, setting_from
 from ufmstar_torch.eval.methods.suite_file import suite_from_file
 from ufmstar_torch.eval.methods.suites import suite_named
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report.load import setting_of
+from ufmstar_torch.eval.report.names import row_label
+from ufmstar_torch.eval.sequences.frame import Entry
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.name import open_tour
 from ufmstar_torch.tracker import LandmarkTracker
 

@@ -11,7 +11,7 @@ import torch
 from layouts import truncate, write_generic, write_image
 from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
 
-from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.results.cache import (
     CacheError,
     PredictionCache,
@@ -19,7 +19,7 @@ from ufmstar_torch.eval.results.cache import (
     frame_digest,
     sequence_digest,
 )
-from ufmstar_torch.eval.engine.predicted import Predicted
+from ufmstar_torch.eval.sequences import open_sequence
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
 KEY = PredictionKey("a" * 64, "b" * 64, "frame-7", "all", "c" * 64)

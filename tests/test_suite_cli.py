@@ -10,13 +10,13 @@ import pytest
 from suite_runs import TRUTH, Stub, write_rooms
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.bench import efficiency_step
-from ufmstar_torch.eval.results import launch
+from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.eval_options import eval_parser, job_from, parse_eval
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import rows_of
 from ufmstar_torch.eval.methods.suites import names
+from ufmstar_torch.eval.results import launch
 
 
 @pytest.fixture(scope="module")

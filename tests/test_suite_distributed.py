@@ -17,12 +17,12 @@ import torch
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 from trainings import SPEC
 
-from ufmstar_torch.eval.results.output_folder import FolderError
+from ufmstar_torch.eval.commands.eval_options import eval_parser, parse_eval
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.report.load import load_results
 from ufmstar_torch.eval.results import pool, slurm, worker
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.results.launch import Place, evaluate_suite
-from ufmstar_torch.eval.commands.eval_options import eval_parser, parse_eval
+from ufmstar_torch.eval.results.output_folder import FolderError
 from ufmstar_torch.eval.results.slurm import Job, Slurm
 from ufmstar_torch.eval.results.store import EvalFolder
 from ufmstar_torch.eval.results.worker import Share

@@ -13,17 +13,17 @@ from scipy.stats import chi2, kstest
 from tiny_suite import row
 
 from ufmstar_torch.eval.bench.measure import _obstacle
-from ufmstar_torch.eval.report.load import setting_of
-from ufmstar_torch.eval.report.names import row_label
-from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.engine.anchor_source import anchor_sources
 from ufmstar_torch.eval.engine.confident import references
-from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.engine.row_run import RowRun
+from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import default_of, setting_from
 from ufmstar_torch.eval.methods.suites import ROTATION_DRIFTS, TRANSLATION_DRIFTS, suite_named
+from ufmstar_torch.eval.report.load import setting_of
+from ufmstar_torch.eval.report.names import row_label
+from ufmstar_torch.eval.sequences.frame import Frame
 
 NAME = "UfM*-DepthOnly"
 BOTH = Setting(rotation_drift=0.5, translation_drift=0.02, seed=3)

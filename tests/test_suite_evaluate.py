@@ -12,13 +12,13 @@ from layouts import truncate, write_generic, write_tum
 from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
-from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.engine.evaluate import SequenceError, Stopped
 from ufmstar_torch.eval.methods.perturb import perturbed
-from ufmstar_torch.eval.tour.name import open_tour
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
+from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+from ufmstar_torch.eval.sequences import FrameError, open_sequence
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.tour.name import open_tour
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.pipeline import combine

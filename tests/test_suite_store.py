@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from layouts import write_seven_scenes
 from suite_runs import NAMES, go, job_on, write_rooms
 
-from ufmstar_torch.eval.results.output_folder import FolderError, differences, hold
-from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
+from ufmstar_torch.eval.results.output_folder import FolderError, differences, hold
 from ufmstar_torch.eval.results.store import EvalFolder
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest, find_work, read_names
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.tour.box_room import intrinsics, look
 from ufmstar_torch.eval.tour import Tour, TourStyle, make_tour, render, tour_path, tour_sequence
+from ufmstar_torch.eval.tour.box_room import intrinsics, look
 from ufmstar_torch.eval.tour.intersect import entry
 from ufmstar_torch.eval.tour.sensor import develop
 from ufmstar_torch.eval.tour.sequence import export_tour

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
-from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.engine.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
 CPU = torch.device("cpu")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.frame import FrameError, Sequence
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.layout import detect_layout, open_sequence
 from ufmstar_torch.train.parts import Part
 from ufmstar_torch.train.samples import RawSample, SampleError

@@ -230,9 +230,9 @@ def _run(options: Mapping[str, Any]) -> dict[str, Any]:
         UsageError: it cannot be opened.
     """
     from ufmstar_torch.eval.commands.run import run as run_job
-    from ufmstar_torch.eval.results.run_folder import FolderError
     from ufmstar_torch.eval.commands.run_job import job_from
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.results.run_folder import FolderError
 
     try:
         _set_threads(options["threads"])
@@ -262,8 +262,8 @@ def _evaluate(options: Mapping[str, Any]) -> int:
         FileNotFoundError, ValueError: it cannot be begun.
         CacheError, ImportError, OSError, RuntimeError: it cannot be finished.
     """
-    from ufmstar_torch.eval.results.launch import evaluate_suite
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.results.launch import evaluate_suite
 
     with Bars() as bars, stop_signals(bars.say) as stop:
         ended = evaluate_suite(options, stop=stop, tell=bars.say, progress=bars.frames)
@@ -316,8 +316,8 @@ def _demo(options: Any) -> dict[str, Any]:
         UsageError: the options do not fit, or what they name is not there.
     """
     from ufmstar_torch.eval.commands.demo import DemoOptions, run_demo
-    from ufmstar_torch.eval.results.demo_folder import DemoError
     from ufmstar_torch.eval.commands.terminal import Bars
+    from ufmstar_torch.eval.results.demo_folder import DemoError
 
     try:
         _set_threads(options.threads)

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.eval.sequences import Sequence
+from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, Preprocess
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.bench.memory import NetworkMemory, tensor_bytes
-from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.engine.networks import BaseNetwork
+from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember

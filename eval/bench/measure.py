@@ -23,10 +23,10 @@ from ufmstar_torch.eval.bench.multiview import Multiview, synchronize
 from ufmstar_torch.eval.bench.power import CPU, GPU, PowerMeter
 from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, Race, inference_of, parts_of, run_race
 from ufmstar_torch.eval.bench.windows import Work, repeated, run_windows
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
-from ufmstar_torch.eval.sequences.frame import Sequence as PosedSequence
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.eval.sequences.frame import Sequence as PosedSequence
 
 FORMAT = 1
 

@@ -16,9 +16,9 @@ from torch import Tensor
 from ufmstar_torch.eval.bench.benchmark_timing import Stopwatch
 from ufmstar_torch.eval.bench.contender import Contender
 from ufmstar_torch.eval.bench.multiview import Inputs, Multiview, StagedUfMStar, synchronize, waited
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.eval.methods.method import ALONE, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 
 DEPTH, ONCE, EVERY, MULTIVIEW = "depth", "once", "every", "multiview"
 # Clocks: what passes, and what this process computes (over all its threads), which other work does not stretch.

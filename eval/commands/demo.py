@@ -21,17 +21,17 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.camera import unproject
-from ufmstar_torch.eval.results.demo_folder import PROGRAM, SUMMARY, DemoError, prepare
-from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.commands.demo_options import FRAMES, OUT, SEED
+from ufmstar_torch.eval.commands.run import Progress
+from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
+from ufmstar_torch.eval.engine.run_source import sha256
 from ufmstar_torch.eval.report.demo_pictures import DemoPanel, panel, write_pictures
 from ufmstar_torch.eval.report.demo_report import names
+from ufmstar_torch.eval.results.demo_folder import PROGRAM, SUMMARY, DemoError, prepare
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
-from ufmstar_torch.eval.commands.run import Progress
-from ufmstar_torch.eval.engine.run_source import sha256
-from ufmstar_torch.eval.sequences.frame import Frame, Sequence
 from ufmstar_torch.eval.results.summary import versions
+from ufmstar_torch.eval.sequences.frame import Frame, Sequence
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
 from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
 from ufmstar_torch.ufmstar import UfMStar

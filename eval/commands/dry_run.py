@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.frame import Sequence as Frames
 from ufmstar_torch.eval.engine.networks import BaseNetwork
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.results.run_suite import EvalJob
 from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.frame import Sequence as Frames
 
 _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file systems allot
 

@@ -12,8 +12,8 @@ from ufmstar_torch.eval.commands.run_options import parse_slice
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
 
-    from ufmstar_torch.eval.results.run_suite import EvalJob
     from ufmstar_torch.eval.methods.suite import Suite
+    from ufmstar_torch.eval.results.run_suite import EvalJob
 
 _USAGE = (
     "ufmstar eval --suite NAME --root [DATASET=]DIR ... --network BASE=MODEL:FILE[,FILE...] ... --out OUT [options]"

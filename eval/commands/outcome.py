@@ -32,8 +32,8 @@ def measure(ended: Ended, threads: int | None = None) -> str | None:
     Raises:
         OSError: the file cannot be written.
     """
-    from ufmstar_torch.eval.bench.measure import Plan
     from ufmstar_torch.eval.bench.efficiency_step import EFFICIENCY, measure_job
+    from ufmstar_torch.eval.bench.measure import Plan
 
     if not ended.job.suite.efficiency or (ended.job.out / EFFICIENCY).exists():
         return None

@@ -9,9 +9,9 @@ import torch
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.run import Job
+from ufmstar_torch.eval.commands.run_options import OWN_DEPTH, check_options, parse_intrinsics, parse_size, parse_slice
 from ufmstar_torch.eval.engine.run_anchors import require_images
 from ufmstar_torch.eval.engine.run_maps import folder_source, own_depth_source
-from ufmstar_torch.eval.commands.run_options import OWN_DEPTH, check_options, parse_intrinsics, parse_size, parse_slice
 from ufmstar_torch.eval.engine.run_source import Source, network_source
 from ufmstar_torch.eval.sequences import Sequence, open_sequence
 

@@ -13,10 +13,10 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.engine.run_clock import Stopwatch
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.eval.methods.ufm import UfM
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
 from ufmstar_torch.prediction import DepthPrediction

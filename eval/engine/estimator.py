@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.engine.predicted import Predicted
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.ufmstar import UfMStar

@@ -16,14 +16,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.sequences.frame import Sequence
+from ufmstar_torch.eval.engine.frame_pass import FramePass
+from ufmstar_torch.eval.engine.networks import BaseNetwork
+from ufmstar_torch.eval.engine.row_run import RowRun
+from ufmstar_torch.eval.methods.method import ALONE
+from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
-from ufmstar_torch.eval.engine.frame_pass import FramePass
-from ufmstar_torch.eval.methods.method import ALONE
-from ufmstar_torch.eval.engine.networks import BaseNetwork
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.engine.row_run import RowRun
+from ufmstar_torch.eval.sequences.frame import Sequence
 
 
 class SequenceError(Exception):

@@ -10,19 +10,19 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
 from ufmstar_torch.eval.engine.anchor_source import anchor_sources
-from ufmstar_torch.eval.results.cache import PredictionCache, PredictionKey, frame_digest, sequence_digest
 from ufmstar_torch.eval.engine.confident import confident_pixels, references
 from ufmstar_torch.eval.engine.estimator import Estimate
-from ufmstar_torch.eval.results.examples import FinishedFrame
-from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.engine.networks import BaseNetwork
 from ufmstar_torch.eval.engine.predicted import Predicted, together
-from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.engine.row_run import RowRun
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
+from ufmstar_torch.eval.results.cache import PredictionCache, PredictionKey, frame_digest, sequence_digest
+from ufmstar_torch.eval.results.examples import FinishedFrame
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
+from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frame import FRAME_FAULTS, check_frame
 
 ALL = "all"  # members, where a prediction is kept

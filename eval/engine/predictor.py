@@ -8,11 +8,11 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.sequences.ground_truth import depth_camera
+from ufmstar_torch.eval.engine.predicted import Predicted, from_network
 from ufmstar_torch.eval.engine.run_clock import Stopwatch
 from ufmstar_torch.eval.engine.run_maps import PredictedMap
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
-from ufmstar_torch.eval.engine.predicted import Predicted, from_network
+from ufmstar_torch.eval.sequences.ground_truth import depth_camera
 from ufmstar_torch.models.dropout import set_sampling
 from ufmstar_torch.models.network import DepthNetwork
 

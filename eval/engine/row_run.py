@@ -12,14 +12,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
-from ufmstar_torch.eval.engine.run_clock import Stopwatch
-from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.engine.anchor_source import AnchorSource
 from ufmstar_torch.eval.engine.estimator import Estimate, make_estimator
-from ufmstar_torch.eval.methods.perturb import Drift, perturbed, selects
 from ufmstar_torch.eval.engine.predicted import Predicted
+from ufmstar_torch.eval.engine.run_clock import Stopwatch
+from ufmstar_torch.eval.methods.perturb import Drift, perturbed, selects
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+from ufmstar_torch.eval.sequences.frame import Frame
 
 METRICS = "metrics"
 BY_ERROR = "nll_by_error"

@@ -14,10 +14,10 @@ import torch
 
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.engine.run_source import Source
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
+from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
 from ufmstar_torch.pipeline import UncertainPrediction
 from ufmstar_torch.prediction import DepthPrediction

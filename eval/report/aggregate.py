@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from ufmstar_torch.eval.report.load import Results
-from ufmstar_torch.eval.report.names import LOWER, Quantity
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
-from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.names import LOWER, Quantity
+from ufmstar_torch.eval.results.record import Record
 
 
 @dataclass(frozen=True)

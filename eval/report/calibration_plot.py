@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.report.colours import require_matplotlib
-from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.report.plots import FAINT, INK
+from ufmstar_torch.eval.results.files import write_atomic
 
 # Okabe and Ito's colours, which the colour-blind tell apart, and marks for print in grey.
 _LINES = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))

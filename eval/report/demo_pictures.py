@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.engine.demo_methods import NETWORK, UFM_STAR, Compared
+from ufmstar_torch.eval.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
+from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.calibration_plot import draw_calibration
 from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.engine.demo_methods import NETWORK, UFM_STAR, Compared
-from ufmstar_torch.eval.results.files import write_json_atomic
-from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.plots import Column, FramePanel, PanelScales, contact_sheet
-from ufmstar_torch.eval.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
+from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.ufmstar import UfMStar
 
 SHEET, CURVES, PLY, ELLIPSOIDS = "contact_sheet.png", "calibration.png", "mixture.ply", "ellipsoids.ply"

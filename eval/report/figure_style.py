@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.report.colours import require_matplotlib
-from ufmstar_torch.eval.results.files import write_atomic
-from ufmstar_torch.eval.report.plots import FAINT, INK
 from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
+from ufmstar_torch.eval.report.colours import require_matplotlib
+from ufmstar_torch.eval.report.plots import FAINT, INK
+from ufmstar_torch.eval.results.files import write_atomic
 
 GRID = "#e6e6e6"
 TITLE, LABEL, TICK = 11, 9, 8  # sizes of letters [pt]

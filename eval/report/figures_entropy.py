@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.plots import FAINT, INK
-from ufmstar_torch.eval.report.figure_style import LABEL, TICK, finish, new_figure, short_name, style_of
-from ufmstar_torch.eval.report.load import Results
-from ufmstar_torch.eval.report.sums import Merged
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
+from ufmstar_torch.eval.report.figure_style import LABEL, TICK, finish, new_figure, short_name, style_of
+from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.plots import FAINT, INK
+from ufmstar_torch.eval.report.sums import Merged
 
 # Entropy [nats] of a Gaussian with a standard deviation of 1 m.
 ONE_METRE = 0.5 * math.log(2 * math.pi * math.e)

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.report.plots import FAINT, INK
+from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, TRUTH
 from ufmstar_torch.eval.report.aggregate import Mean, difference
 from ufmstar_torch.eval.report.figure_style import (
     ALONE_STYLE,
@@ -36,10 +38,8 @@ from ufmstar_torch.eval.report.names import (
     setting_label,
     setting_name,
 )
+from ufmstar_torch.eval.report.plots import FAINT, INK
 from ufmstar_torch.eval.report.sweep_lines import Line, Point, Rest, change, default_value, level, sweep_lines
-from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, TRUTH
 
 SHOWN = (NLL, ECE_DELTA, ECE_Q)
 # Lines of the same method by what is fixed; they differ from all of ``style_of``'s.

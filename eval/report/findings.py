@@ -6,6 +6,9 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import DEFAULT
 from ufmstar_torch.eval.report.aggregate import (
     Mean,
     better,
@@ -19,9 +22,6 @@ from ufmstar_torch.eval.report.aggregate import (
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.names import DELTA1, DIFFERENCES, ECE_DELTA, ECE_Q, LOWER, NLL, Quantity, row_label
 from ufmstar_torch.eval.report.table import number
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT
 
 BETTER, WORSE, OPEN, ALONE_SEQUENCE = "better", "worse", "open", "one sequence"
 _VERDICTS = (BETTER, WORSE, OPEN, ALONE_SEQUENCE)

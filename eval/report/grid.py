@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.report.colours import INVALID_GREY, ColourScale, require_matplotlib
-from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.report.plots import FAINT, INK
+from ufmstar_torch.eval.results.files import write_atomic
 
 # (left, top, width, height) in pixels of the map.
 Box = tuple[int, int, int, int]

@@ -9,11 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.report.sums import Merged, SumsError, merge_sums
 from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.report.sums import Merged, SumsError, merge_sums
+from ufmstar_torch.eval.results.record import Record
 
 FORMAT = 1
 FAILED = "failed.json"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.report.aggregate import value_of
 from ufmstar_torch.eval.report.embed import MOST_BYTES, Embedder
 from ufmstar_torch.eval.report.findings import count, join
@@ -25,6 +24,7 @@ from ufmstar_torch.eval.report.page_parts import (
 )
 from ufmstar_torch.eval.report.page_style import SCRIPT, STYLE
 from ufmstar_torch.eval.report.picture import read_index
+from ufmstar_torch.eval.results.files import write_atomic
 
 PAGE = "report.html"
 

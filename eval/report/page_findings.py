@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.caveats import caveats
 from ufmstar_torch.eval.report.findings import (
     ALONE_SEQUENCE,
@@ -22,7 +23,6 @@ from ufmstar_torch.eval.report.markup import Markup, tag, typeset
 from ufmstar_torch.eval.report.names import DIFFERENCES, row_label
 from ufmstar_torch.eval.report.page_part import Part, bullets, folded, paragraph
 from ufmstar_torch.eval.report.table import number
-from ufmstar_torch.eval.methods.row import Row
 
 # What the reader sees for a verdict, and its class.
 _WORDS = {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.report.paper import TABLE_2, TABLE_2_NETWORKS
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
-from ufmstar_torch.eval.methods.method import Method
 
 _PER_UNIT = ("Latency [ms]", "Power [W]", "Energy [mJ]")
 _COLUMNS = (

@@ -7,6 +7,9 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import DEFAULT
 from ufmstar_torch.eval.report.compare import draw_comparison
 from ufmstar_torch.eval.report.example import Example, find_examples
 from ufmstar_torch.eval.report.load import Results
@@ -14,9 +17,6 @@ from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.picture import BREAKDOWN, COMPARE, ROOM, STRIP, Picture, file_name, write_index
 from ufmstar_torch.eval.report.rooms import choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.report.strips import draw_breakdown, draw_strip, mean_nll
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT
 from ufmstar_torch.eval.results.worklist import WorkItem
 
 # So that a report of a hundred sequences stays one that can be read, and mailed.

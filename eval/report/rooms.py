@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.report.colours import ERROR_MAP, ColourScale, require_matplotlib, robust_range
-from ufmstar_torch.eval.results.files import write_atomic
-from ufmstar_torch.eval.report.plots import FAINT, INK
 from ufmstar_torch.eval.report.example import load_arrays
+from ufmstar_torch.eval.report.plots import FAINT, INK
 from ufmstar_torch.eval.report.projection import Ellipses, View, project, views_of
+from ufmstar_torch.eval.results.files import write_atomic
 
 Array = NDArray[np.float64]
 # A ceiling hides the room from above; the highest camera is held well below it [m].

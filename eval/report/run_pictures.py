@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import INVALID_GREY
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
-from ufmstar_torch.eval.report.plots import FramePanel, PanelScales, contact_sheet, fit_scales
 from ufmstar_torch.eval.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
-from ufmstar_torch.eval.sequences import Sequence as Frames
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
-from ufmstar_torch.eval.sequences.intrinsics import pinhole
+from ufmstar_torch.eval.report.colours import INVALID_GREY
+from ufmstar_torch.eval.report.plots import FramePanel, PanelScales, contact_sheet, fit_scales
 from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
 from ufmstar_torch.eval.results.writers import read_frame
+from ufmstar_torch.eval.sequences import Sequence as Frames
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.sequences.intrinsics import pinhole
 from ufmstar_torch.ufmstar import UfMStar
 
 SHEET_ROWS, SCALE_FRAMES = 6, 12

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
+from ufmstar_torch.eval.methods.method import UFM_STAR
+from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.aggregate import Mean, better, difference, has_variance, mean_of, references, value_of
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.names import DIFFERENCES, EXTRA, MAIN, Quantity, row_label
 from ufmstar_torch.eval.report.paper import BY_SUITE, PaperTable
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, mark_best
-from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.methods.row import Row
 
 METHOD = "Method"
 # [nats] Above it, a mean NLL is that of a few pixels: sigma = .25 d of a room makes about 1.

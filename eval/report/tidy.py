@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.report.aggregate import mean_over, value_of
 from ufmstar_torch.eval.report.load import FORMAT, Results
+from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.results.record import Record
 
 HEAD = ("suite", "dataset", "sequence", "network", "method")

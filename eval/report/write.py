@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.report.latex import latex
 from ufmstar_torch.eval.report.load import Results, load_results
 from ufmstar_torch.eval.report.markdown import markdown
@@ -15,6 +14,7 @@ from ufmstar_torch.eval.report.paper_efficiency import paper_efficiency_tables
 from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.report.tables import difference_table, extra_table, is_empty, main_table, sequence_tables
 from ufmstar_torch.eval.report.tidy import write_tidy
+from ufmstar_torch.eval.results.files import write_atomic
 
 
 def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> list[Path]:

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.sequences.frame import Frame, Sequence
-from ufmstar_torch.eval.engine.predicted import Predicted
 
 _DIGEST = 32  # bytes of a SHA-256
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits

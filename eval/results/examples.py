@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.results.files import write_atomic
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
-from ufmstar_torch.eval.sequences.frame import Frame, Size
-from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
 from ufmstar_torch.eval.engine.estimator import Estimate, Gaussians
-from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.engine.row_run import RowRun
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.sequences.frame import Frame, Size
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
+from ufmstar_torch.eval.sequences.intrinsics import scale_intrinsics
 
 # Of the frames, after which the mixture is kept; and again at the end.
 ROOM_SHARES = (0.25, 0.5)

@@ -24,11 +24,11 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
+from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.results.output_folder import FolderError as FolderError
 from ufmstar_torch.eval.results.output_folder import differences, hold
 from ufmstar_torch.eval.results.output_folder import flatten as flatten
-from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.results.writers import FrameWriter
 
 FORMAT = 1

@@ -20,12 +20,12 @@ from typing import Any, BinaryIO
 
 import torch
 
+from ufmstar_torch.eval.engine.evaluate import RowResult
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.metrics.packed_sums import pack
 from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.results.output_folder import FolderError, differences, hold
-from ufmstar_torch.eval.metrics.packed_sums import pack
-from ufmstar_torch.eval.engine.evaluate import RowResult
 from ufmstar_torch.eval.results.record import FORMAT, Record
-from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.results.worklist import WorkItem
 
 PROGRAM = "ufmstar eval"

@@ -1,4 +1,4 @@
-"""One process of several that share an evaluation, and ``python -m ufmstar_torch.eval.results.worker``, which is one."""
+"""One process of several that share an evaluation; ``python -m ufmstar_torch.eval.results.worker`` starts one."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.commands.eval_options import job_from
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.results.run_suite import Conduct, EvalJob, Evaluate, run_job
 from ufmstar_torch.eval.results.store import EvalFolder
 from ufmstar_torch.eval.results.worklist import Shard

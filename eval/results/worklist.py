@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.sequences.frame import Sequence as Frames
 from ufmstar_torch.eval.results.cache import sequence_digest
+from ufmstar_torch.eval.sequences.frame import Sequence as Frames
 
 TOUR = "tour"
 _ROOT = re.compile(r"(?P<dataset>[A-Za-z0-9][A-Za-z0-9._-]*)=(?P<path>.+)")
