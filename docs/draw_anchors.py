@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.report.run_pictures import field_of_view
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame, Sequence
@@ -34,7 +35,6 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
-from ufmstar_torch.tracker import LandmarkTracker
 
 UNKNOWN = "0.8"  # grey of pixels without ground truth
 DEPTH, ERROR, RATIO = "viridis", "magma", "RdBu"

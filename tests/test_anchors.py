@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors import AnchorInput, Anchors
-from ufmstar_torch.evidence import Evidence, inliers, means, observe
+from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
+from ufmstar_torch.anchors.given import AnchorInput, Anchors
 from ufmstar_torch.read_out import anchored_term
 
 HEIGHT, WIDTH = 48, 64

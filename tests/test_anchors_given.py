@@ -9,7 +9,7 @@ from torch import nn
 
 import scenes
 from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.camera import resize_intrinsics
 
 H, W = 48, 64
@@ -163,8 +163,8 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
 
 
 def test_a_standing_camera_has_no_anchors_and_says_so():
+    from ufmstar_torch.anchors.tracker import LandmarkTracker
     from ufmstar_torch.eval.sequences import open_sequence
-    from ufmstar_torch.tracker import LandmarkTracker
 
     frame = open_sequence("tour:5?frames=2&size=180x240")[0]
     tracker, plain, anchored = LandmarkTracker(), UfMStar(), UfMStar(ON)

@@ -8,8 +8,8 @@ import torch
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors import AnchorInput, Anchors
-from ufmstar_torch.evidence import inliers
+from ufmstar_torch.anchors.evidence import inliers
+from ufmstar_torch.anchors.given import AnchorInput, Anchors
 
 H, W = 48, 64
 ON = UfMStarConfig(anchored=True)

@@ -10,7 +10,7 @@ from test_ufmstar import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
 
 ANCHORED = UfMStarConfig(segment=SPGF, regression="exact", anchored=True, anchor_shrinkage=3.0, anchor_half_life=4.0)
 

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench import benchmark
 from ufmstar_torch.eval.bench.benchmark_anchors import PARTS, TrackedTour, measure_anchors, measure_tracker, one_thread
 from ufmstar_torch.eval.bench.benchmark_frames import RenderedRoom
 from ufmstar_torch.eval.bench.benchmark_report import format_report
 from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
-from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
 
 TIMES = {f"{clock}{name}_ms" for clock in ("", "cpu_") for name in ("median", "p90", "mean", "min")}
 SMALL = TrackedTour(size=(120, 160), path_frames=400)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ufmstar_torch.corners import find, follow
+from ufmstar_torch.anchors.corners import find, follow
 
 
 def textured(height, width, seed=0):

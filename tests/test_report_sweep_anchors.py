@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from evaluations import in_memory
 
+from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.eval.engine.anchor_source import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
@@ -21,7 +22,6 @@ from ufmstar_torch.eval.report.figures_sweep import draw_sweep
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.names import ECE_DELTA
 from ufmstar_torch.eval.report.sweep_lines import default_value, level, points, sweep_lines, sweeps
-from ufmstar_torch.tracker import TrackerConfig
 
 STAR = Method.parse("UfM*-DepthOnly")
 SEQUENCES = {"a": 0.3, "b": 0.5, "c": 0.7}  # ECE_delta of plain UfM*

@@ -11,6 +11,7 @@ import torch
 from runs import Brightness, job_of, outputs, read_summary
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
+from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.commands.run_job import job_from
 from ufmstar_torch.eval.commands.run_options import parse_run, run_parser
@@ -25,7 +26,6 @@ from ufmstar_torch.eval.results.summary import table
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
-from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
 
 TOUR = "tour:5?frames=8&size=120x160"
 ON = UfMStarConfig(on_bad_frame="skip", anchored=True)

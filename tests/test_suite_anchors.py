@@ -11,7 +11,8 @@ import torch
 from tiny_suite import CPU, base_network, evaluate, row, write_network
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.engine.anchor_source import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
 from ufmstar_torch.eval.engine.estimator import make_estimator, ufm_star_config
 from ufmstar_torch.eval.engine.predicted import Predicted
@@ -27,7 +28,6 @@ from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.name import open_tour
-from ufmstar_torch.tracker import LandmarkTracker
 
 NAME = "UfM*-DepthOnly"
 ON = UfMStarConfig(on_bad_frame="skip", anchored=True)

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
+from ufmstar_torch.anchors.triangulate import triangulate
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.kernels import triangulate_cpu
-from ufmstar_torch.tracker import LandmarkTracker, TrackerConfig
-from ufmstar_torch.triangulate import triangulate
 
 HERE = np.array([1000.0, -500.0, 20.0])  # far from the world's origin
 K = np.array([[300.0, 0, 160], [0, 310, 120], [0, 0, 1]])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.prediction import DepthPrediction
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput

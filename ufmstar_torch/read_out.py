@@ -7,11 +7,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors import AnchorInput
+from ufmstar_torch.anchors.evidence import Evidence, means, observe
+from ufmstar_torch.anchors.given import AnchorInput
 from ufmstar_torch.backend import Backend
 from ufmstar_torch.camera import focal_and_centre, unproject
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.evidence import Evidence, means, observe
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression, shares

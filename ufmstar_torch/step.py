@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors import AnchorInput
+from ufmstar_torch.anchors.evidence import Evidence
+from ufmstar_torch.anchors.given import AnchorInput
 from ufmstar_torch.backend import Backend
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.disagree import with_overlap_disagreement
-from ufmstar_torch.evidence import Evidence
 from ufmstar_torch.frame import FRAME_FAULTS, FrameInput
 from ufmstar_torch.fuse import append
 from ufmstar_torch.gaussian import pixel_footprint

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors import AnchorInput, Anchors, check_anchors
+from ufmstar_torch.anchors.evidence import Evidence
+from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.backend import select
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.evidence import Evidence
 from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty

@@ -15,13 +15,13 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench.benchmark_frames import FrameSource, PosedDepth
 from ufmstar_torch.eval.bench.benchmark_step import build_up, memory
 from ufmstar_torch.eval.bench.benchmark_timing import Stopwatch, pinned_threads
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import tour_sequence
-from ufmstar_torch.tracker import Landmarks, LandmarkTracker, TrackerConfig
 
 # Every moment in the tracker's update belongs to one of these; "rest" is the gray image and the window's upkeep.
 PARTS = ("following", "searching", "triangulating", "rest")

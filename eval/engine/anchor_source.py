@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker
 from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, Setting
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.tracker import Landmarks, LandmarkTracker
 
 # Anchors of ground truth in a frame, about as many as a tracker finds, and their standard deviation as a share of the
 # depth: a range sensor's. Their depths are exact.

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR

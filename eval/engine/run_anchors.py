@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.sequences.frame import Frame, Sequence
 from ufmstar_torch.step import FrameStatistics
-from ufmstar_torch.tracker import LandmarkTracker
 
 # Of the tensors that a source keeps, those of its tracker.
 _PREFIX = "tracker."

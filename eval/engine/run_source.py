@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.run_anchors import RunAnchors, of_tracker
 from ufmstar_torch.eval.engine.run_clock import Stopwatch

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.eval.engine.anchor_source import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
@@ -15,7 +16,6 @@ from ufmstar_torch.eval.methods.suite import default_of
 from ufmstar_torch.eval.report.aggregate import Mean, mean_over, value_of
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.names import Quantity, setting_label
-from ufmstar_torch.tracker import TrackerConfig
 
 COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ufmstar_torch.triangulate import DAMPING, STEPS, Triangulated
+from ufmstar_torch.anchors.triangulate import DAMPING, STEPS, Triangulated
 
 # NumPy's error model: no test for zero before every division, and hopeless geometry gives no exception but a covariance
 # that is not finite.
@@ -18,7 +18,7 @@ compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 def triangulate(
     pixel: NDArray[np.float64], seen: NDArray[np.bool_], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
 ) -> Triangulated:
-    """As :func:`ufmstar_torch.triangulate.triangulate`."""
+    """As :func:`ufmstar_torch.anchors.triangulate.triangulate`."""
     n = len(pixel)
     point, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
     error, ahead = np.empty(n), np.empty(n, dtype=np.bool_)

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors import AnchorInput
+from ufmstar_torch.anchors.given import AnchorInput
 
 # Entries of a row of sums.
 COUNT, BIAS, EXCESS = 0, 1, 2

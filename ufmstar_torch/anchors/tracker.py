@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors import Anchors
-from ufmstar_torch.corners import find, follow
+from ufmstar_torch.anchors.corners import find, follow
+from ufmstar_torch.anchors.given import Anchors
 
 # Tracks by which a frame's poses are judged.
 _ENOUGH = 5
