@@ -1,4 +1,4 @@
-"""The pictures of docs/evaluation_analysis.md.
+"""The pictures of docs/results/analysis.md.
 
 python docs/draw_analysis.py --root ../shared --out docs/images
 python docs/measure_factors.py --tours 200:206 --save factors.json

@@ -1,4 +1,4 @@
-"""The picture of docs/evaluation_results.md: what UfM* changes, against how sure the network alone was of itself.
+"""The picture of docs/results/real_video.md: what UfM* changes, against how sure the network alone was of itself.
 
 python docs/draw_gain.py --foreign results/tum results/rest --same results/same --out docs/images/evaluation_gain.png
 """

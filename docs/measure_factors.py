@@ -3,7 +3,7 @@
     python docs/measure_factors.py --tours 200:206
     python docs/measure_factors.py --root ../shared
 
-print the tables of docs/evaluation_analysis.md: the defaults' figures, and for every other value the mean paired
+print the tables of docs/results/analysis.md: the defaults' figures, and for every other value the mean paired
 difference to them over the clips with its 95 % confidence interval. Constants are chosen on tours; the shared sequences
 only check.
 """

@@ -2,7 +2,7 @@
 
     python docs/measure_pruning.py --root ../shared
 
-prints the tables of docs/segmentation.md: every frame of the four shared sequences, cut to the central
+prints the tables of docs/results/segmentation.md: every frame of the four shared sequences, cut to the central
 square and resized to 224 x 224 (nearest neighbour), upstream's thresholds for TUM except those named, taken
 as they are or converted from the 640 x 480 they were made for.
 """

@@ -3,7 +3,7 @@
     python docs/measure_views.py share --root ../shared
     python docs/measure_views.py parts --root ../shared
 
-print the tables of docs/evaluation_analysis.md.
+print the tables of docs/results/analysis.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The scripts behind docs/evaluation_analysis.md: closed forms of what they measure, and one run on a tiny tour."""
+"""The scripts behind docs/results/analysis.md: closed forms of what they measure, and one run on a tiny tour."""
 
 from __future__ import annotations
 

@@ -154,7 +154,7 @@ class SPGFConfig(_Checked):
 @dataclass(frozen=True)
 class UfMStarConfig(_Checked):
     """Everything UfM* can be told. The defaults are the paper's, with two exceptions, each explained where it
-    stands: the pruning rule (``segment.prune``, docs/segmentation.md) and ``regression``.
+    stands: the pruning rule (``segment.prune``, docs/results/segmentation.md) and ``regression``.
     """
 
     segment: SPGFConfig = field(default_factory=SPGFConfig)

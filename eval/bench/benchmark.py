@@ -1,7 +1,7 @@
 """``ufmstar bench``: times of the stages and of the whole UfM* step beside two networks' forward passes.
 
 Nothing here passes or fails: absolute times depend on the machine and on what else it does. See
-docs/benchmark.md for what each figure means.
+docs/results/benchmark.md for what each figure means.
 """
 
 from __future__ import annotations
