@@ -19,7 +19,6 @@ from ufmstar_torch.backend import TORCH, Backend
 from ufmstar_torch.eval.bench import benchmark
 from ufmstar_torch.eval.bench.benchmark_frames import PosedDepth, RecordedSequence, RenderedRoom
 from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
-from ufmstar_torch.eval.bench.benchmark_machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.bench.benchmark_report import format_report
 from ufmstar_torch.eval.bench.benchmark_step import build_up, components_in_view, memory
 from ufmstar_torch.eval.bench.benchmark_timing import (
@@ -30,6 +29,7 @@ from ufmstar_torch.eval.bench.benchmark_timing import (
     pinned_threads,
     spread,
 )
+from ufmstar_torch.eval.results.machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, FastDepthWidths
 
