@@ -312,10 +312,10 @@ def _require_same_function(network: FastDepth, path: str | Path) -> None:
             depth, expected = network(image).depth, graph(image).depth
         except ValueError as error:
             raise ValueError(f"{path} is not a FastDepth: {error}") from error
-    error, largest = float((depth - expected).abs().max()), float(expected.abs().max())
-    if not error <= _AGREEMENT * largest:
+    apart, largest = float((depth - expected).abs().max()), float(expected.abs().max())
+    if not apart <= _AGREEMENT * largest:
         raise ValueError(
-            f"{path} is not a FastDepth: its graph computes another depth from the same weights (up to {error:.3g} m "
+            f"{path} is not a FastDepth: its graph computes another depth from the same weights (up to {apart:.3g} m "
             f"apart, of at most {largest:.3g} m)"
         )
 

@@ -258,16 +258,18 @@ def own_preprocess(
     keep = bool(processor.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
     divisor = int(processor.get("ensure_multiple_of") or processor.get("size_divisor") or 1)
     mean, std = processor.get("image_mean"), processor.get("image_std")
-    normal = bool(processor.get("do_normalize", True))
-    if normal and (mean is None or std is None):
+    if not processor.get("do_normalize", True):
+        mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    if mean is None or std is None:
         raise ValueError(f"{name}: its image processor normalises, but names no image_mean and image_std")
     factor = float(processor.get("rescale_factor", 1 / 255)) if processor.get("do_rescale", True) else 1.0
     return Preprocess(
-        size=tuple(size),
+        size=(size[0], size[1]),
         aspect_multiple=max(patch_size(checkpoint), divisor) if keep else None,
         value_range=255 * factor,
+        mean=tuple(mean),
+        std=tuple(std),
         cubic=resample == _CUBIC,
-        **({"mean": tuple(mean), "std": tuple(std)} if normal else {}),
     )
 
 

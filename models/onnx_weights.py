@@ -100,21 +100,22 @@ def read_convolutions(path: str | Path) -> list[ConvWeights]:
             layer = ConvWeights(tensors[own[0]], tensors[own[1]] if len(own) > 1 else None)
             produced[node.output[0]] = layer
             layers.append(layer)
-        elif (layer := produced.pop(node.input[0], None)) is None:  # type: ignore[assignment]
+        elif node.input[0] not in produced:
             raise ValueError(f"{path}: batch norm {node.output[0]!r} does not follow a convolution")
         else:
+            layer = produced.pop(node.input[0])
             layer.norm = {key: tensors[name] for key, name in zip(_NORM, own, strict=True)}
             layer.norm_eps = {a.name: helper.get_attribute_value(a) for a in node.attribute}.get("epsilon", 1e-5)
         owner |= dict.fromkeys(own, layer)
     used = {names.get(name, name) for node in graph.node for name in node.input}
-    layer = None  # type: ignore[assignment]
+    last: ConvWeights | None = None
     for name, value in tensors.items():
-        layer = owner.get(name, layer)
+        last = owner.get(name, last)
         if name in used:
             continue
         # Batch norm's counter is used by no node; it stands behind the layer's other weights.
         counter = value.dim() == 0 and value.dtype == torch.int64
-        if not counter or not layer or not layer.norm or "num_batches_tracked" in layer.norm:
+        if not counter or last is None or not last.norm or "num_batches_tracked" in last.norm:
             raise ValueError(f"{path}: initialiser {name!r} {tuple(value.shape)} is used by no layer")
-        layer.norm["num_batches_tracked"] = value
+        last.norm["num_batches_tracked"] = value
     return layers
