@@ -264,7 +264,7 @@ def own_preprocess(
         raise ValueError(f"{name}: its image processor normalises, but names no image_mean and image_std")
     factor = float(processor.get("rescale_factor", 1 / 255)) if processor.get("do_rescale", True) else 1.0
     return Preprocess(
-        size=(size[0], size[1]),
+        size=tuple(size),  # type: ignore[arg-type]
         aspect_multiple=max(patch_size(checkpoint), divisor) if keep else None,
         value_range=255 * factor,
         mean=tuple(mean),
