@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.find import find_sequences as find_sequences
     from ufmstar_torch.eval.sequences.frame import Frame as Frame
     from ufmstar_torch.eval.sequences.frame import FrameError as FrameError
-    from ufmstar_torch.eval.sequences.frame import Sequence as Sequence
+    from ufmstar_torch.eval.sequences.frame import FrameSequence as FrameSequence
     from ufmstar_torch.eval.sequences.frame import Skipped as Skipped
     from ufmstar_torch.eval.sequences.layout import open_sequence as open_sequence
 else:
