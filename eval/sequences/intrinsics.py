@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Numbers
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from ufmstar_torch.eval.sequences.frame import Size
 from ufmstar_torch.eval.sequences.poses import read_matrix
 
 # A file's path, a matrix [3, 3] (or [4, 4], as ScanNet writes it), or the numbers fx, fy, cx, cy [px].
-IntrinsicsLike = str | Path | np.ndarray | Numbers[float]
+IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
 
 # Sizes whose aspect ratios differ by more than this were cropped, not resized.
 _ASPECT_TOLERANCE = 0.02
@@ -36,6 +36,23 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
     if values.shape not in ((3, 3), (3, 4), (4, 4)):
         raise ValueError(f"{told}: expected a 3x3 matrix or fx fy cx cy, got shape {list(values.shape)}")
     return np.ascontiguousarray(values[:3, :3])
+
+
+def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:
+    """Words of a command line as :func:`read_intrinsics` takes them: a file, or fx, fy, cx, cy [px]; None for no words.
+
+    Raises:
+        ValueError: neither; the message names ``option``.
+    """
+    if len(words) <= 1:
+        return words[0] if words else None
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4:
+        raise ValueError(f"{option} must be a file, or the four numbers fx fy cx cy, got {' '.join(words)!r}")
+    return numbers
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
