@@ -85,20 +85,19 @@ def bench(arguments: Sequence[str]) -> int:
 
 def train(arguments: Sequence[str]) -> int:
     """a network with an uncertainty head, or an ensemble of them"""
-    from jsonargparse import ArgumentError
-
-    from ufmstar_torch.train.options import job_from, parse_train, train_parser
+    from ufmstar_torch.eval.commands.options import parse
+    from ufmstar_torch.train.options import TrainOptions
 
     try:
-        options = parse_train(train_parser(), arguments)
-        if options["list"]:
+        options = parse(TrainOptions, arguments, "ufmstar train")
+        if options.list:
             from ufmstar_torch.train.presets import table
 
             print(table())
             return OK
-        _set_threads(options["threads"])
-        job = job_from(options)
-    except (ArgumentError, ImportError, OSError, ValueError) as error:
+        _set_threads(options.run.threads)
+        job = options.job()
+    except (ImportError, OSError, ValueError) as error:
         raise UsageError(_one_line(error)) from error
     from lightning.pytorch.utilities import rank_zero_only
 
@@ -110,12 +109,12 @@ def train(arguments: Sequence[str]) -> int:
     remark = missing_start(job.recipe.network, job.settings.init)
     if remark and process.rank == 0:
         print(f"ufmstar train: {remark}", file=sys.stderr)
-    how = {"resume": options["resume"], "overwrite": options["overwrite"]}
+    how = {"resume": options.run.resume, "overwrite": options.run.overwrite}
     try:
         with stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
             summary = fit(job, asked=stop, command=["ufmstar", "train", *arguments], **how)
     except (ImportError, OSError, RuntimeError, TypeError, ValueError) as error:
-        if options["debug"]:
+        if options.run.debug:
             traceback.print_exc()
         return _told(f"ufmstar train: failed: {_one_line(error)}", FAILED)
     if "members" not in summary:
