@@ -91,9 +91,9 @@ class Checked:
     @classmethod
     def read(cls, spec: Self | Mapping[str, Any] | str | Path) -> Self:
         """From settings, plain values or a JSON file; errors as :meth:`from_json`."""
-        if isinstance(spec, cls):
-            return spec
-        return cls.from_dict(spec) if isinstance(spec, Mapping) else cls.from_json(spec)
+        if isinstance(spec, str | Path):
+            return cls.from_json(spec)
+        return cls.from_dict(spec) if isinstance(spec, Mapping) else spec
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain nested values, ready for JSON."""
