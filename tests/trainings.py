@@ -19,39 +19,35 @@ SPEC = NetworkSpec(widths=0.05, positive="softplus", size=SIZE, preprocess="resi
 RECIPE = Recipe(SPEC, epochs=3, batch_size=4, learning_rate=0.01, average=0.9, clip=5.0, warmup_steps=2)
 
 
-def write_frames(root, frames=16, size=SIZE, noise=0.0, seed=0):
-    """A generic sequence: smooth depth from 1 to 3 m, grey 80 times the depth, a fifth of the depth missing.
+def scenes(count, size=SIZE, noisy=False):
+    """Images [N, H, W, 3] uint8, their depth [N, H, W] [m], where it is missing, and which half of the image is red.
 
-    With ``noise``, one half of each image is red (without red in the other one), and there the stored depth is too
-    large or too small by that much [m], at random with ``seed``; the scenes are the same for every seed.
+    Depth is smooth, 1 to 3 m, the image's grey 80 times the depth; a fifth of the depth is missing. If ``noisy``, the
+    right half of even images and the left one of odd ones is red, the other half has no red.
     """
-    rng, coin = np.random.default_rng(7), np.random.default_rng(seed)
+    rng = np.random.default_rng(7)
+    rows, columns = np.mgrid[0 : size[0], 0 : size[1]] / size[0]
+    drawn = [(*rng.uniform(-1, 1, 3), rng.uniform(size=size) < rng.uniform(0, 0.4)) for _ in range(count)]
+    depths = np.stack([2 + np.tanh(a + 2 * b * (rows - 0.5) + 2 * c * (columns - 0.5)) for a, b, c, _ in drawn])
+    images = np.repeat((80 * depths).round().astype(np.uint8)[..., None], 3, axis=-1)
+    red = (columns >= 0.5) ^ (np.arange(count) % 2 == 1)[:, None, None]
+    if noisy:
+        images[..., 0] = np.where(red, 255, 0)
+    return images, depths, np.stack([hole for *_, hole in drawn]), red
+
+
+def write_frames(root, frames=16, size=SIZE, noise=0.0, seed=0):
+    """A generic sequence of :func:`scenes`. With ``noise`` [m], the stored depth of the red half is too large or too
+    small by that much, at random with ``seed``."""
+    images, depths, holes, red = scenes(frames, size, noisy=noise > 0)
+    sign = np.random.default_rng(seed).choice([-1, 1], depths.shape)
+    stored = np.where(holes, 0, depths + np.where(red, noise * sign, 0))
     for i in range(frames):
-        depth = smooth_depth(rng, size)
-        image = np.repeat((80 * depth).round().astype(np.uint8)[..., None], 3, axis=-1)
-        hole = rng.uniform(size=size) < rng.uniform(0, 0.4)
-        if noise:
-            red = red_half(i, size)
-            image[..., 0] = np.where(red, 255, 0)
-            depth = depth + np.where(red, noise * coin.choice([-1, 1], size), 0)
-        write_image(root / "images" / f"{i:03}.png", image)
-        write_depth_png(root / "depth" / f"{i:03}.png", np.where(hole, 0, depth), 1000)
+        write_image(root / "images" / f"{i:03}.png", images[i])
+        write_depth_png(root / "depth" / f"{i:03}.png", stored[i], 1000)
     np.savetxt(root / "K.txt", [[30, 0, 15.5], [0, 30, 15.5], [0, 0, 1]])
     np.savetxt(root / "poses.txt", [np.eye(4).ravel()] * frames)
     return root
-
-
-def smooth_depth(rng, size):
-    """[H, W] depth [m] of the next scene."""
-    rows, columns = np.mgrid[0 : size[0], 0 : size[1]] / size[0]
-    a, b, c = rng.uniform(-1, 1, 3)
-    return 2 + np.tanh(a + 2 * b * (rows - 0.5) + 2 * c * (columns - 0.5))
-
-
-def red_half(number, size):
-    """[H, W] True in the half of a frame that is noisy: right in even frames, left in odd ones."""
-    right = np.broadcast_to(np.arange(size[1]) >= size[1] / 2, size)
-    return ~right if number % 2 else right
 
 
 def tiny_job(frames, out, recipe=RECIPE, augment=True, **settings):
