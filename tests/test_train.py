@@ -212,7 +212,8 @@ def test_invalid_pixels_count_for_nothing():
 def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
     """Twelve scenes, the red half of each with noise of .9 m, twice for training and once more for validation.
 
-    MEASURED
+    Over ten seeds, the likelihood's gain was .45 nat at least (.51 in the median), the error of the depth .56 of the
+    depth's deviation at most (.28), sigma's ratio 2.7 at least (4.1) and the fall of the loss .71 at least (.83).
     """
     size = (64, 64)
     folders = [str(write_frames(tmp_path / f"walk{n}", 12, size, noise=0.9, seed=n)) for n in (1, 2, 3)]
@@ -224,8 +225,8 @@ def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
     first, last = ({name: float(value) for name, value in rows[i].items()} for i in (0, -1))
     assert [int(row["epoch"]) for row in rows] == list(range(20))
     assert last["step"] == 120
-    assert last["train_loss"] < first["train_loss"]
-    assert last["val_nll"] < last["val_nll_constant_best"] - 0.2
+    assert last["train_loss"] < first["train_loss"] - 0.3
+    assert last["val_nll"] < last["val_nll_constant_best"] - 0.15
     assert last["val_nll_constant_best"] <= last["val_nll_constant"]
     assert summary["mean"]["val_nll"] == last["val_nll"]
     (network,) = load_trained(tmp_path / "out" / WEIGHTS)
@@ -233,8 +234,8 @@ def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
     with torch.no_grad():
         prediction = network(torch.from_numpy(images).permute(0, 3, 1, 2) / 255)
     error, sigma = prediction.depth.numpy() - depths, prediction.variance.sqrt().numpy()
-    assert np.sqrt((error[~red] ** 2).mean()) < 0.6 * depths[~red].std()
-    assert np.median(sigma[red]) > 1.8 * np.median(sigma[~red])
+    assert np.sqrt((error[~red] ** 2).mean()) < 0.85 * depths[~red].std()
+    assert np.median(sigma[red]) > 1.5 * np.median(sigma[~red])
 
 
 @pytest.fixture(scope="module")
