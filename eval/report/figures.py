@@ -13,7 +13,7 @@ from ufmstar_torch.eval.report.figures_cost import draw_latency, draw_stages, dr
 from ufmstar_torch.eval.report.figures_entropy import draw_entropy
 from ufmstar_torch.eval.report.figures_error import draw_error
 from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.sweep_lines import sweeps
 
 SVG, PNG = "svg", "png"

@@ -10,9 +10,9 @@ import numpy as np
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
-from ufmstar_torch.eval.report.aggregate import value_of
+from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.figure_style import counted, finish, label_ends, new_figure, short_name, style_of
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.plots import FAINT
 from ufmstar_torch.eval.results.record import Record
 

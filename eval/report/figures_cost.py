@@ -9,9 +9,9 @@ from typing import Any
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
-from ufmstar_torch.eval.report.aggregate import mean_of
+from ufmstar_torch.eval.report.means import mean_of
 from ufmstar_torch.eval.report.figure_style import TICK, finish, new_figure, short_name, spread_apart, style_of
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
 from ufmstar_torch.eval.report.plots import FAINT, INK
 

@@ -13,7 +13,7 @@ from ufmstar_torch.eval.methods.method import BASES, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
 from ufmstar_torch.eval.report.figure_style import LABEL, TICK, finish, new_figure, short_name, style_of
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.plots import FAINT, INK
 from ufmstar_torch.eval.report.sums import Merged
 

@@ -11,7 +11,7 @@ from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
 from ufmstar_torch.eval.report.figure_style import finish, label_ends, new_figure, short_name, style_of
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.sums import BY_ERROR
 
 _Curves = Mapping[Row, Sequence[float]]

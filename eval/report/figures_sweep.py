@@ -13,7 +13,7 @@ import numpy as np
 from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, TRUTH
-from ufmstar_torch.eval.report.aggregate import Mean, difference
+from ufmstar_torch.eval.report.means import Mean, difference
 from ufmstar_torch.eval.report.figure_style import (
     ALONE_STYLE,
     LABEL,
@@ -26,7 +26,7 @@ from ufmstar_torch.eval.report.figure_style import (
     short_name,
     style_of,
 )
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import (
     DIFFERENCES,
     ECE_DELTA,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.report.latex import latex
-from ufmstar_torch.eval.report.load import Results, load_results
+from ufmstar_torch.eval.report.data import Results, load_results
 from ufmstar_torch.eval.report.markdown import markdown
 from ufmstar_torch.eval.report.paper_efficiency import paper_efficiency_tables
 from ufmstar_torch.eval.report.table import Table
