@@ -22,7 +22,7 @@ from ufmstar_torch.eval.engine.run_source import NetworkSource
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.run_pictures import field_of_view, square_pixels
 from ufmstar_torch.eval.results import run_folder, writers
-from ufmstar_torch.eval.results.run_folder import FolderError
+from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at

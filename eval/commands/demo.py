@@ -25,12 +25,13 @@ from ufmstar_torch.eval.commands.demo_options import FRAMES, OUT, SEED
 from ufmstar_torch.eval.commands.run import Progress
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.engine.run_source import sha256
-from ufmstar_torch.eval.report.demo_pictures import DemoPanel, panel, write_pictures
+from ufmstar_torch.eval.report.demo_pictures import FILES, DemoPanel, panel, write_pictures
 from ufmstar_torch.eval.report.demo_report import names
-from ufmstar_torch.eval.results.demo_folder import PROGRAM, SUMMARY, DemoError, prepare
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
+from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.results.summary import versions
-from ufmstar_torch.eval.sequences.frame import Frame, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
 from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
@@ -41,6 +42,12 @@ KINDS = {"home": "familiar", "hall": "unfamiliar"}
 STYLE = "mixed"
 SHEET_ROWS = 6
 _WEIGHTS = ("weights", "demo.safetensors")
+SUMMARY = "summary.json"
+DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*FILES))
+
+
+class DemoError(ValueError):
+    """An option is out of range, or cannot be met on this machine."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +91,8 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         What summary.json holds; ``demo_report`` makes a table of it.
 
     Raises:
-        DemoError: the folder holds something else, or an earlier demo and ``overwrite`` is off; the device is
-            not there.
+        FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
+        DemoError: the device does not exist.
         FileNotFoundError, CheckpointError: the networks cannot be loaded.
         ValueError: the networks state no variance.
         OSError: the results cannot be written.
@@ -95,14 +102,14 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     with _weights(options.weights) as file:
         info, members = read_info(file), load_trained(file)
         digest = sha256(file)
-    prepare(options.out, overwrite=options.overwrite)
+    OutputFolder.open(options.out, DEMO, {}, overwrite=options.overwrite).close()
     size = info.spec.size
     sequence = tour_sequence(options.seed, frames=options.frames, size=size, style=STYLE, device=device)
     frames = _render(sequence, device, progress)
     comparison = Comparison(members, device)
     tally, panels = _walk(comparison, frames, make_tour(options.seed, STYLE), progress)
     summary = {
-        "program": PROGRAM,
+        "program": DEMO.program,
         "out": str(options.out),
         "settings": asdict(options),
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
@@ -183,7 +190,7 @@ def _walk(
     return tally, [panels[row] for row in rows]
 
 
-def _render(sequence: Sequence, device: torch.device, progress: Callable[[Progress], None]) -> list[Frame]:
+def _render(sequence: FrameSequence, device: torch.device, progress: Callable[[Progress], None]) -> list[Frame]:
     """All frames. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the very first run."""
     progress(Progress("rooms", 0, len(sequence), None, 0))
     frames = [sequence[index] for index in range(2)]
@@ -258,6 +265,6 @@ def _device(name: str) -> torch.device:
         DemoError: it is not.
     """
     try:
-        return torch.zeros((), device=name).device
-    except (RuntimeError, AssertionError) as error:
-        raise DemoError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
+        return torch.zeros((), device=require_device(name)).device
+    except ValueError as error:
+        raise DemoError(str(error)) from error

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.run import Job
 from ufmstar_torch.eval.commands.run_options import OWN_DEPTH, check_options, parse_intrinsics, parse_size, parse_slice
 from ufmstar_torch.eval.engine.run_anchors import require_images
 from ufmstar_torch.eval.engine.run_maps import folder_source, own_depth_source
 from ufmstar_torch.eval.engine.run_source import Source, network_source
-from ufmstar_torch.eval.sequences import Sequence, open_sequence
+from ufmstar_torch.eval.results.machine import require_device
+from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
 
 # How a run is carried out; the rest of the options says what is run.
 _CONDUCT = ("resume", "overwrite", "debug", "config")
@@ -29,7 +28,7 @@ def job_from(options: Mapping[str, Any]) -> Job:
     """
     check_options(options)
     config = UfMStarConfig.from_dict(options["ufm"])
-    device = _device(options["device"])
+    device = require_device(options["device"])
     chosen = parse_slice(options["frames"])
     sequence = _sequence(options)
     if config.anchored:
@@ -47,20 +46,7 @@ def job_from(options: Mapping[str, Any]) -> Job:
     )
 
 
-def _device(name: str) -> str:
-    """The device, if it is there.
-
-    Raises:
-        ValueError: it is not.
-    """
-    try:
-        torch.zeros((), device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
-    return name
-
-
-def _sequence(options: Mapping[str, Any]) -> Sequence:
+def _sequence(options: Mapping[str, Any]) -> FrameSequence:
     sequence = open_sequence(
         options["sequence"],
         options["layout"],
@@ -79,7 +65,7 @@ def _sequence(options: Mapping[str, Any]) -> Sequence:
     return sequence
 
 
-def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: Sequence, device: str) -> Source:
+def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameSequence, device: str) -> Source:
     size = parse_size(options["size"])
     if options["model"] is not None:
         return network_source(

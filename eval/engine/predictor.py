@@ -13,6 +13,7 @@ from ufmstar_torch.eval.engine.run_clock import Stopwatch
 from ufmstar_torch.eval.engine.run_maps import PredictedMap
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.dropout import set_sampling
 from ufmstar_torch.models.network import DepthNetwork
 
@@ -64,9 +65,7 @@ class MemberPredictor:
     def _prepared(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3]; once for all members."""
         if self._input is None or self._input[0] is not frame:
-            if frame.image is None:
-                raise FrameError(frame.name, "no image")
-            image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].to(self._device)
+            image = image_tensor(frame).to(self._device)
             x, K = self._members[0].preprocess(image, torch.from_numpy(frame.intrinsics)[None])
             self._input = (frame, x, K)
         return self._input[1], self._input[2]

@@ -24,7 +24,7 @@ _CENTRE_RANGE = (0.2, 0.8)
 class FrameError(Exception):
     """A frame's file is missing, truncated, corrupt, or not of the sequence's size; found when decoding.
 
-    Callers may count such frames and go on (:meth:`Sequence.readable` does).
+    Callers may count such frames and go on (:meth:`FrameSequence.readable` does).
 
     Attributes:
         path: the file, or the frame's name where the file decodes but does not belong to the sequence.
@@ -89,7 +89,7 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class FrameSequence:
     """Posed frames, decoded lazily. Build one with :func:`make_sequence`.
 
     Attributes:
@@ -174,7 +174,7 @@ def make_sequence(
     depth_intrinsics: np.ndarray | None = None,
     depth_size: Size | None = None,
     posed: bool = True,
-) -> Sequence:
+) -> FrameSequence:
     """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W); ``posed`` as there.
 
     Raises:
@@ -195,7 +195,9 @@ def make_sequence(
     check_intrinsics("intrinsics", intrinsics, image_size)
     if depth_intrinsics is not None:
         check_intrinsics("depth_intrinsics", depth_intrinsics, depth_size)
-    return Sequence(name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed)
+    return FrameSequence(
+        name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed
+    )
 
 
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:

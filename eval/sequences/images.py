@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import torch
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.exr import read_exr
-from ufmstar_torch.eval.sequences.frame import FrameError, Loader, Size
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Loader, Size
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
@@ -96,6 +97,17 @@ def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
     if values.ndim != 2 or not (np.issubdtype(values.dtype, np.number) and np.isrealobj(values)):
         raise FrameError(path, f"expected a map [H, W] of numbers, got {values.dtype} {list(values.shape)}")
     return values, scale
+
+
+def image_tensor(frame: Frame) -> torch.Tensor:
+    """The frame's image [1, 3, H, W] uint8 RGB, as a network's ``preprocess`` takes it.
+
+    Raises:
+        FrameError: the frame has no image.
+    """
+    if frame.image is None:
+        raise FrameError(frame.name, "no image")
+    return torch.from_numpy(frame.image).permute(2, 0, 1)[None]
 
 
 def image_size(path: str | Path) -> Size:
