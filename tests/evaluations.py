@@ -17,7 +17,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.metrics.packed_sums import pack
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.record import Record
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.gaussians import (
+from ufmstar_torch.eval.report.gaussians import (
     OPACITY,
     SIGMA_FLOOR,
     icosphere,

@@ -23,7 +23,7 @@ from ufmstar_torch.eval.methods.suite import configured, default_of, rows_of, se
 from ufmstar_torch.eval.methods.suite_file import suite_from_file
 from ufmstar_torch.eval.methods.suites import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.load import setting_of
+from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.sequences.ground_truth import truth_at

@@ -165,19 +165,20 @@ def report(arguments: Sequence[str]) -> int:
     from ufmstar_torch.eval.commands.report_options import parse_report
 
     options = parse_report(arguments)
-    from ufmstar_torch.eval.report.load import ResultsError, load_results
-    from ufmstar_torch.eval.report.write import summary, write_report, written
+    from ufmstar_torch.eval.report.data import ResultsError, load_results
+    from ufmstar_torch.eval.report.text import summary, written
+    from ufmstar_torch.eval.report.write import write_report
 
     try:
         print(summary(load_results(options.out, with_sums=False)))
-        files = write_report(options.out, figures=not options.no_figures, pictures=options.format)
+        made = write_report(options.out, figures=not options.no_figures, pictures=options.format)
     except ResultsError as error:
         raise UsageError(_one_line(error)) from error
     except (ImportError, OSError, ValueError) as error:
         if options.debug:
             traceback.print_exc()
         return _told(f"ufmstar report: failed: {_one_line(error)}", FAILED)
-    print(written(options.out, files))
+    print(written(options.out, made))
     return OK
 
 
@@ -192,9 +193,9 @@ def demo(arguments: Sequence[str]) -> int:
         if options.debug:
             traceback.print_exc()
         return _told(f"ufmstar demo: failed: {_one_line(error)}", FAILED)
-    from ufmstar_torch.eval.report.demo_report import explanation, table
+    from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 
-    print(table(summary), explanation(summary), sep="\n\n")
+    print(demo_table(summary), demo_explanation(summary), sep="\n\n")
     return OK
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import (
     MIN_SEQUENCES,
     Mean,
@@ -20,7 +21,6 @@ from ufmstar_torch.eval.report.means import (
     references,
     value_of,
 )
-from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import DELTA1, DIFFERENCES, ECE_DELTA, ECE_Q, LOWER, NLL, Quantity, row_label
 from ufmstar_torch.eval.report.table import number
 
@@ -281,4 +281,6 @@ def _left_out(results: Results) -> list[str]:
         return []
     listed = ", ".join(f"{row_label(row)} {100 * share:.0f} %" for row, share in list(shares.items())[:6])
     more = f" and {len(shares) - 6} more rows" if len(shares) > 6 else ""
-    return [f"NLL is not defined where a variance is 0, and leaves these pixels out: {listed}{more}. Read NLL with care."]
+    return [
+        f"NLL is not defined where a variance is 0, and leaves these pixels out: {listed}{more}. Read NLL with care."
+    ]

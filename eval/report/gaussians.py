@@ -64,7 +64,11 @@ def write_mixture_ply(
     _fill(table, ("f_dc_0", "f_dc_1", "f_dc_2"), (parts.colour / 255 - 0.5) / SH_DC)
     table["opacity"] = np.log(OPACITY / (1 - OPACITY))
     _fill(table, ("scale_0", "scale_1", "scale_2"), np.log(parts.sigma))
-    _fill(table, ("rot_0", "rot_1", "rot_2", "rot_3"), Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True))
+    _fill(
+        table,
+        ("rot_0", "rot_1", "rot_2", "rot_3"),
+        Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True),
+    )
     for name in ("weight", "disagreement", "count"):
         table[name] = getattr(parts, name)
     _write_ply(Path(path), {"vertex": table}, [parts.legend])

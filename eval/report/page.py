@@ -110,7 +110,9 @@ def write_page(
         parts=[part for part in parts if part],
         networks=join(list(dict.fromkeys(record.network for record in results.records))),
         datasets=join(list(results.datasets)),
-        facts=[(f"{n:,}".replace(",", "\u202f") if n else "", w) for n, w in (*facts, (sum(frames.values()), "frames"))],
+        facts=[
+            (f"{n:,}".replace(",", "\u202f") if n else "", w) for n, w in (*facts, (sum(frames.values()), "frames"))
+        ],
         min_sequences=MIN_SEQUENCES,
         left_out=embedder.left_out_words,
     )
@@ -125,7 +127,11 @@ def _template() -> Any:
 
     # Every template is HTML whatever its file is called: select_autoescape would leave out ".j2".
     environment = Environment(
-        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     environment.filters |= {"typeset": lambda text: Markup(typeset(text)), "plain": _plain}
     for name in ("css", "js"):
@@ -210,9 +216,7 @@ def _sequences(results: Results) -> Part:
     return {"kind": "tables", "title": "Single sequences", "tables": [], "folded": folded, "words": words}
 
 
-def _pictures(
-    folder: Path, figures: Sequence[Path], pictures: Sequence[Picture], embedder: Embedder
-) -> list[Part]:
+def _pictures(folder: Path, figures: Sequence[Path], pictures: Sequence[Picture], embedder: Embedder) -> list[Part]:
     """Diagrams by kind, those of single sequences folded and last; then pictures by kind."""
     by_kind: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _PARTS}
     single = [path for path in figures if _words_of(path)[1:2] == ["sequences"]]
@@ -265,7 +269,7 @@ def _made(results: Results) -> Part:
         "kind": "made",
         "title": "How it was made",
         "command": command(about),
-        "values": {name: about[name] for name in ("networks", "settings", "versions", "machine") if about.get(name)},
+        "made_with": {name: about[name] for name in ("networks", "settings", "versions", "machine") if about.get(name)},
         "digests": [(*where, digest) for where, digest in digests.items()] if any(digests.values()) else [],
     }
 

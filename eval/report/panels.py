@@ -163,7 +163,9 @@ class _Layout:
     def cell(self, row: int, column: int) -> tuple[float, float, float, float]:
         """(left, bottom, width, height)."""
         above = self.top + sum(self.tall[:row]) + row * _GAP + sum(self.heads[: row + 1])
-        return self._shares(self._left(column), self.height - above - self.cell_height, self.cell_width, self.cell_height)
+        return self._shares(
+            self._left(column), self.height - above - self.cell_height, self.cell_width, self.cell_height
+        )
 
     def bar(self, bar: Bar) -> tuple[float, float, float, float]:
         width = bar.span * (self.cell_width + _GAP) - _GAP

@@ -83,7 +83,13 @@ class Table:
 
     @classmethod
     def of(
-        cls, name: str, title: str, first: str, columns: Sequence[Column], lines: Iterable[Line], notes: Iterable[str] = ()
+        cls,
+        name: str,
+        title: str,
+        first: str,
+        columns: Sequence[Column],
+        lines: Iterable[Line],
+        notes: Iterable[str] = (),
     ) -> Table:
         """A table from its columns and lines; a line with another number of cells raises ValueError."""
         listed = list(lines)
@@ -201,9 +207,7 @@ def latex(table: Table) -> str:
     )
     heads = [[latex_text(c.group) for c in table.columns], [c.latex for c in table.columns]]
     names = [None, latex_text(table.first)]
-    frame.columns = (
-        pd.MultiIndex.from_arrays(heads, names=names) if table.groups else pd.Index(heads[1], name=names[1])
-    )
+    frame.columns = pd.MultiIndex.from_arrays(heads, names=names) if table.groups else pd.Index(heads[1], name=names[1])
     text = frame.style.to_latex(
         hrules=True,
         column_format=f"l{'c' * len(table.columns)}",

@@ -238,7 +238,11 @@ def write_tables(results: Results) -> list[Path]:
     for name, tables in _table_files(results):
         shown = [table for table in tables if not table.is_empty]
         if shown:
-            texts = {"md": "\n".join(map(markdown, shown)), "tex": "\n".join(map(latex, shown)), "csv": table_csv(shown)}
+            texts = {
+                "md": "\n".join(map(markdown, shown)),
+                "tex": "\n".join(map(latex, shown)),
+                "csv": table_csv(shown),
+            }
             written += [_write_text(folder / f"{name}.{kind}", text) for kind, text in texts.items()]
     return written
 

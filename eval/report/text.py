@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, PLY, SHEET
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import main_table
-from ufmstar_torch.eval.results.demo_folder import CURVES, ELLIPSOIDS, PLY, SHEET
+from ufmstar_torch.eval.report.write import Report
 from ufmstar_torch.eval.results.summary import aligned, number
 
 _DEMO_COLUMNS = {
@@ -37,13 +38,13 @@ def summary(results: Results) -> str:
     return "\n".join(parts)
 
 
-def written(out: Path, files: Iterable[Path]) -> str:
-    """One line: the files of a folder by name, those of its subfolders by number."""
-    listed = list(files)
-    folders = Counter(file.parent for file in listed if file.parent != out)
-    names = [file.name for file in listed if file.parent == out]
+def written(out: Path, report: Report) -> str:
+    """The files of a folder by name, those of its subfolders by number, and the figures that could not be drawn."""
+    folders = Counter(file.parent for file in report.files if file.parent != out)
+    names = [file.name for file in report.files if file.parent == out]
     names += [f"{folder.name}/ ({count} files)" for folder, count in folders.items()]
-    return f"{out}: {', '.join(names)}"
+    undrawn = [f"figure not drawn: {name}: {reason}" for name, reason in report.undrawn.items()]
+    return "\n".join([*undrawn, f"{out}: {', '.join(names)}"])
 
 
 def demo_names(members: int) -> dict[str, str]:
