@@ -81,7 +81,8 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
     for name, sequence in results.sequences(dataset):
         of = {row: [r for r in results.of(row, name) if r.sequence == sequence] for row in results.rows}
         records = {row: listed for row, listed in of.items() if listed}
-        frames = max(int(value_of(listed[0], "frames.done") or 0) for listed in records.values())
+        counts = (value_of(listed[0], "frames.done") for listed in records.values())
+        frames = max((int(count) for count in counts if count == count), default=0)
         lines = _lines({row: _cells(listed, MAIN) for row, listed in records.items()}, MAIN)
         title = f"{name}, {sequence}" + (f": {frames} frames" if frames else "")
         tables.append(Table.of(f"{name}-{sequence}", title, METHOD, _columns(MAIN, ""), lines))
