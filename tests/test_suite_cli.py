@@ -14,8 +14,7 @@ from ufmstar_torch.eval.bench import efficiency_step
 from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.eval_options import eval_parser, job_from, parse_eval
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.methods.suite import rows_of
-from ufmstar_torch.eval.methods.suites import names
+from ufmstar_torch.eval.methods.suite import names, rows_of
 from ufmstar_torch.eval.results import launch
 
 
@@ -45,7 +44,7 @@ def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""
     stub = Stub()
     own = launch.evaluate_suite
-    monkeypatch.setattr(launch, "evaluate_suite", lambda options, **how: own(options, evaluate=stub, **how))
+    monkeypatch.setattr(launch, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
     return stub
 
 

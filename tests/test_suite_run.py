@@ -23,7 +23,7 @@ from ufmstar_torch.eval.results.cache import CacheError
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.run_suite import DIED, failures, with_references
+from ufmstar_torch.eval.results.work import DIED, failures, with_references
 from ufmstar_torch.eval.results.worklist import Shard, content_digest
 
 

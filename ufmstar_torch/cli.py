@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.results.launch import Ended
+    from ufmstar_torch.eval.results.launch import EvalOutcome
 
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 _HELP = """usage: ufmstar COMMAND ...
@@ -136,7 +136,7 @@ def evaluate(arguments: Sequence[str]) -> int:
     try:
         options = parse_eval(eval_parser(), arguments)
         if options["list"]:
-            from ufmstar_torch.eval.methods.suites import listing
+            from ufmstar_torch.eval.methods.suite import listing
 
             print(listing())
             return OK
@@ -262,32 +262,34 @@ def _evaluate(options: Mapping[str, Any]) -> int:
         FileNotFoundError, ValueError: it cannot be begun.
         CacheError, ImportError, OSError, RuntimeError: it cannot be finished.
     """
+    from ufmstar_torch.eval.commands.eval_options import job_from, launch_from
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
     from ufmstar_torch.eval.results.launch import evaluate_suite
 
     with Bars() as bars, stop_signals(bars.say) as stop:
-        ended = evaluate_suite(options, stop=stop, tell=bars.say, progress=bars.frames)
-    if ended.tells:
-        return _tell(ended, options["threads"], draws=not options["no_report"])
-    return OK if ended.finished else INTERRUPTED
+        job, launch = job_from(options), launch_from(options)
+        outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
+    if outcome.reports:
+        return _report_outcome(outcome, options["threads"], draws=not options["no_report"])
+    return OK if outcome.finished else INTERRUPTED
 
 
-def _tell(ended: Ended, threads: int | None, *, draws: bool) -> int:
+def _report_outcome(outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
     """The table, the measurements and pictures that belong to it, and what is broken; the exit code."""
     from ufmstar_torch.eval.commands.outcome import draw, measure, table
 
-    print(table(ended), flush=True)
-    if ended.finished:
-        if ended.job.suite.efficiency:
+    print(table(outcome), flush=True)
+    if outcome.finished:
+        if outcome.job.suite.efficiency:
             print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
-        for told in (measure(ended, threads), draw(ended) if draws else None):
+        for told in (measure(outcome, threads), draw(outcome) if draws else None):
             if told is not None:
                 print(told)
-    for label, reason in ended.failed.items():
+    for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
-    if ended.stopped:
+    if outcome.stopped:
         return _told("ufmstar eval: stopped; --resume goes on", INTERRUPTED)
-    if ended.failed or not ended.finished:
+    if outcome.failed or not outcome.finished:
         return _told("ufmstar eval: not all is there; --resume tries the rest again", FAILED)
     return OK
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,8 @@ from ufmstar_torch.eval.commands.run_options import parse_slice
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
 
-    from ufmstar_torch.eval.methods.suite import Suite
-    from ufmstar_torch.eval.results.run_suite import EvalJob
+    from ufmstar_torch.eval.results.launch import LaunchOptions
+    from ufmstar_torch.eval.results.work import EvalJob
 
 _USAGE = (
     "ufmstar eval --suite NAME --root [DATASET=]DIR ... --network BASE=MODEL:FILE[,FILE...] ... --out OUT [options]"
@@ -134,24 +134,6 @@ def check_options(options: Mapping[str, Any]) -> None:
         raise ValueError("--overwrite goes without --shard: another part may have begun")
 
 
-def suite_from(options: Mapping[str, Any]) -> Suite:
-    """The suite that the options name.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no such suite, or a file that is none.
-    """
-    from ufmstar_torch.eval.methods.suite_file import suite_from_file
-    from ufmstar_torch.eval.methods.suites import suite_named
-
-    name = options["suite"]
-    if not name.endswith(".toml"):
-        return suite_named(name, options["base"])
-    if options["base"] is not None:
-        raise ValueError("--base goes with suites by name: a file names its own")
-    return suite_from_file(Path(name))
-
-
 def job_from(options: Mapping[str, Any]) -> EvalJob:
     """What the options mean; nothing is opened but folders.
 
@@ -160,11 +142,12 @@ def job_from(options: Mapping[str, Any]) -> EvalJob:
         ValueError: options that do not go together, a base given twice, no row with a network, no sequence.
     """
     from ufmstar_torch.eval.engine.networks import NetworkChoice
-    from ufmstar_torch.eval.results.run_suite import EvalJob
+    from ufmstar_torch.eval.methods.suite import suite_named
+    from ufmstar_torch.eval.results.work import EvalJob
     from ufmstar_torch.eval.results.worklist import find_work, read_names
 
     check_options(options)
-    suite = suite_from(options)
+    suite = suite_named(options["suite"], options["base"])
     choices = [NetworkChoice.parse(text) for text in options["network"]]
     networks = {choice.base: choice for choice in choices}
     if len(networks) < len(choices):
@@ -190,6 +173,13 @@ def job_from(options: Mapping[str, Any]) -> EvalJob:
         examples=options["examples"],
         samples=options["samples"],
     )
+
+
+def launch_from(options: Mapping[str, Any]) -> LaunchOptions:
+    """Who carries the evaluation out."""
+    from ufmstar_torch.eval.results.launch import LaunchOptions
+
+    return LaunchOptions(**{f.name: options[f.name] for f in fields(LaunchOptions)})
 
 
 def _opening(options: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
