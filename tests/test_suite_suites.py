@@ -60,7 +60,7 @@ def test_every_suite_can_be_made_for_every_base():
 
 
 def test_no_such_suite_and_no_such_base():
-    with pytest.raises(ValueError, match="no suite is called 'paper-table-9': there are paper-figure-entropy"):
+    with pytest.raises(ValueError, match="no suite is called 'paper-table-9': there are paper-table-1"):
         suite_named("paper-table-9")
     with pytest.raises(ValueError, match="--base must be one of ensemble"):
         suite_named("ablations", "resnet")

@@ -41,9 +41,9 @@ from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, def
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
 _HINTS = ("datasets", "sequences", "network", "size", "efficiency")
-_KEYS = {"name": str, "title": str, "base": str, "bases": list, "include": list, "sweep": list, "rows": list}
+_KEYS: dict[str, type] = {"name": str, "title": str, "base": str, "bases": list, "include": list, "sweep": list, "rows": list}
 _KEYS |= {"datasets": list, "sequences": int, "network": str, "size": list, "efficiency": bool}
-_ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict}
+_ROW_KEYS: dict[str, type] = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict}
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,11 @@ class Suite:
 
 
 def names() -> tuple[str, ...]:
-    """The names of the suites that come with the package, the paper's first."""
+    """The names of the suites that come with the package, the paper's tables first."""
     stems = [file.name.removesuffix(".toml") for file in _SHIPPED.iterdir() if file.name.endswith(".toml")]
-    return tuple(sorted(stems, key=lambda name: (not name.startswith("paper"), name)))
+    return tuple(
+        sorted(stems, key=lambda name: (not name.startswith("paper-table"), not name.startswith("paper"), name))
+    )
 
 
 def listing() -> str:
@@ -156,17 +158,9 @@ def suite_named(name: str, base: str | None = None) -> Suite:
         own = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
-        return Suite(
-            name=values.get("name", own),
-            title=values.get("title", own),
-            rows=rows,
-            sweep=tuple(dict.fromkeys(_sweep(values))),
-            **{
-                key: tuple(value) if isinstance(value := values[key], list) else value
-                for key in _HINTS
-                if key in values
-            },
-        )
+        named: dict[str, Any] = {"name": values.get("name", own), "title": values.get("title", own), "rows": rows}
+        hints: dict[str, Any] = {key: _plain(values[key]) for key in _HINTS if key in values}
+        return Suite(**named, sweep=tuple(dict.fromkeys(_sweep(values))), **hints)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from error
 
