@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-from dataclasses import replace
 
 import pytest
 from suite_runs import TRUTH, Stub, write_rooms
@@ -222,18 +221,14 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 
     monkeypatch.setattr(efficiency_step, "measure", measure)
     monkeypatch.setattr(efficiency_step, "contenders", lambda networks: networks)
-    monkeypatch.setattr(launch, "job_from", lambda options: _about_efficiency(own(options)))
-    own = job_from
-    words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1")
+    rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
+    (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
+    words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")
     assert "measured when all sequences are evaluated" in ufmstar(*words, "--shard", "1/2")[1]
     assert measured == [], "another part may still be running"
     code, _, err = ufmstar(*words, "--shard", "2/2")
     assert (code, "measuring time, energy and memory" in err) == (0, True)
     assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
-    assert measured == [(["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"], "ash", 1, 1)]
+    assert measured == [(rows, "ash", 1, 1)]
     assert ufmstar(*words, "--resume")[0] == 0
     assert len(measured) == 1
-
-
-def _about_efficiency(job):
-    return replace(job, suite=replace(job.suite, efficiency=True))

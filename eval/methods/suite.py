@@ -41,7 +41,15 @@ from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, def
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
 _HINTS = ("datasets", "sequences", "network", "size", "efficiency")
-_KEYS: dict[str, type] = {"name": str, "title": str, "base": str, "bases": list, "include": list, "sweep": list, "rows": list}
+_KEYS: dict[str, type] = {
+    "name": str,
+    "title": str,
+    "base": str,
+    "bases": list,
+    "include": list,
+    "sweep": list,
+    "rows": list,
+}
 _KEYS |= {"datasets": list, "sequences": int, "network": str, "size": list, "efficiency": bool}
 _ROW_KEYS: dict[str, type] = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict}
 
