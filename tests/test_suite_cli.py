@@ -11,7 +11,7 @@ from suite_runs import TRUTH, Stub, write_rooms
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import efficiency_step
 from ufmstar_torch.eval.commands import dry_run as dry
-from ufmstar_torch.eval.commands.eval_options import eval_parser, job_from, parse_eval
+from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import names, rows_of
 from ufmstar_torch.eval.results import launch
@@ -202,12 +202,12 @@ def test_predictions_are_counted_once_however_many_rows_share_them():
 
 def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
     words = words_for(rooms, "out", "--root", "tour:1?frames=2&size=32x48", "a=tour:2?frames=2", "--sequences", "1")
-    job = job_from(parse_eval(eval_parser(), list(map(str, words[1:]))))
+    job = job_from(read(list(map(str, words[1:]))))
     assert [item.dataset for item in job.items] == ["a", "rooms", "tour"]
     given = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
     (tmp_path / "eval.yaml").write_text(json.dumps(given))
-    options = parse_eval(eval_parser(), ["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
-    assert (options["root"], options["seed"]) == (given["root"], 4)
+    options = read(["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
+    assert (list(options.data.root), options.data.seed) == (given["root"], 4)
     assert len(job_from(options).items) == 3
 
 

@@ -18,7 +18,7 @@ import torch
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 from trainings import SPEC
 
-from ufmstar_torch.eval.commands.eval_options import eval_parser, job_from, launch_from, parse_eval
+from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.report.load import load_results
 from ufmstar_torch.eval.results import launch, worker
@@ -55,7 +55,7 @@ def no_torchrun(monkeypatch):
 def options_for(rooms, out, *words, network=TRUTH, suite="depth-only"):
     """Parsed options of an evaluation of the rooms."""
     fixed = ["--suite", suite, "--network", network, "--root", f"rooms={rooms}", "--out", str(out), "--examples", "0"]
-    return parse_eval(eval_parser(), [*fixed, *words])
+    return read([*fixed, *words])
 
 
 def quiet(options, evaluate=None, stop=lambda: False):
