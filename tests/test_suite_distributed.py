@@ -152,7 +152,7 @@ def test_threads_are_divided_and_devices_go_round(rooms, tmp_path, monkeypatch):
     assert len({t.launch for t in tasks}) == 1
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(torch, "zeros", lambda *_, device: None)
+    monkeypatch.setattr(worker, "require_device", lambda name: name)
     assert [worker.device_of("cuda", t.local) for t in tasks] == ["cuda:0", "cuda:1", "cuda:0"]
     assert worker.device_of("cuda:1", 0) == "cuda:1"
 
