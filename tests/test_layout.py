@@ -77,8 +77,6 @@ EVAL_VIOLATIONS: frozenset[str] = frozenset(
         "engine.evaluate -> results.examples",
         "engine.frame_pass -> results.cache",
         "engine.frame_pass -> results.examples",
-        "results.launch -> commands.eval_options",
-        "results.worker -> commands.eval_options",
         "sequences.layout -> tour.name",
     }
 )

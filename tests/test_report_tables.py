@@ -36,7 +36,7 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.methods.suites import names, suite_named
+from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import Results, ResultsError, load_results, setting_of
 from ufmstar_torch.eval.report.efficiency import paper_efficiency_tables
