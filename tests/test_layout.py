@@ -86,7 +86,6 @@ EVAL_VIOLATIONS: frozenset[str] = frozenset(
         "report.write -> bench.efficiency_table",
         "results.launch -> commands.eval_options",
         "results.worker -> commands.eval_options",
-        "sequences.layout -> tour.name",
     }
 )
 

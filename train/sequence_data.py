@@ -10,7 +10,8 @@ import torch
 
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.sequences.layout import detect_layout, open_sequence
+from ufmstar_torch.eval.sequences.layout import detect_layout
+from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.train.parts import Part
 from ufmstar_torch.train.samples import RawSample, SampleError
 from ufmstar_torch.train.unposed import is_unposed, open_unposed

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.generic import DEPTHS, IMAGES, INTRINSICS
 from ufmstar_torch.eval.sequences.images import (
@@ -19,7 +20,6 @@ from ufmstar_torch.eval.sequences.images import (
     read_color,
 )
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
-from ufmstar_torch.eval.sequences.pairing import pair_by_name
 from ufmstar_torch.eval.sequences.poses import associate
 
 # [s] Largest difference of the timestamps in the names of an image and its depth map, as in ``open_sequence``.
