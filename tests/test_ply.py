@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -162,7 +162,6 @@ class TestSplats:
 
 
 class TestQuaternion:
-    @settings(max_examples=60, deadline=None)
     @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-9, 0.1, 1.0]))
     def test_is_scipys(self, seed: int, jitter: float) -> None:
         rng = np.random.default_rng(seed)

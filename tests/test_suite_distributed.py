@@ -59,6 +59,7 @@ def quiet(options, evaluate=None, stop=lambda: False):
 # ---- a pool ----
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_torchrun")
 def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     torch.manual_seed(3)
@@ -164,6 +165,7 @@ def as_rank(rank, world, options, result):
     result.put((rank, ended.finished, ended.left, ended.tells, [name for name, _ in stub.asked]))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of forks, from Python 3.12 on
 def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(rooms, tmp_path):
     options = options_for(rooms, tmp_path / "out")
@@ -237,6 +239,7 @@ def test_parts_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path):
 # ---- SLURM ----
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # submitit's debug executor leaves its logs open
 @pytest.mark.usefixtures("no_torchrun")
 def test_jobs_through_submitit(rooms, tmp_path):
