@@ -153,22 +153,22 @@ def from_hugging_face(
     revision: str | None = None,
     local_files_only: bool = False,
 ) -> HuggingFaceDepth:
-    """Any model that ``AutoModelForDepthEstimation`` knows (DPT, ZoeDepth, GLPN, ...), in eval mode.
+    """Any architecture of ``AutoModelForDepthEstimation`` (DPT, ZoeDepth, GLPN, ...), in eval mode.
 
     Args:
         name_or_dir: "owner/name" on the hub, or a directory with config.json and weights.
         kind: what it predicts: "metric" (ZoeDepth, GLPN, DPT trained on NYU or KITTI), "inverse" (DPT and MiDaS
-            otherwise) or "affine" (depth up to scale and shift). None = what the configuration says, if it does.
+            otherwise) or "affine" (depth up to scale and shift). None = as the configuration states, if it does.
         scale: [m] length of one unit of metric depth.
         size: (height, width) [px] of the input; None = that of preprocessor_config.json.
-        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration says.
+        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
         preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
         allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
             "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
         dtype: of the weights; what comes out is float32 in any case (float64 for float64).
         device: where they go; None = the CPU.
         revision: branch, tag or commit on the hub.
-        local_files_only: whether the hub may not be asked.
+        local_files_only: do not access the hub.
 
     The image processor's padding (ZoeDepth) is not done.
 
@@ -183,7 +183,7 @@ def from_hugging_face(
     if preprocess is None:
         preprocess = own_preprocess(checkpoint, size, keep_aspect)
     elif size is not None or keep_aspect is not None:
-        raise ValueError("preprocess excludes size and keep_aspect: it says both")
+        raise ValueError("preprocess excludes size and keep_aspect, which it contains")
     network = HuggingFaceDepth.of_checkpoint(
         checkpoint, preprocess, kind=kind, scale=scale, allow_missing=allow_missing, dtype=dtype
     )
