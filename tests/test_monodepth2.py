@@ -295,11 +295,11 @@ def test_a_variance_beyond_half_precision(tmp_path: Path) -> None:
     assert float(network.encoder.bn1.running_var[3]) == 65504
     half["bn1.running_mean"][0] = float("inf")
     torch.save(half, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError, match="NaN or infinity: bn1.running_mean"):
+    with pytest.raises(CheckpointError, match=r"NaN or infinity: bn1.running_mean"):
         MonodepthResNet.imagenet(tmp_path / "w.pth", 18, decoder=SMALL)
     weights["bn1.running_var"][3] = float("inf")  # in single precision it is no overflow
     torch.save(weights, tmp_path / "w.pth")
-    with pytest.raises(CheckpointError, match="NaN or infinity: bn1.running_var"):
+    with pytest.raises(CheckpointError, match=r"NaN or infinity: bn1.running_var"):
         MonodepthResNet.imagenet(tmp_path / "w.pth", 18, decoder=SMALL)
 
 
