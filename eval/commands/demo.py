@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 from time import perf_counter
@@ -21,12 +20,13 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.camera import unproject
-from ufmstar_torch.eval.commands.demo_options import FRAMES, OUT, SEED
+from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.commands.run import Progress
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.engine.run_source import sha256
-from ufmstar_torch.eval.report.demo_pictures import FILES, DemoPanel, panel, write_pictures
-from ufmstar_torch.eval.report.demo_report import names
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, panel, write_pictures
+from ufmstar_torch.eval.report.panels import FramePanel
+from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.machine import require_device
@@ -43,41 +43,11 @@ STYLE = "mixed"
 SHEET_ROWS = 6
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
-DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*FILES))
+DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
 
 
 class DemoError(ValueError):
     """An option is out of range, or cannot be met on this machine."""
-
-
-@dataclass(frozen=True)
-class DemoOptions:
-    """What to show.
-
-    Attributes:
-        out: folder for everything that is written.
-        frames: of the tour.
-        seed: of the rooms; the networks were trained on others.
-        weights: trained networks (``save_trained``); None = those of the package.
-        device: "cpu", "cuda", ...
-        overwrite: replace an earlier demo in ``out``.
-
-    Raises:
-        DemoError: a number is out of range.
-    """
-
-    out: Path = OUT
-    frames: int = FRAMES
-    seed: int = SEED
-    weights: Path | None = None
-    device: str = "cpu"
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if self.frames < 2:
-            raise DemoError(f"--frames must be at least 2, got {self.frames}: one view has nothing to disagree with")
-        if self.seed < 0:
-            raise DemoError(f"--seed must be at least 0, got {self.seed}")
 
 
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
@@ -88,7 +58,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         progress: called at the start of each stage and after every step of it.
 
     Returns:
-        What summary.json holds; ``demo_report`` makes a table of it.
+        What summary.json holds; ``report.text`` makes a table of it.
 
     Raises:
         FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
@@ -111,7 +81,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     summary = {
         "program": DEMO.program,
         "out": str(options.out),
-        "settings": asdict(options),
+        "settings": options.settings(),
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
         "network": _network(info, digest, len(members)),
         "methods": _methods(comparison, tally),
@@ -121,7 +91,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "versions": versions(),
     }
     progress(Progress("pictures", 0, 1, None, 0))
-    shown = names(len(members))
+    shown = demo_names(len(members))
     metrics = {shown[method].strip(): values for method, values in tally.overall().items()}
     title = f"ufmstar demo: {len(sequence)} frames, seed {options.seed}"
     outputs = write_pictures(options.out, panels, metrics, comparison.ufm_star, title)
@@ -166,7 +136,7 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
 
 def _walk(
     comparison: Comparison, frames: list[Frame], tour: Tour, progress: Callable[[Progress], None]
-) -> tuple[Tally, list[DemoPanel]]:
+) -> tuple[Tally, list[FramePanel]]:
     """All frames by all methods, with their figures and the rows of the contact sheet."""
     comparison.take(frames[0])  # libraries set themselves up at the first call, which does not count
     comparison.restart()
