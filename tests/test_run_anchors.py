@@ -20,9 +20,9 @@ from ufmstar_torch.eval.engine.run_maps import MapSource, PredictedMap
 from ufmstar_torch.eval.engine.run_source import NetworkSource
 from ufmstar_torch.eval.report.plots import fit_scales, map_columns
 from ufmstar_torch.eval.report.run_pictures import Finished
+from ufmstar_torch.eval.report.text import table
 from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.results.folder import FolderError
-from ufmstar_torch.eval.results.summary import table
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess

@@ -7,7 +7,7 @@ from typing import Any
 
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR
 from ufmstar_torch.eval.report.demo_pictures import CURVES, ELLIPSOIDS, PLY, SHEET
-from ufmstar_torch.eval.results.summary import aligned, number
+from ufmstar_torch.eval.report.text import aligned, number
 
 _COLUMNS = {
     "delta1": "delta1",
