@@ -1,4 +1,4 @@
-"""summary.json and the table at the end of a run: what came out, from what, with which settings and versions."""
+"""The data of a run's summary.json: results, where they come from, settings and versions."""
 
 from __future__ import annotations
 
