@@ -32,7 +32,7 @@ def test_agrees_with_the_oracle(weighted, seed):
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, empty=1, features=2)
     pairs = random_pairs(2, previous, current, seed)
     config = UfMStarConfig(overlap_weighted=weighted, features=2)
-    room = previous.grown(12, 12)
+    room = previous.padded(12)
     wide = Correspondence(torch.nn.functional.pad(pairs.match, (0, 6)), torch.nn.functional.pad(pairs.overlap, (0, 6)))
     fused = fuse(room, current, wide, config)
     new = current.valid & ~pairs.match.any(2)

@@ -80,7 +80,6 @@ EVAL_VIOLATIONS: frozenset[str] = frozenset(
         "engine.evaluate -> results.examples",
         "engine.frame_pass -> results.cache",
         "engine.frame_pass -> results.examples",
-        "engine.networks -> commands.run_options",
         "gaussians -> report.colours",
         "gaussians -> results.files",
         "report.page_parts -> bench.efficiency_table",

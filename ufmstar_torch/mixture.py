@@ -102,7 +102,11 @@ class GaussianMixture:
         capacity = self.capacity
         while capacity < needed:
             capacity *= 2
-        missing = (capacity if limit is None else min(capacity, limit)) - self.capacity
+        return self.padded(capacity if limit is None else min(capacity, limit))
+
+    def padded(self, capacity: int) -> GaussianMixture:
+        """The same mixture with at least ``capacity`` slots, new ones empty."""
+        missing = capacity - self.capacity
         if missing <= 0:
             return self
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
 from time import perf_counter
@@ -21,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.camera import unproject
-from ufmstar_torch.eval.commands.demo_options import FRAMES, OUT, SEED
+from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.commands.run import Progress
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.engine.run_source import sha256
@@ -48,36 +47,6 @@ DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=r
 
 class DemoError(ValueError):
     """An option is out of range, or cannot be met on this machine."""
-
-
-@dataclass(frozen=True)
-class DemoOptions:
-    """What to show.
-
-    Attributes:
-        out: folder for everything that is written.
-        frames: of the tour.
-        seed: of the rooms; the networks were trained on others.
-        weights: trained networks (``save_trained``); None = those of the package.
-        device: "cpu", "cuda", ...
-        overwrite: replace an earlier demo in ``out``.
-
-    Raises:
-        DemoError: a number is out of range.
-    """
-
-    out: Path = OUT
-    frames: int = FRAMES
-    seed: int = SEED
-    weights: Path | None = None
-    device: str = "cpu"
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if self.frames < 2:
-            raise DemoError(f"--frames must be at least 2, got {self.frames}: one view has nothing to disagree with")
-        if self.seed < 0:
-            raise DemoError(f"--seed must be at least 0, got {self.seed}")
 
 
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
@@ -111,7 +80,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     summary = {
         "program": DEMO.program,
         "out": str(options.out),
-        "settings": asdict(options),
+        "settings": options.settings(),
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
         "network": _network(info, digest, len(members)),
         "methods": _methods(comparison, tally),

@@ -10,14 +10,13 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.commands.run_options import parse_size
 from ufmstar_torch.eval.engine.network_checks import check_members, without_sampling
 from ufmstar_torch.eval.engine.network_label import label_of
 from ufmstar_torch.eval.engine.predicted import Predicted, together
 from ufmstar_torch.eval.engine.predictor import MemberPredictor, Predictor, TruthPredictor
 from ufmstar_torch.eval.engine.run_source import load_members, require_same_input, sha256
 from ufmstar_torch.eval.methods.method import BASES
-from ufmstar_torch.eval.sequences.frame import Frame, Size
+from ufmstar_torch.eval.sequences.frame import Frame, Size, parse_size
 from ufmstar_torch.models.dropout import SAMPLES
 from ufmstar_torch.models.load import network_names
 from ufmstar_torch.models.network import DepthNetwork

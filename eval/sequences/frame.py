@@ -21,6 +21,20 @@ Size = tuple[int, int]
 _CENTRE_RANGE = (0.2, 0.8)
 
 
+def parse_size(text: str | None, option: str = "--size") -> Size | None:
+    """HxW as (H, W), None for None.
+
+    Raises:
+        ValueError: another form; the message names ``option``.
+    """
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
+        raise ValueError(f"{option} must be HxW in pixels, 240x320 say, got {text!r}")
+    return int(parts[0]), int(parts[1])
+
+
 class FrameError(Exception):
     """A frame's file is missing, truncated, corrupt, or not of the sequence's size; found when decoding.
 
@@ -198,6 +212,22 @@ def make_sequence(
     return FrameSequence(
         name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed
     )
+
+
+def parse_slice(text: str | None) -> slice:
+    """START:STOP:STEP as a slice of frames, any part of it left out.
+
+    Raises:
+        ValueError: another form, or a step below 1.
+    """
+    parts = (text or ":").split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
+        raise ValueError(f"--frames must be START:STOP or START:STOP:STEP with STEP at least 1, got {text!r}")
+    return slice(*numbers)
 
 
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
