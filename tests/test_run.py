@@ -20,7 +20,7 @@ from ufmstar_torch.eval.commands.run import Progress, run
 from ufmstar_torch.eval.engine.run_maps import folder_source
 from ufmstar_torch.eval.engine.run_source import NetworkSource
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.run_pictures import field_of_view, square_pixels
+from ufmstar_torch.eval.report.outputs import field_of_view, square_pixels
 from ufmstar_torch.eval.results import run_folder, writers
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.writers import read_frame

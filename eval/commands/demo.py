@@ -24,8 +24,9 @@ from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.commands.run import Progress
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.engine.run_source import sha256
-from ufmstar_torch.eval.report.demo_pictures import FILES, DemoPanel, panel, write_pictures
-from ufmstar_torch.eval.report.demo_report import names
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, panel, write_pictures
+from ufmstar_torch.eval.report.panels import FramePanel
+from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.machine import require_device
@@ -42,7 +43,7 @@ STYLE = "mixed"
 SHEET_ROWS = 6
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
-DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*FILES))
+DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
 
 
 class DemoError(ValueError):
@@ -57,7 +58,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         progress: called at the start of each stage and after every step of it.
 
     Returns:
-        What summary.json holds; ``demo_report`` makes a table of it.
+        What summary.json holds; ``report.text`` makes a table of it.
 
     Raises:
         FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
@@ -90,7 +91,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "versions": versions(),
     }
     progress(Progress("pictures", 0, 1, None, 0))
-    shown = names(len(members))
+    shown = demo_names(len(members))
     metrics = {shown[method].strip(): values for method, values in tally.overall().items()}
     title = f"ufmstar demo: {len(sequence)} frames, seed {options.seed}"
     outputs = write_pictures(options.out, panels, metrics, comparison.ufm_star, title)
@@ -135,7 +136,7 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
 
 def _walk(
     comparison: Comparison, frames: list[Frame], tour: Tour, progress: Callable[[Progress], None]
-) -> tuple[Tally, list[DemoPanel]]:
+) -> tuple[Tally, list[FramePanel]]:
     """All frames by all methods, with their figures and the rows of the contact sheet."""
     comparison.take(frames[0])  # libraries set themselves up at the first call, which does not count
     comparison.restart()

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.judge import Judge
 from ufmstar_torch.eval.engine.run_source import Source
-from ufmstar_torch.eval.report.run_pictures import Finished, common_scales, draw_sheet, draw_video, write_mixture
+from ufmstar_torch.eval.report.outputs import Finished, common_scales, draw_sheet, draw_video, write_mixture
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.results.summary import FAILED, FINISHED, INTERRUPTED, NEAR_ZERO, Ending, summarise

@@ -1,0 +1,180 @@
+"""The example frames that an evaluation keeps: image, ground truth, and the maps of every row."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+Map = NDArray[np.float32]
+_SCENE = ("image", "truth", "K")
+
+
+@dataclass(frozen=True, eq=False)
+class RowMaps:
+    """One row's maps of a frame, [h, w] float32.
+
+    Attributes:
+        depth: [m].
+        variance: of all that the row knows, V [m^2].
+        aleatoric: the network's own A [m^2], None where the row has none.
+        epistemic: the spread of members or samples E [m^2], or None.
+        disagreement: between the views M [m^2], or None.
+    """
+
+    depth: Map
+    variance: Map
+    aleatoric: Map | None = None
+    epistemic: Map | None = None
+    disagreement: Map | None = None
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """[h, w] bool, True where depth and variance can be used."""
+        with np.errstate(invalid="ignore"):
+            return np.isfinite(self.depth) & (self.depth > 0) & np.isfinite(self.variance) & (self.variance >= 0)
+
+    @property
+    def sigma(self) -> Map:
+        """[h, w] standard deviation [m], NaN where invalid."""
+        return deviation(self.variance, self.valid)
+
+
+_MAPS = tuple(f.name for f in fields(RowMaps))
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """A frame.
+
+    Attributes:
+        dataset: as "scannet"; sequence: its name within it; frame: its name within that.
+        sequence: see ``dataset``.
+        frame: see ``dataset``.
+        image: [H, W, 3] uint8.
+        truth: [h, w] ground truth [m], 0 = none.
+        K: [3, 3] intrinsics of the maps [px].
+        rows: maps by the row's file name.
+        labels: rows' names for people, by file name.
+    """
+
+    dataset: str
+    sequence: str
+    frame: str
+    image: NDArray[np.uint8]
+    truth: Map
+    K: NDArray[np.float64]
+    rows: Mapping[str, RowMaps]
+    labels: Mapping[str, str] = field(default_factory=dict)
+
+    def label(self, row: str) -> str:
+        """The row's name for people."""
+        return self.labels.get(row, row)
+
+    @property
+    def aspect(self) -> float:
+        """Height by width of what the maps show: networks that take squares squeeze wide images."""
+        height, width = self.truth.shape
+        return float((height / self.K[1, 1]) / (width / self.K[0, 0]))
+
+    def error(self, row: str) -> Map:
+        """[h, w] |depth - truth| [m], NaN where there is no truth or no prediction."""
+        maps = self.rows[row]
+        known = (self.truth > 0) & np.isfinite(self.truth) & maps.valid
+        return np.where(known, np.abs(maps.depth - self.truth), np.nan).astype(np.float32)
+
+    def nll(self, row: str) -> NDArray[np.float64]:
+        """[h, w] (g - d)^2 / (2 v) + 0.5 ln(2 pi v) [nats], NaN where there is no truth or v = 0."""
+        maps = self.rows[row]
+        usable = np.isfinite(self.error(row)) & (maps.variance > 0)
+        v = np.where(usable, maps.variance, 1.0).astype(np.float64)
+        error = np.where(usable, maps.depth.astype(np.float64) - self.truth.astype(np.float64), 0.0)
+        return np.where(usable, error**2 / (2 * v) + 0.5 * np.log(2 * math.pi * v), np.nan)
+
+
+def deviation(variance: Map, valid: NDArray[np.bool_]) -> Map:
+    """[h, w] square root of a variance [m], NaN where it is not ``valid``."""
+    return np.where(valid, np.sqrt(np.where(valid, variance, 0)), np.nan).astype(np.float32)
+
+
+def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list[Example]:
+    """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames.
+
+    Rows whose maps show the frame with another camera (a network of another size) make an example of their own. Rows
+    without a variance have nothing to show and are left out, and so are frames without any row.
+
+    Args:
+        folder: of the sequence.
+        labels: rows' names for people, by file name.
+
+    Raises:
+        ValueError: a file cannot be read or its maps do not fit; the message names it.
+    """
+    files = sorted((folder / "examples").glob("*.npz"))
+    stems = {file.stem: file for file in files}
+    # A frame's name may hold an "@", as a setting's does: a row's file is one whose frame has a file of its own.
+    owner = {stem: _frame_of(stem, stems) for stem in stems}
+    examples = []
+    for frame in sorted(stem for stem, of in owner.items() if of is None):
+        of_frame = {stem[len(frame) + 1 :]: stems[stem] for stem, of in owner.items() if of == frame}
+        examples += _load(folder, frame, stems[frame], of_frame, labels or {})
+    return examples
+
+
+def load_arrays(file: Path) -> dict[str, NDArray]:
+    """The arrays of an npz file.
+
+    Raises:
+        ValueError: it is none, or broken.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (BadZipFile, EOFError, KeyError, ValueError) as error:
+        raise ValueError(f"{file} is not a readable npz file: {error}") from error
+
+
+def _frame_of(stem: str, stems: Mapping[str, Path]) -> str | None:
+    """The frame whose row a file holds, None if it is a frame itself."""
+    for at in (i for i, letter in enumerate(stem) if letter == "@"):
+        if stem[:at] in stems:
+            return stem[:at]
+    return None
+
+
+def _load(
+    folder: Path, frame: str, file: Path, row_files: Mapping[str, Path], labels: Mapping[str, str]
+) -> list[Example]:
+    """The examples of one frame, one for each camera that its rows have."""
+    common = load_arrays(file)
+    _require(file, common, _SCENE)
+    scenes: dict[bytes, dict[str, NDArray]] = {}
+    rows: dict[bytes, dict[str, RowMaps]] = {}
+    for row, row_file in row_files.items():
+        stored = load_arrays(row_file)
+        _require(row_file, stored, ("depth",))
+        scene = {name: stored.get(name, common[name]) for name in _SCENE}
+        maps = {name: stored[name] for name in _MAPS if name in stored}
+        wrong = [name for name, value in maps.items() if value.shape != scene["truth"].shape]
+        if wrong:
+            raise ValueError(f"{row_file}: {', '.join(wrong)} must have the truth's shape {scene['truth'].shape}")
+        if "variance" in maps:
+            camera = scene["K"].astype(np.float64).tobytes() + repr(scene["truth"].shape).encode()
+            scenes.setdefault(camera, scene)
+            rows.setdefault(camera, {})[row] = RowMaps(**maps)
+    examples = []
+    for camera, of_camera in rows.items():
+        image, truth, K = (scenes[camera][name] for name in _SCENE)
+        examples.append(Example(folder.parent.name, folder.name, frame, image, truth, K, of_camera, labels))
+    return examples
+
+
+def _require(file: Path, stored: Mapping[str, NDArray], names: tuple[str, ...]) -> None:
+    missing = [name for name in names if name not in stored]
+    if missing:
+        raise ValueError(f"{file} must hold {', '.join(names)}; {', '.join(missing)} is missing")

@@ -1,0 +1,113 @@
+"""Means and paired differences over sequences, with 95 % confidence intervals where there are enough sequences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
+from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.names import LOWER, Quantity
+from ufmstar_torch.eval.results.record import Record
+
+# With fewer sequences there is neither an interval nor a verdict: Student's interval of two to four values claims a
+# normal distribution that nobody has checked.
+MIN_SEQUENCES = 5
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean over sequences.
+
+    Attributes:
+        value: NaN without a sequence.
+        half: half-width of its 95 % confidence interval, NaN for fewer than ``MIN_SEQUENCES`` sequences.
+        sequences: number of sequences that have the figure.
+    """
+
+    value: float
+    half: float
+    sequences: int
+
+    @property
+    def beyond(self) -> bool:
+        """Whether 0 lies outside the interval; False where there is no interval."""
+        return abs(self.value) > self.half
+
+    @property
+    def decidable(self) -> bool:
+        """Whether there are enough sequences for an interval."""
+        return self.sequences >= MIN_SEQUENCES
+
+
+def value_of(record: Record, key: str) -> float:
+    """A figure of a record by ``Quantity.key``; NaN where it has none."""
+    group, _, name = key.rpartition(".")
+    if key == "ms.total":
+        parts = [record.ms.get(part) for part in ("network", "uncertainty")] + [record.ms.get("anchors", 0.0)]
+        # Predictions from the cache were not timed: without them there is no sum.
+        return math.nan if None in parts else math.fsum(float(part) for part in parts if part is not None)
+    value = {"": record.figures, "state": record.state, "ms": record.ms, "frames": record.frames}[group].get(name)
+    return math.nan if value is None else float(value)
+
+
+def mean_over(values: Sequence[float]) -> Mean:
+    """The mean over sequences; NaN (no such figure) is left out."""
+    from ufmstar_torch.eval.metrics import mean_and_ci
+
+    kept = [value for value in values if not math.isnan(value)]
+    mean, half = mean_and_ci(kept)
+    return Mean(mean, half if len(kept) >= MIN_SEQUENCES else math.nan, len(kept))
+
+
+def mean_of(records: Sequence[Record], quantity: Quantity) -> Mean:
+    """The mean of a figure over the records of one row, in the quantity's unit."""
+    return mean_over([quantity.factor * value_of(record, quantity.key) for record in records])
+
+
+def difference(results: Results, row: Row, reference: Row, quantity: Quantity, dataset: str | None = None) -> Mean:
+    """Mean of row - reference over the sequences that both have.
+
+    Sequences differ far more than methods do, and that part cancels in each difference.
+    """
+    theirs = {(r.dataset, r.sequence): value_of(r, quantity.key) for r in results.of(reference, dataset)}
+    mine = ((r, theirs.get((r.dataset, r.sequence), math.nan)) for r in results.of(row, dataset))
+    return mean_over([quantity.factor * (value_of(r, quantity.key) - other) for r, other in mine])
+
+
+def better(mean: Mean, quantity: Quantity) -> bool | None:
+    """Whether a difference beyond its interval is to the better; None where it is not beyond, or neither way is."""
+    if not mean.beyond or quantity.better is None:
+        return None
+    return (mean.value < 0) == (quantity.better == LOWER)
+
+
+def references(results: Results, row: Row) -> list[Row]:
+    """The rows with a variance with which a row is compared.
+
+    The base alone on the same images; UfM of the same base, pruned rather than not, for rows of UfM*; plain UfM* for
+    its variants; and the default for a row of an ablation.
+    """
+    method, base = row.method, row.method.base
+    same_images = Setting(skip=row.setting.skip)
+    mine = [r for r in results.rows if r.method.base == base and r != row]
+    wanted: list[Row] = []
+    if method.fusion != ALONE:
+        wanted += [r for r in mine if r.method.fusion == ALONE and r.setting == same_images]
+    if method.fusion == UFM_STAR and row.setting == DEFAULT:
+        points = [r for r in mine if r.method.fusion == UFM and not r.method.full and r.setting == DEFAULT]
+        wanted += sorted(points, key=lambda r: r.method.max_points or math.inf)[:1]
+        if method.full or method.fixed_param:
+            plain = (r for r in mine if r.method.fusion == UFM_STAR and r.setting == DEFAULT)
+            wanted += [r for r in plain if not (r.method.full or r.method.fixed_param)]
+    if row.setting != DEFAULT:
+        wanted += [r for r in mine if r.method == method and r.setting == DEFAULT]
+    return [r for r in wanted if has_variance(results, r)]
+
+
+def has_variance(results: Results, row: Row) -> bool:
+    """Whether a row has a variance: a network of depth alone has none."""
+    return any(not math.isnan(value_of(record, "ece_delta")) for record in results.of(row))

@@ -1,0 +1,225 @@
+"""What a run and the demo leave to look at: contact sheet, preview video, curves, and the mixture for viewers.
+
+A run's pictures are drawn from its finished frames on disk, so that their scales fit the whole run, and a run that was
+stopped and continued gets the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.engine.demo_methods import NETWORK, UFM_STAR, Compared
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.report.colours import INVALID_GREY
+from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
+from ufmstar_torch.eval.report.panels import FramePanel, PanelScales, contact_sheet, fit_scales
+from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
+from ufmstar_torch.eval.results.files import write_json_atomic
+from ufmstar_torch.eval.results.writers import read_frame
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.sequences.intrinsics import pinhole
+from ufmstar_torch.ufmstar import UfMStar
+
+SHEET, CURVES, PLY, ELLIPSOIDS, NPZ = (
+    "contact_sheet.png",
+    "calibration.png",
+    "mixture.ply",
+    "ellipsoids.ply",
+    "mixture.npz",
+)
+DEMO_FILES = (SHEET, CURVES, PLY, ELLIPSOIDS, NPZ, "curves.json")
+SHEET_ROWS, SCALE_FRAMES = 6, 12
+# Without timestamps; and the range in which a recording's own rate is kept.
+DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """The finished frames of a run.
+
+    Attributes:
+        out: the run's folder.
+        frames: the sequence.
+        records: the frames' lines of frames.jsonl, in order.
+        with_error: whether there is a ground truth that the prediction can differ from.
+    """
+
+    out: Path
+    frames: FrameSequence
+    records: Sequence[Mapping[str, Any]]
+    with_error: bool
+
+    def panel(self, number: int) -> FramePanel:
+        """Finished frame ``number``, with square pixels, and the image cut to what the prediction shows."""
+        record = self.records[number]
+        stored = read_frame(self.out / "frames" / f"{record['name']}.npz")
+        K, size = pinhole(*record["intrinsics"]), (record["size"][0], record["size"][1])
+        K_square, size_square = square_pixels(K, size)
+        frame = self._frame(record["index"])
+        truth = truth_at(frame, K, size) if self.with_error and frame is not None else None
+        maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "valid": stored["valid"]}
+        note = f"K = {record['components']}"
+        if "anchored" in stored:
+            maps["anchored"] = np.sqrt(stored["anchored"])
+            note += f", {record['anchors']['used']} anchors"
+        if truth is not None:
+            maps["error"] = np.where(truth > 0, np.abs(stored["depth"] - truth), np.nan).astype(np.float32)
+        shown = {name: resample_nearest(value, K, K_square, size_square) for name, value in maps.items()}
+        image = None if frame is None or frame.image is None else field_of_view(frame.image, frame.intrinsics, K, size)
+        if image is None:
+            image = np.full((*size_square, 3), INVALID_GREY, np.uint8)
+        return FramePanel(name=record["name"], image=image, note=note, **shown)
+
+    def spread(self, count: int) -> list[int]:
+        """Numbers of at most ``count`` frames spread over the run, the first and the last included."""
+        return sorted(set(np.linspace(0, len(self.records) - 1, count).round().astype(int).tolist()))
+
+    def fps(self) -> float:
+        """Frames per second of the recording, for the video."""
+        times = [self.frames.entries[record["index"]].timestamp for record in self.records]
+        known = np.array([time for time in times if time is not None])
+        if len(known) < 2 or len(known) < len(times) or not np.median(np.diff(known)) > 0:
+            return DEFAULT_FPS
+        return float(np.clip(1 / np.median(np.diff(known)), *FPS_RANGE))
+
+    def _frame(self, index: int) -> Frame | None:
+        """The frame again, or None if it cannot be read any more."""
+        try:
+            return self.frames[index]
+        except FrameError:
+            return None
+
+
+def draw_sheet(finished: Finished, scales: PanelScales, title: str, rows: int = SHEET_ROWS) -> None:
+    """Write contact_sheet.png: frames spread over the run, the last one included.
+
+    The first is not, unless it is the only one: it was compared with nothing, so its disagreement is 0.
+    """
+    numbers = finished.spread(rows + 1)
+    panels = [finished.panel(number) for number in numbers[1:] or numbers]
+    contact_sheet(panels, finished.out / SHEET, title=title, scales=scales)
+
+
+def draw_video(finished: Finished, scales: PanelScales) -> Iterator[int]:
+    """Write preview.mp4 frame by frame; yields how many are done, so that the caller can report and stop."""
+    with VideoWriter(finished.out / "preview.mp4", finished.fps()) as video:
+        for number in range(len(finished.records)):
+            video.add(preview_frame(finished.panel(number), scales, with_error=finished.with_error))
+            yield number + 1
+
+
+def common_scales(finished: Finished) -> PanelScales:
+    """Colour scales for sheet and video, from frames spread over the whole run."""
+    return fit_scales([finished.panel(number) for number in finished.spread(SCALE_FRAMES)])
+
+
+def mixture_writers(ufm: UfMStar) -> dict[str, Callable[[Path], object]]:
+    """By file name, what writes the mixture in world coordinates: as splats, as ellipsoids, and exactly."""
+    mixture, first = ufm.mixture, ufm.T_world_first
+    return {
+        PLY: lambda path: write_mixture_ply(path, mixture, T_world_first=first),
+        ELLIPSOIDS: lambda path: write_ellipsoids_ply(path, mixture, T_world_first=first),
+        NPZ: lambda path: write_mixture_npz(path, mixture, T_world_first=first),
+    }
+
+
+def write_mixture(out: Path, ufm: UfMStar) -> None:
+    """Write all files of ``mixture_writers`` into a folder."""
+    for name, write in mixture_writers(ufm).items():
+        write(out / name)
+
+
+def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
+    """K [3, 3] and (h, w) of the same view with fx = fy, not smaller than it is.
+
+    Networks that take squares of a wide image predict maps that look squeezed.
+    """
+    f = max(K[0, 0], K[1, 1])
+    new = (round(size[0] * f / K[1, 1]), round(size[1] * f / K[0, 0]))
+    sx, sy = new[1] / size[1], new[0] / size[0]
+    cx, cy = (K[0, 2] + 0.5) * sx - 0.5, (K[1, 2] + 0.5) * sy - 0.5
+    return pinhole(K[0, 0] * sx, K[1, 1] * sy, cx, cy), new
+
+
+def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) -> NDArray[np.uint8]:
+    """The part of an image that a map with intrinsics K and size (h, w) shows, in the image's own pixels."""
+    corners = np.array([[-0.5, -0.5, 1.0], [size[1] - 0.5, size[0] - 0.5, 1.0]])
+    (left, top), (right, bottom) = np.rint((corners @ (K_image @ np.linalg.inv(K)).T)[:, :2] + 0.5).astype(int)
+    height, width = image.shape[:2]
+    part = image[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
+    return part if part.size else image
+
+
+# ---- the demo ----
+
+
+def panel(name: str, note: str, image: NDArray[np.uint8], compared: Compared, truth: NDArray[np.float32]) -> FramePanel:
+    """One row of the demo's sheet: the network's depth, its own sigma, that of UfM*, and the true error.
+
+    Args:
+        name: of the frame.
+        note: the kind of room.
+        image: [H, W, 3] uint8 RGB.
+        compared: the frame by all methods.
+        truth: [h, w] [m], 0 = none.
+    """
+    own, star = compared.estimates[NETWORK], compared.estimates[UFM_STAR]
+    depth = star.depth.float().numpy()
+    return FramePanel(
+        name=name,
+        note=note,
+        image=image,
+        depth=depth,
+        sigma=star.variance.float().sqrt().numpy(),
+        own_sigma=own.variance.float().sqrt().numpy(),
+        error=np.where(truth > 0, np.abs(depth - truth), np.nan).astype(np.float32),
+        valid=star.valid.numpy(),
+    )
+
+
+def write_pictures(
+    out: Path,
+    panels: Sequence[FramePanel],
+    metrics: Mapping[str, SequenceMetrics],
+    ufm_star: UfMStar,
+    title: str,
+) -> dict[str, str | None]:
+    """Write all of :data:`DEMO_FILES`.
+
+    Args:
+        out: an existing folder.
+        panels: rows of the contact sheet.
+        metrics: by the name that the legend shows.
+        ufm_star: at the end of the tour.
+        title: of the pictures.
+
+    Returns:
+        By file: None if it was written, else why not (an optional package is missing).
+
+    Raises:
+        OSError: a full disk, say.
+    """
+    from ufmstar_torch.eval.report.figures import write_curves
+
+    curves = {name: values.curves() for name, values in metrics.items()}
+    todo: dict[str, Callable[[Path], object]] = {
+        SHEET: lambda path: contact_sheet(panels, path, title=title),
+        CURVES: lambda path: write_curves(path, curves, title=title),
+        **mixture_writers(ufm_star),
+        "curves.json": lambda path: write_json_atomic(path, curves),
+    }
+    made: dict[str, str | None] = {}
+    for name, write in todo.items():
+        try:
+            write(out / name)
+            made[name] = None
+        except ImportError as error:  # the demo's figures need no pictures
+            made[name] = str(error)
+    return made

@@ -1,0 +1,145 @@
+"""How figures look: one colour and mark per kind of method, names at the ends of lines, no global state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
+from ufmstar_torch.eval.report.colours import FAINT, INK, plain, require_matplotlib
+from ufmstar_torch.eval.results.files import write_atomic
+
+GRID = "#e6e6e6"
+TITLE, LABEL, TICK = 11, 9, 8  # sizes of letters [pt]
+DPI = 130
+
+
+@dataclass(frozen=True)
+class Style:
+    """A line's colour (Okabe and Ito's, which the colour-blind tell apart) and mark (for print in grey)."""
+
+    colour: str
+    marker: str
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """For ``Axes.plot``."""
+        return {"color": self.colour, "marker": self.marker, "linewidth": 1.6, "markersize": 4.5}
+
+
+ALONE_STYLE = Style("#6b6b6b", "^")
+
+
+def style_of(method: Method) -> Style:
+    """The same in every figure, whatever the network."""
+    if method.fusion == ALONE:
+        return ALONE_STYLE
+    if method.fusion == UFM:
+        if method.full:
+            return Style("#F0E442", "X")
+        return Style("#E69F00", "s") if method.max_points is None else Style("#D55E00", "v")
+    if method.full:
+        return Style("#009E73", "D")
+    return Style("#CC79A7", "P") if method.fixed_param else Style("#0072B2", "o")
+
+
+def short_name(method: Method) -> str:
+    """A method's name where its network stands elsewhere: "alone", "UfM-100K", "UfM*", "UfM*-Full"."""
+    if method.fusion == ALONE:
+        return "alone"
+    cap = "" if method.max_points is None else f"-{method.max_points // 1000}K"
+    name = "UfM" if method.fusion == UFM else "UfM*"
+    return f"{name}{'-Full' if method.full else ''}{cap}{' fixed-param' if method.fixed_param else ''}"
+
+
+def counted(sequences: int) -> str:
+    """ "1 sequence", "6 sequences"."""
+    return f"{sequences} sequence{'' if sequences == 1 else 's'}"
+
+
+def new_figure(width: float, height: float, title: str) -> Any:
+    """A figure with a title [inches].
+
+    Raises:
+        ImportError: matplotlib is missing; names the extra that brings it.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", layout=layout)
+    figure.suptitle(plain(title), size=TITLE, weight="bold", color=INK, x=0.012, ha="left")
+    return figure
+
+
+def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
+    """Words, a faint grid behind, no box."""
+    axes.set_title(plain(title), size=LABEL + 0.5, color=INK, loc="left")
+    axes.set_xlabel(plain(x), size=LABEL, color=INK)
+    axes.set_ylabel(plain(y), size=LABEL, color=INK)
+    axes.tick_params(labelsize=TICK, color=FAINT, labelcolor=INK)
+    axes.grid(color=GRID, linewidth=0.6)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(FAINT)
+
+
+def spread_apart(places: Sequence[float], gap: float, low: float, high: float) -> list[float]:
+    """Places at least ``gap`` apart within [low, high] in the same order, each as near to its own as can be.
+
+    Neighbours that are too close form a group about the mean of their places; groups that touch are joined.
+    Where they do not fit, the gap is smaller.
+    """
+    if not places:
+        return []
+    gap = min(gap, (high - low) / max(len(places) - 1, 1))
+    order = sorted(range(len(places)), key=lambda i: places[i])
+    groups: list[list[float]] = []  # [number of members, mean of (wanted - offset within the group)]
+    for i in order:
+        groups.append([1, places[i]])
+        while len(groups) > 1 and groups[-2][1] + groups[-2][0] * gap > groups[-1][1]:
+            n, start = groups.pop()
+            m, before = groups.pop()
+            groups.append([m + n, (m * before + n * (start - m * gap)) / (m + n)])
+    spread = [start + k * gap for n, start in groups for k in range(int(n))]
+    # Pushed in from the top, then from the bottom: the gap fits, so both can hold.
+    spread = [min(place, high - (len(spread) - 1 - k) * gap) for k, place in enumerate(spread)]
+    by_index = {i: max(place, low + k * gap) for k, (i, place) in enumerate(zip(order, spread, strict=True))}
+    return [by_index[i] for i in range(len(places))]
+
+
+def label_ends(axes: Any, ends: Iterable[tuple[float, str, str]], *, size: float = TICK) -> None:
+    """Names right of a panel, level with where their lines end, and apart from each other.
+
+    Call it when the limits of y stand.
+
+    Args:
+        axes: the panel.
+        ends: (y of the line's end, name, colour).
+        size: of the letters [pt].
+    """
+    listed = list(ends)
+    transform = axes.transData + axes.transAxes.inverted()
+    x = axes.get_xlim()[1]
+    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _, _ in listed]
+    height = axes.get_position().height * axes.figure.get_figheight()
+    for place, (_, name, colour) in zip(spread_apart(wanted, 1.25 * size / 72 / height, 0, 1), listed, strict=True):
+        axes.text(1.02, place, plain(name), transform=axes.transAxes, color=colour, size=size, va="center", ha="left")
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a figure, as the suffix says (.svg or .png); the same figure gives the same bytes.
+
+    Raises:
+        OSError: see ``write_atomic``.
+    """
+    matplotlib = require_matplotlib()
+    kind = path.suffix.removeprefix(".")
+    plain = {"Date": None} if kind == "svg" else {"Software": None}
+    with matplotlib.rc_context({"svg.hashsalt": "ufmstar"}):
+        write_atomic(path, lambda file: figure.savefig(file, format=kind, metadata=plain))
