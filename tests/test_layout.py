@@ -77,7 +77,6 @@ EVAL_VIOLATIONS: frozenset[str] = frozenset(
         "engine.evaluate -> results.examples",
         "engine.frame_pass -> results.cache",
         "engine.frame_pass -> results.examples",
-        "sequences.layout -> tour.name",
     }
 )
 
