@@ -60,7 +60,6 @@ def test_exact_measurements_give_back_each_image_s_scale_and_shift(kind, robust)
     assert (fit.residual < 1e-10).all()
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     kind=st.sampled_from(["inverse", "affine"]),
     scale=st.floats(1e-3, 1e3),
@@ -258,7 +257,7 @@ def test_invalid_pixels_are_no_prediction_for_ufm_and_give_finite_gradients():
     assert out.variance[0, 5:].isfinite().all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(scale=st.floats(1e-3, 10), shift=st.floats(-0.5, 0.5), seed=st.integers(0, 100))
 def test_depth_falls_with_the_prediction_and_inverts_it(scale, shift, seed):
     prediction = random_depth(1, seed=seed).flatten().sort().values.view(1, *SIZE)

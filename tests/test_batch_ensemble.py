@@ -82,7 +82,7 @@ def alone(layer, n):
 # ---- one layer ----
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     groups=st.sampled_from([(1, 3, 2), (2, 4, 6), (4, 4, 4), (4, 4, 8)]),
     kernel=st.sampled_from([1, 3, (1, 3)]),

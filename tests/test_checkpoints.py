@@ -159,7 +159,7 @@ def test_long_lists_of_keys_are_shortened(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 @given(data=st.data())
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_cut_off_files_are_named(tmp_path: Path, name: str, data: st.DataObject) -> None:
     """Wherever a file ends early, the error is ours and says which file."""
     save_checkpoint(tmp_path / name, Small())
@@ -172,7 +172,7 @@ def test_cut_off_files_are_named(tmp_path: Path, name: str, data: st.DataObject)
 
 @pytest.mark.parametrize("name", FORMATS)
 @given(content=st.binary(max_size=300))
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_arbitrary_bytes_are_named(tmp_path: Path, name: str, content: bytes) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(CheckpointError, match=name):
@@ -184,7 +184,7 @@ def test_arbitrary_bytes_are_named(tmp_path: Path, name: str, content: bytes) ->
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol:UserWarning")
 @example(place=852, value=0, kept=880)
 @given(place=st.integers(0, 2000), value=st.integers(0, 255), kept=st.integers(16, 3000))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damage_to_the_format_of_old_releases(tmp_path: Path, place: int, value: int, kept: int) -> None:
     """Files from before torch 1.6 are one pickle; damaged ones load with other values or name the file."""
     path = tmp_path / "old.pth"
