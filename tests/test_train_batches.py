@@ -119,6 +119,7 @@ def test_loading_leaves_the_global_generator_alone():
     assert torch.equal(torch.get_rng_state(), state)
 
 
+@pytest.mark.slow
 def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
     """Spawned; what they find broken is known here, and they know what epoch it is."""
     frames = NyuFrames(write_nyu(tmp_path), "train")
