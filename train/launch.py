@@ -77,9 +77,7 @@ def _meet(trainer: pl.Trainer, wait: float) -> dist.TCPStore:
     """The store where process group and this meet: torchrun's own, or else one that the first process opens."""
     environment = cast(ParallelStrategy, trainer.strategy).cluster_environment
     if environment is None:
-        raise ValueError(
-            f"{type(trainer.strategy).__name__} does not state the address of its processes"
-        )
+        raise ValueError(f"{type(trainer.strategy).__name__} does not state the address of its processes")
     # A port that Lightning has chosen for this launch: what it starts later, and its process group, take the same.
     os.environ.setdefault("MASTER_PORT", str(environment.main_port))
     served = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == str(True)
