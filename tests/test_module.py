@@ -20,6 +20,8 @@ import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.frame import FRAME_FAULTS
 
+pytestmark = pytest.mark.numerics
+
 H, W = 30, 40
 CONFIG = UfMStarConfig(segment=SPGF)
 DEPTHS, POSES, K_ = scenes.sequence(8, H, W, 0.05)
@@ -311,12 +313,12 @@ def test_no_host_synchronisation():
     ufm = UfMStar(config, device="meta")
     for _ in range(2):
         out = ufm(
-            torch.empty(2, 12, 16, device="meta"),
+            torch.empty(2, 6, 8, device="meta"),
             torch.empty(2, 4, 4, device="meta"),
             torch.empty(2, 3, 3, device="meta"),
-            aleatoric=torch.empty(2, 12, 16, device="meta"),
+            aleatoric=torch.empty(2, 6, 8, device="meta"),
         )
-    assert out.variance.shape == (2, 12, 16)
+    assert out.variance.shape == (2, 6, 8)
     assert out.variance.device.type == "meta"
 
 
@@ -524,7 +526,7 @@ def test_intrinsics_and_size_may_change_in_the_middle():
 
 
 @given(st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_any_depth_map_gives_a_variance_or_nan(data):
     """Whatever lies in a depth map: finite non-negative variance where valid, NaN elsewhere, no crash."""
     values = st.one_of(

@@ -164,6 +164,7 @@ def meeting(monkeypatch):
     return trainer
 
 
+@pytest.mark.slow
 def test_every_training_waits_for_its_own_preparation(meeting, tmp_path):
     for _ in range(2):
         with (
@@ -175,6 +176,7 @@ def test_every_training_waits_for_its_own_preparation(meeting, tmp_path):
             pass
 
 
+@pytest.mark.slow
 def test_all_processes_end_where_the_first_cannot_prepare(meeting, tmp_path):
     @contextmanager
     def refused():
@@ -213,6 +215,7 @@ def test_one_validation_frame_for_two_processes(frames, tmp_path):
     assert float(read_rows(tmp_path / "out" / "member_0" / METRICS)[-1]["val_rmse"]) > 0
 
 
+@pytest.mark.slow
 def test_the_processes_above_had_unequal_numbers_of_valid_pixels(frames, tmp_path):
     """Otherwise a mean of the processes' means would pass as well."""
     data = make_data(tiny_job(frames, tmp_path, PLAIN), 0, 1)

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from layouts import write_generic, write_scannet, write_tum
 from training_data import PLAIN, TINY, truncated
@@ -53,7 +53,6 @@ def test_an_empty_part_is_named():
         Part.parse("50:60").frames(20)
 
 
-@settings(max_examples=100, deadline=None)
 @given(length=st.integers(1, 5000), edge=st.integers(1, 99))
 def test_two_parts_that_meet_divide_every_sequence(length, edge):
     covered = []
