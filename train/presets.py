@@ -123,9 +123,9 @@ PRESETS: dict[str, Recipe] = {
 } | {"demo": _DEMO}
 
 
-_SOURCES = """From the paper (Section V-A): method, members, size, epochs, decay, dropout, Adam's betas (.9, .999), and the
-ResNet50 encoder's start from ImageNet (--init imagenet). Ours, since the paper does not state them: batch, learning rate
-and its schedule. The preset demo is ours."""
+_SOURCES = """From the paper (Section V-A): method, members, size, epochs, decay, dropout, Adam's betas (.9, .999), and
+the ResNet50 encoder's start from ImageNet (--init imagenet). Ours, since the paper does not state them: batch,
+learning rate and its schedule. The preset demo is ours."""
 
 
 def preset(name: str) -> Recipe:
