@@ -32,8 +32,8 @@ _WARM_UP, _TORCH_ROUNDS = 3, 3
 class BenchSettings:
     """Times of the stages and of the whole UfM* step beside the forward passes of two networks.
 
-    Nothing passes or fails: absolute times depend on the machine and on its other load. docs/results/benchmark.md explains
-    each figure.
+    Nothing passes or fails: absolute times depend on the machine and on its other load. docs/results/benchmark.md
+    explains each figure.
 
     Attributes:
         sequence: recorded sequence instead of a rendered room
