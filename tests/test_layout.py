@@ -17,7 +17,7 @@ HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetr
 HEAVY += ("numba",)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "disagree", "fuse", "regress", "mixture", "step", "frame")
-REFERENCE += ("anchors", "evidence", "read_out", "output", "stateful")
+REFERENCE += ("anchors", "evidence", "hook", "output", "state", "fixed_order")
 
 
 def layer_of(path: Path) -> str:
@@ -77,7 +77,6 @@ EVAL_VIOLATIONS: frozenset[str] = frozenset(
         "engine.evaluate -> results.examples",
         "engine.frame_pass -> results.cache",
         "engine.frame_pass -> results.examples",
-        "sequences.layout -> tour.name",
     }
 )
 
@@ -111,6 +110,7 @@ def test_kernels_import_back_only_plain_types():
         "Regression",
         "regress",
         "distribute",
+        "regress_pixels",
         "Correspondence",
         "PIXEL_VARIANCE",
         "UfMStarConfig",
@@ -119,7 +119,7 @@ def test_kernels_import_back_only_plain_types():
         "DAMPING",
         "STEPS",
     }
-    for path in (ROOT / "ufmstar_torch" / "kernels").glob("*.py"):
+    for path in (ROOT / "ufmstar_torch" / "kernels").glob("*_cpu.py"):
         for module, names in imported(path):
             if module.startswith("ufmstar_torch.") and not module.startswith("ufmstar_torch.kernels"):
                 own = {n for n in names if n in plain or module == "ufmstar_torch.segment_input"}
@@ -138,6 +138,14 @@ def test_folders_on_disk_are_the_packages():
     assert set(PYPROJECT["packages"]) == on_disk
     mapping = {"ufmstar_torch": "ufmstar_torch"} | {f"ufmstar_torch.{x}": x for x in ("models", "eval", "train")}
     assert PYPROJECT["package-dir"] == mapping
+
+
+def test_data_files_beside_the_modules_are_packaged():
+    folders = {name: ROOT / name.removeprefix("ufmstar_torch.").replace(".", "/") for name in PYPROJECT["package-data"]}
+    globs = PYPROJECT["package-data"].items()
+    listed = {path for name, patterns in globs for pattern in patterns for path in folders[name].glob(pattern)}
+    data = {p for p in (ROOT / "eval").rglob("*") if p.is_file() and p.suffix != ".py" and "__pycache__" not in p.parts}
+    assert data - listed == set()
 
 
 @pytest.mark.parametrize(

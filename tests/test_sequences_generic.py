@@ -10,7 +10,7 @@ import pytest
 from layouts import quaternion_line, truncate, write_depth_png, write_image, write_video
 
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
-from ufmstar_torch.eval.sequences.pairing import pair_by_name
+from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.video import Video
 
 
@@ -38,6 +38,17 @@ def test_kitti_rows_and_a_wrong_count(tmp_path):
     np.savetxt(path / "poses.txt", [T[:3].ravel() for T in truth.T_world_cam[:5]])
     with pytest.raises(ValueError, match="trajectory has 5 poses for 6 images"):
         open_sequence(path)
+
+
+def test_a_link_without_its_file_keeps_its_place_and_is_an_error_of_its_frame(tmp_path):
+    path, truth = layouts.write_generic(tmp_path)
+    (path / "images" / "7.png").unlink()
+    (path / "images" / "7.png").symlink_to("nowhere.png")
+    sequence = open_sequence(path)
+    assert sequence.names[0] == "7"
+    np.testing.assert_array_equal(sequence[1].image, truth.images[1])
+    with pytest.raises(FrameError, match="cannot be decoded"):
+        sequence[0]
 
 
 @pytest.mark.parametrize("form", ["rows", "line", "4x4", "numbers"])
@@ -238,9 +249,10 @@ def test_broken_video(tmp_path, capfd):
     images = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(8)]
     write_video(tmp_path / "cut.avi", images)
     truncate(tmp_path / "cut.avi", 0.6)
-    (tmp_path / "noise.mp4").write_bytes(b"no video at all" * 10)
-    with pytest.raises(FrameError, match="cannot be opened as a video"):
-        Video(tmp_path / "noise.mp4")
+    for content in (b"", b"no video at all" * 10):
+        (tmp_path / "noise.mp4").write_bytes(content)
+        with pytest.raises(ValueError, match=r"noise\.mp4: cannot be opened as a video"):
+            Video(tmp_path / "noise.mp4")
     with pytest.raises(FileNotFoundError):
         Video(tmp_path / "absent.mp4")
     video = Video(tmp_path / "cut.avi")

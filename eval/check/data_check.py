@@ -14,7 +14,7 @@ import numpy as np
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
 from ufmstar_torch.eval.sequences.conventions import OURS
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.layout import open_sequence
+from ufmstar_torch.eval.tour.open import open_sequence
 
 _SAMPLED = 12  # frames whose depth is looked at for its range
 _DECODED = 500  # frames that are read to see that they can be; of more, as many evenly spaced ones: seconds
@@ -47,7 +47,7 @@ class DataReport:
         checked: what ``check_sequence`` measured, plain values; {} where it could not.
         problems: what is wrong, in words.
         remedies: what to do about it; options are named as on the command line.
-        undecided: what the data cannot tell.
+        undecided: what the data leave open.
     """
 
     name: str
@@ -81,7 +81,7 @@ class DataReport:
 
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
-    """Opens a sequence and looks at all that can be told without a network.
+    """Opens a sequence and checks all that needs no network.
 
     A sequence that cannot be opened is a report with that problem.
 
@@ -219,7 +219,7 @@ def _measured(found: SequenceCheck) -> dict[str, Any]:
 
 
 def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
-    """How many frames were read, and what was said of those that cannot be; a rendered frame always can."""
+    """How many frames were read, and the errors of those that cannot be; a rendered frame always can."""
     if sequence.layout == "tour":
         return 0, []
     chosen = np.unique(np.linspace(0, len(sequence) - 1, min(_DECODED, len(sequence))).astype(int))

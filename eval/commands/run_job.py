@@ -12,9 +12,10 @@ from ufmstar_torch.eval.engine.run_anchors import require_images
 from ufmstar_torch.eval.engine.run_maps import folder_source, own_depth_source
 from ufmstar_torch.eval.engine.run_source import Source, network_source
 from ufmstar_torch.eval.results.machine import require_device
-from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
+from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.eval.tour.open import open_sequence
 
 
 def job_from(chosen: RunOptions) -> Job:

@@ -12,7 +12,7 @@ from torch import Tensor
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
-from ufmstar_torch.step import FrameStatistics
+from ufmstar_torch.output import FrameStatistics
 
 # Of the tensors that a source keeps, those of its tracker.
 _PREFIX = "tracker."
