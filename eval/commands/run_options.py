@@ -7,6 +7,7 @@ from dataclasses import MISSING, Field, fields
 from typing import TYPE_CHECKING, Any
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.eval.sequences.frame import parse_size
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -175,20 +176,6 @@ def parse_slice(text: str | None) -> slice:
     if len(numbers) not in (2, 3) or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
         raise ValueError(f"--frames must be START:STOP or START:STOP:STEP with STEP at least 1, got {text!r}")
     return slice(*numbers)
-
-
-def parse_size(text: str | None) -> tuple[int, int] | None:
-    """HxW as (H, W), None for None.
-
-    Raises:
-        ValueError: another form.
-    """
-    if text is None:
-        return None
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
-        raise ValueError(f"--size must be HxW in pixels, 240x320 say, got {text!r}")
-    return int(parts[0]), int(parts[1])
 
 
 def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:

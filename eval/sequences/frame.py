@@ -21,6 +21,20 @@ Size = tuple[int, int]
 _CENTRE_RANGE = (0.2, 0.8)
 
 
+def parse_size(text: str | None, option: str = "--size") -> Size | None:
+    """HxW as (H, W), None for None.
+
+    Raises:
+        ValueError: another form; the message names ``option``.
+    """
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
+        raise ValueError(f"{option} must be HxW in pixels, 240x320 say, got {text!r}")
+    return int(parts[0]), int(parts[1])
+
+
 class FrameError(Exception):
     """A frame's file is missing, truncated, corrupt, or not of the sequence's size; found when decoding.
 

@@ -11,13 +11,16 @@ import zipfile
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.exr import read_exr
-from ufmstar_torch.eval.sequences.frame import FrameError, Loader, Size
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Loader, Size
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
@@ -26,6 +29,19 @@ _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
 _MILLIMETRE = 1e-3
+
+
+def image_tensor(frame: Frame) -> Tensor:
+    """[1, 3, H, W] uint8 RGB of a frame's image, as networks' preprocessing takes it.
+
+    Raises:
+        FrameError: the frame has no image.
+    """
+    import torch
+
+    if frame.image is None:
+        raise FrameError(frame.name, "no image")
+    return torch.from_numpy(frame.image).permute(2, 0, 1)[None]
 
 
 def read_color(path: str | Path) -> np.ndarray:
