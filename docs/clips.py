@@ -16,6 +16,7 @@ from torch import nn
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
@@ -89,7 +90,7 @@ def predict(name: str, source: str, members: list[DepthNetwork], *, aleatoric: b
         except FrameError:
             continue
         member = members[len(rows) % len(members)]
-        image, intrinsics = torch.from_numpy(frame.image).permute(2, 0, 1)[None], torch.from_numpy(frame.intrinsics)
+        image, intrinsics = image_tensor(frame), torch.from_numpy(frame.intrinsics)
         with torch.no_grad():
             x, K = member.preprocess(image, intrinsics[None])
             said = member(x)

@@ -30,8 +30,9 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.report.run_pictures import field_of_view
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
-from ufmstar_torch.eval.sequences.frame import Frame, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained
@@ -70,11 +71,11 @@ class Shot:
         return np.abs(self.depth - self.truth)
 
 
-def last_shot(sequence: Sequence, network: DepthNetwork) -> Shot:
+def last_shot(sequence: FrameSequence, network: DepthNetwork) -> Shot:
     """What is said of the last frame, after all those before it; frames that cannot be read are left out."""
     plain, anchored, tracker = UfMStar(), UfMStar(UfMStarConfig(anchored=True)), LandmarkTracker()
     for frame in readable(sequence):
-        image, intrinsics = torch.from_numpy(frame.image).permute(2, 0, 1)[None], torch.from_numpy(frame.intrinsics)
+        image, intrinsics = image_tensor(frame), torch.from_numpy(frame.intrinsics)
         with torch.no_grad():
             x, K = network.preprocess(image, intrinsics[None])
             depth = network(x).depth.float()
@@ -98,7 +99,7 @@ def last_shot(sequence: Sequence, network: DepthNetwork) -> Shot:
     )
 
 
-def readable(sequence: Sequence) -> Iterator[Frame]:
+def readable(sequence: FrameSequence) -> Iterator[Frame]:
     """Its frames but those whose files are broken."""
     for index in range(len(sequence)):
         try:

@@ -14,8 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.sequences import Frame, Sequence, open_sequence
+from ufmstar_torch.eval.sequences import Frame, FrameSequence, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import Tour, make_tour, render, tour_path
 from ufmstar_torch.eval.tour.box_room import intrinsics
 from ufmstar_torch.models import Preprocess
@@ -132,7 +133,9 @@ def parse_tour(name: str) -> tuple[int, str]:
     return int(number), options["style"]
 
 
-def _recording(sequence: Sequence, frames: int, stride: int, held_back: int, preprocess: Preprocess) -> Environment:
+def _recording(
+    sequence: FrameSequence, frames: int, stride: int, held_back: int, preprocess: Preprocess
+) -> Environment:
     total = len(sequence)
     pool = range(0, int(total * _POOL_END), stride)[:frames]
     judged = np.linspace(int(total * _HELD_BACK_START), total - 1, held_back).round().astype(int)
@@ -148,7 +151,7 @@ def _views(part: str, frames: Iterable[Frame], rooms: list[str], preprocess: Pre
     for frame, room in zip(frames, rooms, strict=True):
         if frame.image is None or frame.depth is None:
             raise ValueError(f"frame {frame.name} has no {'image' if frame.image is None else 'depth'}: it needs both")
-        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
+        image = image_tensor(frame)
         x, K = preprocess(image, torch.from_numpy(frame.intrinsics)[None])
         truth = truth_at(frame, K[0].numpy(), (x.shape[-2], x.shape[-1]))
         assert truth is not None

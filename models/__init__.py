@@ -5,8 +5,9 @@ The names below load their module when they are first used, not when this packag
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.models.aligned import AlignedNetwork as AlignedNetwork
@@ -60,67 +61,5 @@ if TYPE_CHECKING:
     from ufmstar_torch.models.trained import load_trained as load_trained
     from ufmstar_torch.models.trained import read_info as read_info
     from ufmstar_torch.models.trained import save_trained as save_trained
-
-_HOME = {
-    "AleatoricNetwork": "heads",
-    "AlignedNetwork": "aligned",
-    "Alignment": "alignment",
-    "AlignmentFit": "alignment",
-    "AlignmentSums": "alignment",
-    "Backbone": "network",
-    "BatchEnsemble": "batch_ensemble",
-    "CheckpointError": "checkpoints",
-    "DecoderDropout": "dropout",
-    "DepthAnything": "depth_anything",
-    "DepthNetwork": "network",
-    "DepthOnlyNetwork": "heads",
-    "Ensemble": "ensemble",
-    "EvidentialDepth": "distribution",
-    "EvidentialNetwork": "heads",
-    "FastDepth": "fastdepth",
-    "FastDepthWidths": "fastdepth",
-    "GaussianDepth": "distribution",
-    "GroundFit": "camera_height",
-    "HuggingFaceDepth": "hugging_face",
-    "LazyMember": "ensemble",
-    "MonodepthResNet": "monodepth2",
-    "MonteCarloDropout": "dropout",
-    "NetworkSpec": "spec",
-    "OnnxNetwork": "onnx_network",
-    "OnnxSpec": "onnx_network",
-    "OutputSpec": "outputs",
-    "PointDepth": "distribution",
-    "Preprocess": "preprocess",
-    "TrainedInfo": "trained",
-    "UncertaintyNetwork": "heads",
-    "WrappedNetwork": "any_network",
-    "align_to_camera_height": "camera_height",
-    "build_backbone": "spec",
-    "build_network": "spec",
-    "convert": "batch_ensemble",
-    "depth_anything_name": "depth_anything",
-    "fit_affine_depth": "alignment",
-    "fit_inverse_depth": "alignment",
-    "from_hugging_face": "hugging_face",
-    "load_monodepth2": "monodepth2_import",
-    "load_network": "load",
-    "load_state_dict_file": "checkpoints",
-    "load_trained": "trained",
-    "load_weights": "checkpoints",
-    "read_info": "trained",
-    "save_checkpoint": "checkpoints",
-    "save_trained": "trained",
-    "set_sampling": "dropout",
-    "with_head": "heads",
-    "wrap_network": "any_network",
-}
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(_HOME)
+else:
+    __getattr__, __dir__ = lazy_names(__name__)

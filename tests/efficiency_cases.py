@@ -8,7 +8,7 @@ from tiny_networks import Linear
 
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.sequences.frame import Entry, Sequence, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, make_sequence
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models.heads import UncertaintyNetwork, with_head
 from ufmstar_torch.models.network import Backbone
@@ -31,9 +31,9 @@ def network(
     return with_head(inside, head).eval()
 
 
-def room_sequence(frames: int = 8) -> Sequence:
+def room_sequence(frames: int = 8) -> FrameSequence:
     """Views of a room whose depth [5 m] is the red of the image."""
-    room, K = synthetic.Room.furnished(10, 0), synthetic.intrinsics(*SIZE)
+    room, K = synthetic.BoxRoom.furnished(10, 0), synthetic.intrinsics(*SIZE)
 
     def entry(n: int, T: np.ndarray) -> Entry:
         depth = synthetic.render(room, T, K, *SIZE)

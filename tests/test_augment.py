@@ -84,7 +84,7 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom
 def test_a_rendered_room_is_the_room_seen_by_the_rolled_camera(zoom):
     """Ray-cast again with K' and the rolled pose, an exact depth image agrees off the edges (no flip: a mirrored
     room is another room)."""
-    room, pose = synthetic.Room.furnished(25, 3), synthetic.look((0.2, 0.0, -0.1), 0.6, 0.1)
+    room, pose = synthetic.BoxRoom.furnished(25, 3), synthetic.look((0.2, 0.0, -0.1), 0.6, 0.1)
     change = Change(scale=1.3, angle=0.08, shift=(5.0, 3.0))
     camera = K.clone()
     camera[0, 1] = 0.0  # the renderer knows no skew

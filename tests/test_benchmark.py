@@ -162,7 +162,7 @@ def test_impossible_thread_counts(count):
 
 
 def scene(size=96, boxes=25):
-    return synthetic.Room.furnished(boxes, seed=3), synthetic.intrinsics(size, size), size
+    return synthetic.BoxRoom.furnished(boxes, seed=3), synthetic.intrinsics(size, size), size
 
 
 def points_in_world(depth, T, K):
@@ -214,13 +214,13 @@ def test_the_window_of_a_box_loses_no_pixel():
     room, K, size = scene(64)
     for T in synthetic.walk(5, period=5):
         brute = np.min(
-            [synthetic.render(synthetic.Room(room.walls, box[None]), T, K, size, size) for box in room.boxes], axis=0
+            [synthetic.render(synthetic.BoxRoom(room.walls, box[None]), T, K, size, size) for box in room.boxes], axis=0
         )
         np.testing.assert_array_equal(synthetic.render(room, T, K, size, size), brute)
 
 
 def test_a_wall_straight_ahead():
-    room = synthetic.Room(np.array([[-2.0, -1, -3], [2, 1, 5]]), np.zeros((0, 2, 3)))
+    room = synthetic.BoxRoom(np.array([[-2.0, -1, -3], [2, 1, 5]]), np.zeros((0, 2, 3)))
     T = synthetic.look((0, 0, 1), yaw=0)
     np.testing.assert_allclose(synthetic.render(room, T, synthetic.intrinsics(9, 9, 10), 9, 9), 4.0)
     sideways = synthetic.look((0, 0, 1), yaw=np.pi / 2)  # right: the wall at x = 2
@@ -254,7 +254,7 @@ def test_a_camera_outside_the_room(position):
 
 
 def test_the_walk_stays_free_of_the_boxes():
-    boxes = synthetic.Room.furnished(1000).boxes
+    boxes = synthetic.BoxRoom.furnished(1000).boxes
     positions = np.array([T[:3, 3] for T in synthetic.walk(1000, period=37)])
     gap = np.maximum(boxes[:, 0] - positions[:, None], positions[:, None] - boxes[:, 1]).max(-1)
     assert gap.min() > 0.3
@@ -262,7 +262,7 @@ def test_the_walk_stays_free_of_the_boxes():
 
 def test_impossible_rooms_and_walks():
     with pytest.raises(ValueError, match="boxes"):
-        synthetic.Room.furnished(-1)
+        synthetic.BoxRoom.furnished(-1)
     with pytest.raises(ValueError, match="period"):
         list(synthetic.walk(3, period=0))
 

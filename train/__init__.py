@@ -5,8 +5,9 @@ The names below load their module when they are first used, not when this packag
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.train.augment import Augmentation as Augmentation
@@ -33,40 +34,5 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.start import starting_network as starting_network
     from ufmstar_torch.train.tour_data import TourSettings as TourSettings
     from ufmstar_torch.train.tour_data import tour_frames as tour_frames
-
-_HOME = {
-    "Augmentation": "augment",
-    "AugmentationConfig": "augment",
-    "DataConfig": "data_config",
-    "DepthDataModule": "data",
-    "EpochBatches": "batches",
-    "EpochLoader": "batches",
-    "FitSettings": "settings",
-    "Job": "member",
-    "NonFiniteLossError": "module",
-    "NyuFrames": "nyu",
-    "PRESETS": "presets",
-    "Recipe": "presets",
-    "ResumeError": "checkpoints",
-    "SampleDataset": "samples",
-    "SampleError": "samples",
-    "SequenceFrames": "sequence_data",
-    "TourSettings": "tour_data",
-    "TrainingModule": "module",
-    "convert_labelled": "nyu",
-    "loss_of": "losses",
-    "loss_sums": "losses",
-    "preset": "presets",
-    "starting_network": "start",
-    "tour_frames": "tour_data",
-}
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(_HOME)
+else:
+    __getattr__, __dir__ = lazy_names(__name__)

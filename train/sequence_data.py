@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Items
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.sequences.frame import FrameError, Sequence
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.layout import detect_layout, open_sequence
 from ufmstar_torch.train.parts import Part
@@ -29,7 +29,7 @@ class SequenceFrames:
         ValueError: no sequence, or one whose part has no frame with depth.
     """
 
-    def __init__(self, sequences: Items[Sequence], part: str | Part = "0:100%") -> None:
+    def __init__(self, sequences: Sequence[FrameSequence], part: str | Part = "0:100%") -> None:
         part = Part.parse(part) if isinstance(part, str) else part
         if not sequences:
             raise ValueError("sequences must hold at least one sequence, got none")
@@ -74,7 +74,7 @@ class SequenceFrames:
         )
 
 
-def open_rgbd(source: str | Path) -> Sequence:
+def open_rgbd(source: str | Path) -> FrameSequence:
     """A sequence as ``open_sequence`` detects it, or else a folder of images and depth maps without poses.
 
     Raises:

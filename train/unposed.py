@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.generic import DEPTHS, IMAGES, INTRINSICS
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
@@ -35,7 +35,7 @@ def is_unposed(path: Path) -> bool:
 
 def open_unposed(
     path: str | Path, intrinsics: IntrinsicsLike | None = None, depth_scale: float | None = None
-) -> Sequence:
+) -> FrameSequence:
     """Opens a folder with one of ``images image rgb color frames`` and one of ``depth depths``.
 
     A depth map belongs to the image with the same name or the same numbers in it, or else, where names are

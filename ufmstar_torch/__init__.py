@@ -1,7 +1,8 @@
 """UfM*: how far to trust a monocular depth network, from the disagreement between its views."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.config import SPGFConfig as SPGFConfig
@@ -11,6 +12,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.prediction import DepthPrediction as DepthPrediction
     from ufmstar_torch.ufmstar import UfMStar as UfMStar
     from ufmstar_torch.ufmstar import UfMStarOutput as UfMStarOutput
+else:
+    __getattr__, __dir__ = lazy_names(__name__)
 
 __version__ = "0.1.0"
 __all__ = [
@@ -22,23 +25,3 @@ __all__ = [
     "UfMStarOutput",
     "UncertainDepth",
 ]
-_HOME = {
-    "DepthPrediction": "prediction",
-    "GaussianMixture": "mixture",
-    "SPGFConfig": "config",
-    "UfMStar": "ufmstar",
-    "UfMStarConfig": "config",
-    "UfMStarOutput": "ufmstar",
-    "UncertainDepth": "pipeline",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name's module when it is first asked for (PEP 562): ``ufmstar --help`` needs no torch."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.sequences import Sequence
+from ufmstar_torch.eval.sequences import FrameSequence
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, Preprocess
 
@@ -71,7 +72,7 @@ class RenderedRoom:
 
     def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
         """The first ``count`` frames at size x size pixels."""
-        room = synthetic.Room.furnished(self.boxes, self.seed)
+        room = synthetic.BoxRoom.furnished(self.boxes, self.seed)
         K = synthetic.intrinsics(size, size)
         rng = np.random.default_rng(self.seed)
         for T in synthetic.walk(count, self.period):
@@ -119,15 +120,14 @@ class RecordedSequence:
                 own = frame.intrinsics if frame.depth_intrinsics is None else frame.depth_intrinsics
                 yield _square(torch.from_numpy(frame.depth)[None], T, torch.from_numpy(own), size)
             else:
-                assert frame.image is not None  # every layout has images
-                yield _predicted(self.network, frame.image, T, torch.from_numpy(frame.intrinsics), size)
+                yield _predicted(self.network, image_tensor(frame), T, torch.from_numpy(frame.intrinsics), size)
 
     def describe(self) -> dict[str, object]:
         """What was read, for the report; the folder's name only, not where it lies on this machine."""
         depth = "of the sequence" if self.network is None else "predicted by FastDepth"
         return {"kind": "recorded sequence", "name": self.path.name, "depth": depth}
 
-    def _open(self) -> Sequence:
+    def _open(self) -> FrameSequence:
         from ufmstar_torch.eval.sequences import open_sequence
 
         return open_sequence(self.path)
@@ -138,10 +138,9 @@ def _square(depth: Tensor, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDe
     return PosedDepth(preprocess.apply_depth(depth), T_world_cam, preprocess.apply_intrinsics(K, *depth.shape[-2:]))
 
 
-def _predicted(network: FastDepth, image: np.ndarray, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDepth:
+def _predicted(network: FastDepth, image: Tensor, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDepth:
     """FastDepth at the resolution it was trained for, enlarged linearly."""
-    rgb = torch.from_numpy(image).permute(2, 0, 1)[None]
-    x, K = network.preprocess(rgb, K)
+    x, K = network.preprocess(image, K)
     with torch.inference_mode():
         depth = network(x).depth
     enlarged = Preprocess(size=(size, size), antialias=False)

@@ -25,8 +25,7 @@ from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, Race, inferen
 from ufmstar_torch.eval.bench.windows import Work, repeated, run_windows
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
-from ufmstar_torch.eval.sequences.frame import Sequence as PosedSequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 
 FORMAT = 1
 
@@ -68,7 +67,7 @@ class Plan:
 def measure(
     rows: Sequence[Row],
     networks: Mapping[str, Contender],
-    sequence: PosedSequence,
+    sequence: FrameSequence,
     *,
     device: torch.device | str = "cpu",
     multiview_device: torch.device | str = "cpu",
@@ -140,7 +139,7 @@ def _obstacle(row: Row, networks: Mapping[str, Contender]) -> str | None:
     return None
 
 
-def _frames(sequence: PosedSequence, plan: Plan) -> tuple[list[Frame], int]:
+def _frames(sequence: FrameSequence, plan: Plan) -> tuple[list[Frame], int]:
     """The first frames that can be read, and how many could not.
 
     Raises:

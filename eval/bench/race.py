@@ -18,7 +18,8 @@ from ufmstar_torch.eval.bench.contender import Contender
 from ufmstar_torch.eval.bench.multiview import Inputs, Multiview, StagedUfMStar, synchronize, waited
 from ufmstar_torch.eval.methods.method import ALONE, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.images import image_tensor
 
 DEPTH, ONCE, EVERY, MULTIVIEW = "depth", "once", "every", "multiview"
 # Clocks: what passes, and what this process computes (over all its threads), which other work does not stretch.
@@ -129,9 +130,7 @@ def prepare(contender: Contender, frame: Frame, device: torch.device) -> Prepare
     Raises:
         FrameError: it has none.
     """
-    if frame.image is None:
-        raise FrameError(frame.name, "no image")
-    image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].to(device)
+    image = image_tensor(frame).to(device)
     x, K = contender.preprocess(image, torch.from_numpy(frame.intrinsics)[None].to(device))
     return Prepared(x, torch.from_numpy(frame.T_world_cam)[None], K)
 

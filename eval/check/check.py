@@ -13,7 +13,7 @@ import numpy as np
 
 from ufmstar_torch.eval.check.alignment import Alignment, alignment
 from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 
 AS_GIVEN = CONVENTIONS[OURS].told
 _READINGS = {convention.told: convention.convert for convention in CONVENTIONS.values()}
@@ -84,7 +84,7 @@ class _Pair:
     depth_b: np.ndarray
 
 
-def check_sequence(sequence: Sequence, pairs: int = 8) -> SequenceCheck:
+def check_sequence(sequence: FrameSequence, pairs: int = 8) -> SequenceCheck:
     """Checks pose convention, depth scale and registration on evenly spaced pairs of frames.
 
     Of a sequence without poses only the registration is checked; there are no pairs then, and ``error`` is NaN.
@@ -157,7 +157,7 @@ def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> floa
     return float(np.median(np.abs(np.log(z[inside][valid] / found[valid]))))
 
 
-def _load_pairs(sequence: Sequence, gap: int, count: int, unreadable: list[str]) -> list[_Pair]:
+def _load_pairs(sequence: FrameSequence, gap: int, count: int, unreadable: list[str]) -> list[_Pair]:
     if len(sequence) <= gap:
         return []
     found = []
@@ -168,7 +168,7 @@ def _load_pairs(sequence: Sequence, gap: int, count: int, unreadable: list[str])
     return found
 
 
-def _read(sequence: Sequence, index: int, unreadable: list[str]) -> tuple[Frame, np.ndarray] | None:
+def _read(sequence: FrameSequence, index: int, unreadable: list[str]) -> tuple[Frame, np.ndarray] | None:
     """A frame and its depth, if it has any; one that cannot be decoded is noted."""
     try:
         frame = sequence[index]
@@ -193,7 +193,7 @@ def _errors(pairs: list[_Pair], reading: str, scales: np.ndarray) -> np.ndarray:
     return np.median([[warp_error(pair, reading, scale) for scale in scales] for pair in pairs], axis=0)
 
 
-def _registration(sequence: Sequence, unreadable: list[str]) -> Alignment | None:
+def _registration(sequence: FrameSequence, unreadable: list[str]) -> Alignment | None:
     """Alignment of depth and image, where the depth maps claim to lie on the images."""
     if sequence.depth_intrinsics is not None:
         return None

@@ -13,7 +13,7 @@ import numpy as np
 
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
 from ufmstar_torch.eval.sequences.conventions import OURS
-from ufmstar_torch.eval.sequences.frame import FrameError, Sequence
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.layout import open_sequence
 
 _SAMPLED = 12  # frames whose depth is looked at for its range
@@ -129,7 +129,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
 
 
 def _verdict(
-    sequence: Sequence, path: str | Path, pairs: int, options: Mapping[str, Any]
+    sequence: FrameSequence, path: str | Path, pairs: int, options: Mapping[str, Any]
 ) -> tuple[list[str], list[str], list[str], dict[str, Any]]:
     """Problems, remedies, what is undecided, and the check's figures."""
     problems: list[str] = []
@@ -150,7 +150,7 @@ def _verdict(
     return problems, remedies, list(found.undecided), {**_measured(found), "read": read, "unreadable": broken}
 
 
-def _remedies(found: SequenceCheck, sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
+def _remedies(found: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
     remedies = []
     if found.convention != OURS:
         given = options.get("poses", OURS)
@@ -170,7 +170,7 @@ def _remedies(found: SequenceCheck, sequence: Sequence, path: str | Path, option
     return remedies
 
 
-def _scale_remedy(factor: float, sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> str:
+def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> str:
     """What brings depth and positions to one scale: depth times ``factor``."""
     positions = f"divide the positions of the poses by {factor:.4g}"
     if options.get("trajectory") is not None:
@@ -187,7 +187,7 @@ def _scale_remedy(factor: float, sequence: Sequence, path: str | Path, options: 
     return f"--depth-scale {scale:.4g}"
 
 
-def _metres_per_unit(sequence: Sequence, path: str | Path, options: Mapping[str, Any]) -> float | None:
+def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> float | None:
     """The scale with which depth files are read now; None where it has no say (a laser, a rendered tour)."""
     if sequence.layout == "tour" or (sequence.layout == "kitti360" and options.get("depth") is None):
         return None
@@ -218,7 +218,7 @@ def _measured(found: SequenceCheck) -> dict[str, Any]:
     }
 
 
-def _read_frames(sequence: Sequence) -> tuple[int, list[str]]:
+def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
     """How many frames were read, and what was said of those that cannot be; a rendered frame always can."""
     if sequence.layout == "tour":
         return 0, []
@@ -232,7 +232,7 @@ def _read_frames(sequence: Sequence) -> tuple[int, list[str]]:
     return len(chosen), broken
 
 
-def _depth_statistics(sequence: Sequence) -> tuple[tuple[float, ...] | None, float]:
+def _depth_statistics(sequence: FrameSequence) -> tuple[tuple[float, ...] | None, float]:
     """Quantiles of depth [m] and the share of valid pixels, over evenly spaced frames."""
     with_depth = [entry for entry in sequence.entries if entry.load_depth is not None]
     values, pixels = [], 0
@@ -251,7 +251,7 @@ def _depth_statistics(sequence: Sequence) -> tuple[tuple[float, ...] | None, flo
     return tuple(float(q) for q in np.quantile(found, _QUANTILES)), found.size / pixels
 
 
-def _walked(sequence: Sequence) -> float:
+def _walked(sequence: FrameSequence) -> float:
     positions = np.array([entry.T_world_cam[:3, 3] for entry in sequence.entries])
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence as Words
+from collections.abc import Sequence
 from typing import Any
 
 from ufmstar_torch.eval.commands.run_options import parse_intrinsics
@@ -53,7 +53,7 @@ def data_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parse_data(arguments: Words[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
+def parse_data(arguments: Sequence[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
     """The command's own options, and those that were given for ``open_sequence``.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Items
+from collections.abc import Sequence
 
 from ufmstar_torch.eval.check.data_check import DataReport
 
@@ -39,7 +39,7 @@ def line(report: DataReport) -> str:
     return f"PROBLEM  {report.name}: {' '.join('; '.join(report.problems).split())}{remedy}"
 
 
-def lines(reports: Items[DataReport]) -> str:
+def lines(reports: Sequence[DataReport]) -> str:
     """Several sequences, a line each, and how many are fine."""
     fine = sum(report.ok for report in reports)
     return "\n".join([*map(line, reports), f"{fine} of {len(reports)} sequences are fine"])

@@ -30,7 +30,7 @@ from ufmstar_torch.eval.report.demo_report import names
 from ufmstar_torch.eval.results.demo_folder import PROGRAM, SUMMARY, DemoError, prepare
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.summary import versions
-from ufmstar_torch.eval.sequences.frame import Frame, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
 from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
@@ -183,7 +183,7 @@ def _walk(
     return tally, [panels[row] for row in rows]
 
 
-def _render(sequence: Sequence, device: torch.device, progress: Callable[[Progress], None]) -> list[Frame]:
+def _render(sequence: FrameSequence, device: torch.device, progress: Callable[[Progress], None]) -> list[Frame]:
     """All frames. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the very first run."""
     progress(Progress("rooms", 0, len(sequence), None, 0))
     frames = [sequence[index] for index in range(2)]

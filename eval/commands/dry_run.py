@@ -9,8 +9,7 @@ from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.results.run_suite import EvalJob
 from ufmstar_torch.eval.results.worklist import Shard
-from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.frame import Sequence as Frames
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 
 _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file systems allot
 
@@ -64,7 +63,7 @@ def _cached(rows: Sequence[Row], networks: Mapping[str, BaseNetwork], frames: in
     return sum(predictions(own, networks[base], frames) * sample[base] for base, own in by_base.items())
 
 
-def _bytes_per_file(sequence: Frames, networks: Mapping[str, BaseNetwork]) -> dict[str, int] | None:
+def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, BaseNetwork]) -> dict[str, int] | None:
     """By base, from the first frame that can be read; None if none can."""
     for index in range(len(sequence)):
         try:

@@ -23,7 +23,7 @@ from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.results.summary import FAILED, FINISHED, INTERRUPTED, NEAR_ZERO, Ending, summarise
 from ufmstar_torch.eval.results.writers import WrittenFrame
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frame import FRAME_FAULTS
 from ufmstar_torch.pipeline import UncertainPrediction
@@ -46,7 +46,7 @@ class Job:
         sheet: whether to make contact_sheet.png.
     """
 
-    sequence: Sequence
+    sequence: FrameSequence
     indices: range
     source: Source
     settings: Mapping[str, Any]

@@ -13,7 +13,7 @@ from ufmstar_torch.eval.commands.run_options import OWN_DEPTH, check_options, pa
 from ufmstar_torch.eval.engine.run_anchors import require_images
 from ufmstar_torch.eval.engine.run_maps import folder_source, own_depth_source
 from ufmstar_torch.eval.engine.run_source import Source, network_source
-from ufmstar_torch.eval.sequences import Sequence, open_sequence
+from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
 
 # How a run is carried out; the rest of the options says what is run.
 _CONDUCT = ("resume", "overwrite", "debug", "config")
@@ -60,7 +60,7 @@ def _device(name: str) -> str:
     return name
 
 
-def _sequence(options: Mapping[str, Any]) -> Sequence:
+def _sequence(options: Mapping[str, Any]) -> FrameSequence:
     sequence = open_sequence(
         options["sequence"],
         options["layout"],
@@ -79,7 +79,7 @@ def _sequence(options: Mapping[str, Any]) -> Sequence:
     return sequence
 
 
-def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: Sequence, device: str) -> Source:
+def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameSequence, device: str) -> Source:
     size = parse_size(options["size"])
     if options["model"] is not None:
         return network_source(

@@ -16,7 +16,8 @@ from torch import Tensor
 from ufmstar_torch.eval.engine.run_clock import Stopwatch
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
 from ufmstar_torch.prediction import DepthPrediction
@@ -108,9 +109,7 @@ class Comparison:
             FrameError: it has no image.
             ValueError: a network states no variance of its own.
         """
-        if frame.image is None:
-            raise FrameError(frame.name, "no image")
-        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].to(self._device)
+        image = image_tensor(frame).to(self._device)
         pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
         turn = self._frames % len(self._members)
         with torch.no_grad():

@@ -8,8 +8,7 @@ where it predicts something. How many it leaves out is among its figures (``left
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +22,7 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
-from ufmstar_torch.eval.sequences.frame import Sequence
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 
 
 class SequenceError(Exception):
@@ -63,8 +62,8 @@ class RowResult:
 
 
 def evaluate_sequence(
-    sequence: Sequence,
-    rows: SequenceOf[Row],
+    sequence: FrameSequence,
+    rows: Sequence[Row],
     networks: Mapping[str, BaseNetwork],
     *,
     cache: PredictionCache,
@@ -121,7 +120,7 @@ def evaluate_sequence(
     return [_result(run, sequence) for run in frames.runs]
 
 
-def _check(rows: SequenceOf[Row], networks: Mapping[str, BaseNetwork], confident: float) -> None:
+def _check(rows: Sequence[Row], networks: Mapping[str, BaseNetwork], confident: float) -> None:
     """Raises ValueError for what ``evaluate_sequence`` cannot do, whatever the sequence."""
     if not rows or len({row.slug for row in rows}) < len(rows):
         raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
@@ -132,7 +131,7 @@ def _check(rows: SequenceOf[Row], networks: Mapping[str, BaseNetwork], confident
         raise ValueError(f"confident must be a share in (0, 1], got {confident}")
 
 
-def _result(run: RowRun, sequence: Sequence) -> RowResult:
+def _result(run: RowRun, sequence: FrameSequence) -> RowResult:
     """What a row leaves behind.
 
     Raises:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from collections.abc import Sequence as SequenceOf
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
 from ufmstar_torch.eval.results.cache import PredictionCache, PredictionKey, frame_digest, sequence_digest
 from ufmstar_torch.eval.results.examples import FinishedFrame
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.frame import FRAME_FAULTS, check_frame
 
@@ -49,8 +48,8 @@ class FramePass:
 
     def __init__(
         self,
-        sequence: Sequence,
-        rows: SequenceOf[Row],
+        sequence: FrameSequence,
+        rows: Sequence[Row],
         networks: Mapping[str, BaseNetwork],
         cache: PredictionCache,
         device: torch.device,

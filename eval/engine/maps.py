@@ -16,7 +16,7 @@ from torch import nn
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Sequence, Size
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
 
@@ -89,7 +89,7 @@ class MapSource:
 
 
 def folder_source(
-    sequence: Sequence,
+    sequence: FrameSequence,
     folder: str | Path,
     *,
     variance: str | Path | None = None,
@@ -138,7 +138,7 @@ def folder_source(
     return MapSource(read, identity, size=size)
 
 
-def _check_first(sequence: Sequence, maps: DepthMaps, any_shape: bool) -> None:
+def _check_first(sequence: FrameSequence, maps: DepthMaps, any_shape: bool) -> None:
     """Raises ValueError at once where the first map has another shape than the images, as then all have."""
     try:
         depth, _ = maps[0]
@@ -150,7 +150,7 @@ def _check_first(sequence: Sequence, maps: DepthMaps, any_shape: bool) -> None:
         raise ValueError(f"{maps.depth_files[0]}: {_cropped(sequence, depth)}") from error
 
 
-def _cropped(sequence: Sequence, depth: np.ndarray) -> str:
+def _cropped(sequence: FrameSequence, depth: np.ndarray) -> str:
     height, width = sequence.image_size or (0, 0)
     return (
         f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the whole "

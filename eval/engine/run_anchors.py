@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.eval.sequences.frame import Frame, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.step import FrameStatistics
 
 # Of the tensors that a source keeps, those of its tracker.
@@ -91,7 +91,7 @@ def why_none(tracked: int, found: int, usable: int) -> str:
     return "none lies on a pixel with a depth" if not usable else "they contradict each other"
 
 
-def require_images(sequence: Sequence) -> None:
+def require_images(sequence: FrameSequence) -> None:
     """What tracking needs.
 
     Raises:

@@ -16,7 +16,8 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.run_anchors import RunAnchors, of_tracker
 from ufmstar_torch.eval.engine.run_clock import Stopwatch
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.dropout import SAMPLES, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.load import DIRECTORIES, load_network
@@ -109,9 +110,7 @@ class NetworkSource(Source):
 
     def predict(self, frame: Frame) -> UncertainPrediction:
         """See :meth:`Source.predict`."""
-        if frame.image is None:
-            raise FrameError(frame.name, "no image")
-        image = torch.from_numpy(frame.image).permute(2, 0, 1)[None].to(self.device)
+        image = image_tensor(frame).to(self.device)
         self._dropout.manual_seed(frame.index)  # of the frame alone: a resumed run draws the same
         # Pose and intrinsics stay on the host, where UfM* checks them without waiting for a device.
         pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]

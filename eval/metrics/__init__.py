@@ -5,8 +5,9 @@ The names below load torchmetrics (seconds) when they are first used, not when t
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.metrics.accuracy import RMSE as RMSE
@@ -21,28 +22,5 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.metrics.ranking import SpearmanCorrelation as SpearmanCorrelation
     from ufmstar_torch.eval.metrics.sequence import SequenceMetrics as SequenceMetrics
     from ufmstar_torch.eval.metrics.sequence import mean_and_ci as mean_and_ci
-
-_HOME = {
-    "AbsRel": "accuracy",
-    "Delta1": "accuracy",
-    "ECEDelta": "calibration",
-    "ECEQuantile": "calibration",
-    "EntropyHistogram": "likelihood",
-    "NLL": "likelihood",
-    "NLLByError": "ranking",
-    "RMSE": "accuracy",
-    "SequenceMetrics": "sequence",
-    "Sparsification": "ranking",
-    "SpearmanCorrelation": "ranking",
-    "mean_and_ci": "sequence",
-}
-
-
-def __getattr__(name: str) -> object:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(_HOME)
+else:
+    __getattr__, __dir__ = lazy_names(__name__)

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.plots import FramePanel, PanelScales, contact_sheet, fit_scales
 from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
 from ufmstar_torch.eval.results.writers import read_frame
-from ufmstar_torch.eval.sequences import Sequence as Frames
+from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
@@ -42,7 +42,7 @@ class Finished:
     """
 
     out: Path
-    frames: Frames
+    frames: FrameSequence
     records: Sequence[Mapping[str, Any]]
     with_error: bool
 

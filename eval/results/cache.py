@@ -16,7 +16,7 @@ import torch
 
 from ufmstar_torch.eval.engine.predicted import Predicted
 from ufmstar_torch.eval.results.files import write_atomic
-from ufmstar_torch.eval.sequences.frame import Frame, Sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 
 _DIGEST = 32  # bytes of a SHA-256
 _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
@@ -126,7 +126,7 @@ class PredictionCache:
             raise CacheError(_cannot(self.folder, error)) from error
 
 
-def sequence_digest(sequence: Sequence) -> str:
+def sequence_digest(sequence: FrameSequence) -> str:
     """Hex digest of a sequence's name, layout, camera and frames' names."""
     told = (sequence.name, sequence.layout, sequence.image_size, sequence.intrinsics.tolist(), sequence.names)
     return hashlib.sha256(repr(told).encode()).hexdigest()

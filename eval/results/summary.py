@@ -12,7 +12,7 @@ from statistics import mean, median
 from typing import Any
 
 from ufmstar_torch.eval.engine.judge import ALONE, UFM
-from ufmstar_torch.eval.sequences import Sequence as Frames
+from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
@@ -45,7 +45,7 @@ def summarise(
     *,
     ending: Ending,
     settings: Mapping[str, Any],
-    sequence: Frames,
+    sequence: FrameSequence,
     selected: int,
     source: Mapping[str, Any],
     records: Sequence[Mapping[str, Any]],
@@ -103,7 +103,7 @@ def versions() -> dict[str, str | None]:
     return {**found, "python": platform.python_version(), "platform": platform.platform()}
 
 
-def _sequence(sequence: Frames) -> dict[str, Any]:
+def _sequence(sequence: FrameSequence) -> dict[str, Any]:
     return {
         "name": sequence.name,
         "layout": sequence.layout,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.results.cache import sequence_digest
-from ufmstar_torch.eval.sequences.frame import Sequence as Frames
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 
 TOUR = "tour"
 _ROOT = re.compile(r"(?P<dataset>[A-Za-z0-9][A-Za-z0-9._-]*)=(?P<path>.+)")
@@ -48,7 +48,7 @@ class WorkItem:
         """For people."""
         return f"{self.dataset}/{self.sequence}"
 
-    def open(self) -> Frames:
+    def open(self) -> FrameSequence:
         """Open it.
 
         Raises:
@@ -149,7 +149,7 @@ def read_names(file: Path) -> list[str]:
     return found
 
 
-def content_digest(sequence: Frames) -> str:
+def content_digest(sequence: FrameSequence) -> str:
     """Hex digest of what can be told of a sequence without decoding it: frames, cameras and poses."""
     digest = hashlib.sha256(sequence_digest(sequence).encode())
     digest.update(

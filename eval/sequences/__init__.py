@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.conventions import CONVENTIONS as CONVENTIONS
@@ -12,25 +13,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.find import find_sequences as find_sequences
     from ufmstar_torch.eval.sequences.frame import Frame as Frame
     from ufmstar_torch.eval.sequences.frame import FrameError as FrameError
-    from ufmstar_torch.eval.sequences.frame import Sequence as Sequence
+    from ufmstar_torch.eval.sequences.frame import FrameSequence as FrameSequence
     from ufmstar_torch.eval.sequences.frame import Skipped as Skipped
     from ufmstar_torch.eval.sequences.layout import open_sequence as open_sequence
-
-_HOME = {
-    "CONVENTIONS": "conventions",
-    "DepthFolder": "depth_folder",
-    "Found": "find",
-    "Frame": "frame",
-    "FrameError": "frame",
-    "Sequence": "frame",
-    "Skipped": "frame",
-    "find_sequences": "find",
-    "open_sequence": "layout",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Imports a name's module when it is first asked for (PEP 562): Pillow and SciPy are not free."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+else:
+    __getattr__, __dir__ = lazy_names(__name__)

@@ -7,7 +7,7 @@ no partner is skipped and counted; nothing is moved to the next image.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence as Items
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +31,7 @@ Poses = list[np.ndarray | None]
 UNKNOWN = np.full((4, 4), np.nan)
 
 
-def attach(names: Items[str], times: np.ndarray | None, trajectory: Trajectory, options: Options) -> Poses:
+def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options) -> Poses:
     """The pose of each image, None where the trajectory has none.
 
     Without timestamps in the trajectory, pose i belongs to the i-th image. With them, the pose is interpolated at the
@@ -73,7 +73,7 @@ def attach(names: Items[str], times: np.ndarray | None, trajectory: Trajectory, 
 
 
 def _comparable(
-    names: Items[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
+    names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
 ) -> tuple[np.ndarray, Trajectory]:
     """Times of images and poses in the same unit: seconds or frame numbers.
 
@@ -96,7 +96,7 @@ def _comparable(
     return (times if numbers is None else numbers), trajectory
 
 
-def _as_frame_numbers(names: Items[str], stamps: np.ndarray, timed: bool) -> np.ndarray | None:
+def _as_frame_numbers(names: Sequence[str], stamps: np.ndarray, timed: bool) -> np.ndarray | None:
     """[N] the images' numbers, if the trajectory's timestamps are frame numbers.
 
     ``timed`` images must have a pose each, most of them, since 0, 1, 2, ... could be seconds as well.
@@ -109,7 +109,7 @@ def _as_frame_numbers(names: Items[str], stamps: np.ndarray, timed: bool) -> np.
 
 
 def attach_given(
-    frames: Items[Entry | Skipped], root: Path, options: Options, times: np.ndarray | None = None
+    frames: Sequence[Entry | Skipped], root: Path, options: Options, times: np.ndarray | None = None
 ) -> list[Entry | Skipped]:
     """A layout's frames with the poses of ``options.trajectory`` instead of their own; as they are without one.
 
@@ -150,7 +150,7 @@ def no_pose(options: Options) -> str:
     return f"no pose within {options.max_pose_gap:g} s around the image"
 
 
-def frame_numbers(names: Items[str]) -> np.ndarray | None:
+def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
     """[N] the one whole number in each name, ``frame-000012`` being 12; None where a name has none or several."""
     found = [re.findall(r"\d+", name) for name in names]
     if not found or any(len(groups) != 1 for groups in found):
@@ -158,7 +158,7 @@ def frame_numbers(names: Items[str]) -> np.ndarray | None:
     return np.array([float(groups[0]) for groups in found])
 
 
-def stem_times(names: Items[str]) -> np.ndarray | None:
+def stem_times(names: Sequence[str]) -> np.ndarray | None:
     """[N] names as timestamps [s], also those in nanoseconds or microseconds; None where one is no number."""
     try:
         times = np.array([float(name) for name in names])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import Sequence
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 
 # Columns are our camera axes in a camera frame with x forward, y right, z down, or x right, y up, z backward.
 _NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -38,7 +38,7 @@ CONVENTIONS = {
 }
 
 
-def convert_poses(sequence: Sequence, convention: str) -> Sequence:
+def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
     """The sequence with its poses, which were written so, as camera-to-world ones with our axes.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Names
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,7 +92,7 @@ class DepthFolder:
     def __len__(self) -> int:
         return len(self.files)
 
-    def for_frames(self, names: Names[str], names_on_disk: Names[str] = ()) -> DepthMaps:
+    def for_frames(self, names: Sequence[str], names_on_disk: Sequence[str] = ()) -> DepthMaps:
         """The maps of a sequence's frames: by stem, or by the numbers in the names, or else in sorted order.
 
         Args:
@@ -121,7 +121,7 @@ def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
     return files
 
 
-def _paired(folder: Path, files: list[Path], names: Names[str], names_on_disk: Names[str]) -> tuple[Path, ...]:
+def _paired(folder: Path, files: list[Path], names: Sequence[str], names_on_disk: Sequence[str]) -> tuple[Path, ...]:
     pairs = pair_by_name(names, files)
     missing = [name for name in names if name not in pairs]
     if not missing:

@@ -38,7 +38,7 @@ def parse_size(text: str | None, option: str = "--size") -> Size | None:
 class FrameError(Exception):
     """A frame's file is missing, truncated, corrupt, or not of the sequence's size; found when decoding.
 
-    Callers may count such frames and go on (:meth:`Sequence.readable` does).
+    Callers may count such frames and go on (:meth:`FrameSequence.readable` does).
 
     Attributes:
         path: the file, or the frame's name where the file decodes but does not belong to the sequence.
@@ -103,7 +103,7 @@ class Entry:
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class FrameSequence:
     """Posed frames, decoded lazily. Build one with :func:`make_sequence`.
 
     Attributes:
@@ -188,7 +188,7 @@ def make_sequence(
     depth_intrinsics: np.ndarray | None = None,
     depth_size: Size | None = None,
     posed: bool = True,
-) -> Sequence:
+) -> FrameSequence:
     """Sorts frames into usable and skipped and checks that the intrinsics fit the sizes (H, W); ``posed`` as there.
 
     Raises:
@@ -209,7 +209,9 @@ def make_sequence(
     check_intrinsics("intrinsics", intrinsics, image_size)
     if depth_intrinsics is not None:
         check_intrinsics("depth_intrinsics", depth_intrinsics, depth_size)
-    return Sequence(name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed)
+    return FrameSequence(
+        name, layout, entries, intrinsics, image_size, depth_intrinsics, depth_size, skipped, names, posed
+    )
 
 
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:

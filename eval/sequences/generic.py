@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach, no_pose, stem_times
-from ufmstar_torch.eval.sequences.frame import Entry, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
     IMAGE_SUFFIXES,
@@ -54,7 +54,7 @@ def detect(path: Path) -> bool:
     return has_trajectory and bool(_image_sources(path))
 
 
-def open_generic(path: Path, options: Options) -> Sequence:
+def open_generic(path: Path, options: Options) -> FrameSequence:
     """Opens images or a video with a trajectory.
 
     Without timestamps in the trajectory, pose i belongs to the i-th image (numbers sorted by value).

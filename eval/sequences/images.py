@@ -11,16 +11,14 @@ import zipfile
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
+import torch
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.exr import read_exr
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Loader, Size
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
@@ -29,19 +27,6 @@ _BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
 _MILLIMETRE = 1e-3
-
-
-def image_tensor(frame: Frame) -> Tensor:
-    """[1, 3, H, W] uint8 RGB of a frame's image, as networks' preprocessing takes it.
-
-    Raises:
-        FrameError: the frame has no image.
-    """
-    import torch
-
-    if frame.image is None:
-        raise FrameError(frame.name, "no image")
-    return torch.from_numpy(frame.image).permute(2, 0, 1)[None]
 
 
 def read_color(path: str | Path) -> np.ndarray:
@@ -112,6 +97,17 @@ def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
     if values.ndim != 2 or not (np.issubdtype(values.dtype, np.number) and np.isrealobj(values)):
         raise FrameError(path, f"expected a map [H, W] of numbers, got {values.dtype} {list(values.shape)}")
     return values, scale
+
+
+def image_tensor(frame: Frame) -> torch.Tensor:
+    """The frame's image [1, 3, H, W] uint8 RGB, as a network's ``preprocess`` takes it.
+
+    Raises:
+        FrameError: the frame has no image.
+    """
+    if frame.image is None:
+        raise FrameError(frame.name, "no image")
+    return torch.from_numpy(frame.image).permute(2, 0, 1)[None]
 
 
 def image_size(path: str | Path) -> Size:

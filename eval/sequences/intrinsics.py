@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Numbers
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from ufmstar_torch.eval.sequences.frame import Size
 from ufmstar_torch.eval.sequences.poses import read_matrix
 
 # A file's path, a matrix [3, 3] (or [4, 4], as ScanNet writes it), or the numbers fx, fy, cx, cy [px].
-IntrinsicsLike = str | Path | np.ndarray | Numbers[float]
+IntrinsicsLike = str | Path | np.ndarray | Sequence[float]
 
 # Sizes whose aspect ratios differ by more than this were cropped, not resized.
 _ASPECT_TOLERANCE = 0.02

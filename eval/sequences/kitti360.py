@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
-from ufmstar_torch.eval.sequences.frame import Entry, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
     IMAGE_SUFFIXES,
@@ -78,7 +78,7 @@ def drives(root: Path) -> list[Path]:
     return sorted(d for d in (root / _RAW).iterdir() if any((d / camera / "data_rect").is_dir() for camera in _CAMERAS))
 
 
-def open_kitti360(path: Path, options: Options) -> Sequence:
+def open_kitti360(path: Path, options: Options) -> FrameSequence:
     """Opens a drive: ``path`` is the root (with the option ``drive``, unless there is only one), or the drive's folder
     (its first rectified camera), or the camera's.
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences import generic, kitti360, nyu, scannet, sens, seven_scenes, tartanair, tum
 from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS, convert_poses
-from ufmstar_torch.eval.sequences.frame import Sequence
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike
 from ufmstar_torch.eval.sequences.options import Options
 
-_READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, Options], Sequence], str]] = {
+_READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, Options], FrameSequence], str]] = {
     "tum": (tum.detect, tum.open_tum, tum.LOOKED_FOR),
     "7scenes": (seven_scenes.detect, seven_scenes.open_seven_scenes, seven_scenes.LOOKED_FOR),
     "scannet": (scannet.detect, scannet.open_scannet, scannet.LOOKED_FOR),
@@ -47,7 +47,7 @@ def open_sequence(
     drive: str | int | None = None,
     scans: int | None = None,
     poses: str = OURS,
-) -> Sequence:
+) -> FrameSequence:
     """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
 
     Args:
@@ -120,7 +120,7 @@ def open_sequence(
     return convert_poses(open_reader(path, options), poses)
 
 
-def _open_tour(name: str, layout: str, options: Options) -> Sequence:
+def _open_tour(name: str, layout: str, options: Options) -> FrameSequence:
     """A tour, which nothing can be said about but in its name.
 
     Raises:

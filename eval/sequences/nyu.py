@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, Sequence, Size, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, make_sequence
 from ufmstar_torch.eval.sequences.images import natural_key
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options
@@ -46,7 +46,7 @@ def part_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*/*.h5"), key=lambda path: (path.parent.name, natural_key(path)))
 
 
-def open_nyu(path: Path, options: Options) -> Sequence:
+def open_nyu(path: Path, options: Options) -> FrameSequence:
     """Opens a part, or a scene of it, as a sequence without poses; names are ``SCENE__NUMBER``.
 
     Raises:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from collections.abc import Sequence as Names
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 
-def pair_by_name(names: Names[str], files: Iterable[Path]) -> dict[str, Path]:
+def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]:
     """The file of each frame name, where there is one.
 
     A file belongs to a name if their stems are equal, or else if all numbers in them are

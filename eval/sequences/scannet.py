@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
-from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Size, Skipped, fits, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
     common_size,
@@ -34,7 +34,7 @@ def detect(path: Path) -> bool:
     return all((path / folder).is_dir() for folder in ("color", "pose", "intrinsic"))
 
 
-def open_scannet(path: Path, options: Options) -> Sequence:
+def open_scannet(path: Path, options: Options) -> FrameSequence:
     """Opens a SensReader export; depth comes as it is, with ``depth_intrinsics``.
 
     Exports with resized images keep the original ``intrinsic_color.txt``: intrinsics that fit 1296x968

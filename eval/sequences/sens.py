@@ -21,7 +21,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences import scannet
 from ufmstar_torch.eval.sequences.attach import attach_given
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import decode_color
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
 from ufmstar_torch.eval.sequences.options import Options
@@ -81,7 +81,7 @@ def detect(path: Path) -> bool:
     return path.suffix.lower() == _SUFFIX and path.is_file()
 
 
-def open_sens(path: Path, options: Options) -> Sequence:
+def open_sens(path: Path, options: Options) -> FrameSequence:
     """Opens a ``.sens`` file; depth comes as it is, with ``depth_intrinsics``, as from a SensReader export.
 
     Frames are called by their number. In a truncated file, those before the break are used and the others skipped.

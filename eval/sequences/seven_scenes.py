@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, Loader, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import common_size, first_image_size, natural_key, read_color, read_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options
@@ -45,7 +45,7 @@ def approximate_T_color_depth() -> np.ndarray:
     return T
 
 
-def open_seven_scenes(path: Path, options: Options) -> Sequence:
+def open_seven_scenes(path: Path, options: Options) -> FrameSequence:
     """Opens a 7-Scenes sequence folder (``seq-NN``).
 
     With ``register`` (the default) depth is warped into the colour camera, and ``T_world_cam`` is the

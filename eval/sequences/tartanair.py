@@ -13,7 +13,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach_given
 from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
-from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
     common_size,
@@ -36,7 +36,7 @@ def detect(path: Path) -> bool:
     return bool(trajectory_folders(path))
 
 
-def open_tartanair(path: Path, options: Options) -> Sequence:
+def open_tartanair(path: Path, options: Options) -> FrameSequence:
     """Opens a TartanAir trajectory (left camera). A given ``trajectory`` has our axes already.
 
     Raises:

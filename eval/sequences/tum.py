@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach, no_pose
-from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import common_size, depth_loader, first_image_size, read_color
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options, resolve
@@ -35,7 +35,7 @@ def detect(path: Path) -> bool:
     return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
 
 
-def open_tum(path: Path, options: Options) -> Sequence:
+def open_tum(path: Path, options: Options) -> FrameSequence:
     """Opens a TUM RGB-D sequence.
 
     A colour image is skipped where it is missing on disk or no pose is known at its time (the samples

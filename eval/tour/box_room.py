@@ -21,7 +21,7 @@ _IN_FRONT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class BoxRoom:
     """Axis-aligned boxes inside an axis-aligned box, seen from within.
 
     Attributes:
@@ -33,7 +33,7 @@ class Room:
     boxes: Array
 
     @classmethod
-    def furnished(cls, boxes: int = 60, seed: int = 0) -> Room:
+    def furnished(cls, boxes: int = 60, seed: int = 0) -> BoxRoom:
         """A room of 7 x 2.8 x 7 m whose floor and walls are lined with boxes; the middle stays free to walk.
 
         Raises:
@@ -87,7 +87,7 @@ def walk(frames: int, period: int = 100) -> Iterator[Array]:
         yield look(position, turn + 0.3 * np.sin(0.37 * turn), 0.12 + 0.08 * np.sin(0.71 * turn))
 
 
-def render(room: Room, T_world_cam: Array, K: Array, height: int, width: int) -> Array:
+def render(room: BoxRoom, T_world_cam: Array, K: Array, height: int, width: int) -> Array:
     """Exact depth [height, width] along the optical axis [m] of the room, from a camera inside it.
 
     Raises:

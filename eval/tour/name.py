@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ufmstar_torch.eval.sequences.frame import Sequence
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.tour.sequence import tour_sequence
 from ufmstar_torch.eval.tour.style import STYLES
 
@@ -13,7 +13,7 @@ PREFIX = "tour:"
 _FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path and sensor"
 
 
-def open_tour(name: str) -> Sequence:
+def open_tour(name: str) -> FrameSequence:
     """The tour of a name.
 
     Options: ``style`` (home, hall, mixed), ``frames``, ``size`` (HxW), ``fov`` (degrees), ``path`` (seed of the way)

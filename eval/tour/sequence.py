@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.sequences.frame import Entry, Sequence, Size, make_sequence
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, make_sequence
 from ufmstar_torch.eval.tour.box_room import intrinsics
 from ufmstar_torch.eval.tour.path import tour_path
 from ufmstar_torch.eval.tour.style import TourStyle
@@ -55,7 +55,7 @@ def tour_sequence(
     path_seed: int | None = None,
     sensor: bool = True,
     device: torch.device | str = "cpu",
-) -> Sequence:
+) -> FrameSequence:
     """A tour as a sequence; frames are rendered when they are asked for.
 
     Args:
@@ -87,7 +87,7 @@ def tour_sequence(
     return make_sequence(f"tour-{seed}-{named}", "tour", entries, K, image_size=size, depth_size=size)
 
 
-def export_tour(sequence: Sequence, folder: str | Path) -> Path:
+def export_tour(sequence: FrameSequence, folder: str | Path) -> Path:
     """Writes a sequence into the generic layout: images/, depth/ (float32 npy [m]), poses.txt and K.txt.
 
     Args:

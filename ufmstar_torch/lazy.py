@@ -1,0 +1,44 @@
+"""Packages whose public names are imported when they are first used (PEP 562), so that a bare import stays light.
+
+A package lists its names once, as the imports that type checkers and editors read::
+
+    if TYPE_CHECKING:
+        from ufmstar_torch.config import UfMStarConfig as UfMStarConfig
+    else:
+        __getattr__, __dir__ = lazy_names(__name__)
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+
+def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """``__getattr__`` and ``__dir__`` of a package for the names imported under ``if TYPE_CHECKING:`` in it.
+
+    Args:
+        package: the package's ``__name__``. Its source is parsed when the first name is looked up.
+    """
+
+    @cache
+    def origins() -> dict[str, tuple[str, str]]:
+        """Module and name there of every public name."""
+        import ast
+
+        spec = sys.modules[package].__spec__
+        source = spec.loader.get_source(package)  # type: ignore[union-attr]
+        blocks = (node.body for node in ast.parse(source).body if isinstance(node, ast.If))
+        imports = (node for body in blocks for node in body if isinstance(node, ast.ImportFrom))
+        return {alias.asname or alias.name: (str(i.module), alias.name) for i in imports for alias in i.names}
+
+    def getattr_(name: str) -> Any:
+        if name.startswith("__") or name not in origins():
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module, original = origins()[name]
+        return getattr(import_module(module), original)
+
+    return getattr_, lambda: sorted(origins())
