@@ -159,7 +159,7 @@ def job_from(options: Mapping[str, Any]) -> EvalJob:
         FileNotFoundError: something that was named does not exist.
         ValueError: options that do not go together, a base given twice, no row with a network, no sequence.
     """
-    from ufmstar_torch.eval.engine.networks import NetworkChoice
+    from ufmstar_torch.eval.engine.load import NetworkChoice
     from ufmstar_torch.eval.results.run_suite import EvalJob
     from ufmstar_torch.eval.results.worklist import find_work, read_names
 

@@ -10,10 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.eval.sequences.frame import Sequence as FrameSequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.pipeline import combine
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -88,6 +87,8 @@ class DepthSource(Protocol):
     """Where depth comes from: networks, or maps that exist already.
 
     Attributes:
+        label: as tables show it.
+        networks: that it runs; () of maps.
         identity: plain values that distinguish this source from another one.
         digest: the same as a hex digest, the source's name in a store; "" where nothing is stored.
         passes: inferences that all members (or samples) take.
@@ -96,6 +97,10 @@ class DepthSource(Protocol):
         is_truth: whether it is the sequence's own depth, which has no error.
     """
 
+    @property
+    def label(self) -> str: ...  # noqa: D102
+    @property
+    def networks(self) -> tuple[nn.Module, ...]: ...  # noqa: D102
     @property
     def identity(self) -> Mapping[str, Any]: ...  # noqa: D102
     @property

@@ -13,13 +13,15 @@ import torch
 
 from ufmstar_torch.eval.bench.benchmark_machine import hardware, versions
 from ufmstar_torch.eval.engine.confident import references
-from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, Stopped, evaluate_sequence
-from ufmstar_torch.eval.engine.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.results.cache import PredictionCache
-from ufmstar_torch.eval.results.examples import Examples
+from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.store import CACHE, EvalFolder
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
@@ -65,17 +67,17 @@ class EvalJob:
     examples: int = 3
     samples: int | None = None
 
-    def load(self, device: torch.device) -> dict[str, BaseNetwork]:
+    def load(self, device: torch.device) -> dict[str, DepthSource]:
         """The networks that the rows need.
 
         Raises:
-            FileNotFoundError, ValueError, ImportError: see ``BaseNetwork``.
+            FileNotFoundError, ValueError, ImportError: see ``NetworkChoice.load``.
         """
         passes = {} if self.samples is None else {"samples": self.samples}
         needed = [self.networks[base] for base in self.suite.bases]
-        return {choice.base: BaseNetwork(choice, device, **passes) for choice in needed}
+        return {choice.base: choice.load(device, **passes) for choice in needed}
 
-    def about(self, networks: Mapping[str, BaseNetwork]) -> dict[str, Any]:
+    def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """eval.json."""
         suite, f = self.suite, self.frames
         opening = {name: value for item in self.items for name, value in item.opening}
@@ -125,7 +127,7 @@ class Conduct:
 def run_job(
     job: EvalJob,
     folder: EvalFolder,
-    networks: Mapping[str, BaseNetwork],
+    networks: Mapping[str, DepthSource],
     conduct: Conduct,
     evaluate: Evaluate = evaluate_sequence,
 ) -> bool:
@@ -182,7 +184,7 @@ class _Turn:
     died: bool
 
 
-def _take(job: EvalJob, folder: EvalFolder, networks: Mapping[str, BaseNetwork], item: WorkItem, turn: _Turn) -> None:
+def _take(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], item: WorkItem, turn: _Turn) -> None:
     """Compute and keep what is missing of a sequence, or why it cannot be had."""
     failure = folder.failure(item)
     if failure is not None and failure.get("launch") == turn.launch:
@@ -207,16 +209,16 @@ def _take(job: EvalJob, folder: EvalFolder, networks: Mapping[str, BaseNetwork],
     possible = [row for row in job.suite.rows if sequence.posed or row.method.fusion == ALONE]
     left_out = [row for row in missing if row not in possible]
     todo = [row for row in missing if row in possible]
-    examples = Examples(folder.place(item)) if job.keeps_examples(item) else None
+    sinks = [ExampleWriter(Examples(folder.place(item)))] if job.keeps_examples(item) else []
     try:
         results = turn.evaluate(
             sequence,
             with_references(todo, possible) if todo else missing,
             networks,
-            cache=turn.cache,
+            store=turn.cache,
             device=torch.device(job.device),
             limit=job.frames,
-            examples=examples,
+            sinks=sinks,
             confident=job.confident,
             stop=turn.conduct.stop,
             progress=lambda done, total: turn.conduct.progress(item.label, done, total),
@@ -257,7 +259,7 @@ def _fail(folder: EvalFolder, item: WorkItem, error: Exception, rows: Sequence[R
 def _record(
     job: EvalJob,
     item: WorkItem,
-    networks: Mapping[str, BaseNetwork],
+    networks: Mapping[str, DepthSource],
     result: RowResult,
     provenance: Mapping[str, Any],
 ) -> Record:

@@ -90,7 +90,7 @@ def prepare(job: EvalJob, *, resume: bool, overwrite: bool) -> EvalFolder:
     """Open the output folder for processes that are then started: what is wrong is told once.
 
     Raises:
-        FolderError, FileNotFoundError, ValueError, ImportError: see ``EvalFolder.open`` and ``BaseNetwork``.
+        FolderError, FileNotFoundError, ValueError, ImportError: see ``EvalFolder.open`` and ``NetworkChoice.load``.
     """
     about = job.about(job.load(torch.device("cpu")))
     return EvalFolder.open(job.out, about, resume=resume, overwrite=overwrite)
