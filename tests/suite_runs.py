@@ -10,12 +10,13 @@ from dataclasses import replace
 import torch
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.evaluate import RowResult, Stopped
-from ufmstar_torch.eval.engine.networks import NetworkChoice
+from ufmstar_torch.eval.engine.evaluate import RowResult
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.suites import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.run_suite import Conduct, EvalJob, run_job
-from ufmstar_torch.eval.results.store import EvalFolder
 from ufmstar_torch.eval.results.worklist import find_work
 
 TRUTH = "depth_only=ground-truth:24x32"

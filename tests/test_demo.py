@@ -14,7 +14,7 @@ from runs import read_summary
 
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.eval.commands import demo
-from ufmstar_torch.eval.commands.demo import DemoOptions, sheet_rows, surface_kinds
+from ufmstar_torch.eval.commands.demo import DEMO, DemoOptions, sheet_rows, surface_kinds
 from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, METHODS, NETWORK, UFM, UFM_STAR, Comparison, Tally
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import SequenceMetrics
@@ -22,7 +22,7 @@ from ufmstar_torch.eval.report import calibration_plot, colours, plots
 from ufmstar_torch.eval.report.calibration_plot import draw_calibration
 from ufmstar_torch.eval.report.demo_pictures import FILES
 from ufmstar_torch.eval.report.demo_report import explanation, table
-from ufmstar_torch.eval.results import demo_folder
+from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
@@ -333,12 +333,12 @@ def test_an_earlier_demo_is_replaced_only_when_asked(done, tmp_path):
     for name in ("summary.json", "mixture.ply"):
         (tmp_path / name).write_bytes((done[0] / name).read_bytes())
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(demo_folder.DemoError, match="--overwrite replaces it"):
-        demo_folder.prepare(tmp_path, overwrite=False)
+    with pytest.raises(FolderError, match="--overwrite replaces it"):
+        OutputFolder.open(tmp_path, DEMO, {})
     assert (tmp_path / "mixture.ply").exists()
-    demo_folder.prepare(tmp_path, overwrite=True)
+    OutputFolder.open(tmp_path, DEMO, {}, overwrite=True)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["notes.txt", "summary.json"]
-    demo_folder.prepare(tmp_path, overwrite=False)  # one that was interrupted needs no permission
+    OutputFolder.open(tmp_path, DEMO, {})  # one that was interrupted needs no permission
 
 
 def test_missing_weights_are_named(ufmstar, tmp_path, monkeypatch):

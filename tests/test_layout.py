@@ -85,10 +85,7 @@ EVAL_VIOLATIONS: frozenset[str] = frozenset(
         "gaussians -> results.files",
         "report.page_parts -> bench.efficiency_table",
         "report.write -> bench.efficiency_table",
-        "results.demo_folder -> report.demo_pictures",
         "results.launch -> commands.eval_options",
-        "results.pool -> bench.benchmark_machine",
-        "results.run_suite -> bench.benchmark_machine",
         "results.worker -> commands.eval_options",
         "sequences.layout -> tour.name",
     }

@@ -21,10 +21,10 @@ from ufmstar_torch.eval.commands.eval_options import eval_parser, parse_eval
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.report.load import load_results
 from ufmstar_torch.eval.results import pool, slurm, worker
+from ufmstar_torch.eval.results.eval_folder import EvalFolder
+from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.launch import Place, evaluate_suite
-from ufmstar_torch.eval.results.output_folder import FolderError
 from ufmstar_torch.eval.results.slurm import Job, Slurm
-from ufmstar_torch.eval.results.store import EvalFolder
 from ufmstar_torch.eval.results.worker import Share
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
@@ -213,7 +213,7 @@ def test_the_first_waits_for_a_sequence_that_another_is_at(rooms, tmp_path):
     time.sleep(0.5)
     assert waiter.is_alive()
     assert stub.asked == []
-    claim.file.close()  # the other one was killed
+    claim.release()
     waiter.join(30)
     assert [name for name, _ in stub.asked] == ["ash"]
 

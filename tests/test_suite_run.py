@@ -20,10 +20,10 @@ from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.methods.suite import rows_of
 from ufmstar_torch.eval.report.load import load_results
 from ufmstar_torch.eval.results.cache import CacheError
-from ufmstar_torch.eval.results.output_folder import FolderError
+from ufmstar_torch.eval.results.eval_folder import EvalFolder
+from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.run_suite import DIED, failures, with_references
-from ufmstar_torch.eval.results.store import EvalFolder
 from ufmstar_torch.eval.results.worklist import Shard, content_digest
 
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
+import multiprocessing
+import os
 import random
+import time
 
 import pytest
 import torch
@@ -16,8 +20,9 @@ from suite_runs import NAMES, go, job_on, write_rooms
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.results.output_folder import FolderError, differences, hold
-from ufmstar_torch.eval.results.store import EvalFolder
+from ufmstar_torch.eval.results.claim import ABANDONED_SECONDS
+from ufmstar_torch.eval.results.eval_folder import EvalFolder
+from ufmstar_torch.eval.results.folder import FolderError, differences, hold
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest, find_work, read_names
 
 # ---- work list ----
@@ -190,6 +195,21 @@ def test_resuming_adds_rows_sequences_and_networks(tmp_path):
     assert about["missing_bases"] == ["evidential"]
 
 
+@pytest.fixture(params=["flock", "no flock"])
+def flock(request, monkeypatch):
+    """Locks as the kernel has them, and as NFS mounted with nolock has them: granted to everybody."""
+    if request.param == "no flock":
+        monkeypatch.setattr(fcntl, "flock", lambda *_: None)
+
+
+def leave(claimed, **changes):
+    """A claim as a killed process leaves it whose number another process has now."""
+    holder = json.loads(claimed.path.read_text())
+    claimed.release()
+    claimed.path.write_text(json.dumps({**holder, "started": "1", **changes}))
+
+
+@pytest.mark.usefixtures("flock")
 def test_a_sequence_is_claimed_by_one(tmp_path):
     folder, item = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False), WorkItem("d", "s", "p", "auto")
     first = folder.claim(item, "one")
@@ -197,14 +217,67 @@ def test_a_sequence_is_claimed_by_one(tmp_path):
     assert folder.claim(item, "two") is None
     with folder.claim(WorkItem("d", "t", "p", "auto"), "two") as another_sequence:
         assert not another_sequence.died
-    first.file.close()  # as a killed process leaves it
+    leave(first)
     with folder.claim(item, "two") as other_launch:
         assert not other_launch.died
-    folder.claim(item, "one").file.close()
+    leave(folder.claim(item, "one"))
     with folder.claim(item, "one") as same_launch:
         assert same_launch.died
     with folder.claim(item, "one") as in_good_order:
         assert not in_good_order.died
+    assert len(list(folder.place(item).iterdir())) == 1
+
+
+def test_a_claim_of_another_computer_counts_until_it_is_old(tmp_path):
+    folder, item = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False), WorkItem("d", "s", "p", "auto")
+    claimed = folder.claim(item, "one")
+    leave(claimed, host="elsewhere")
+    assert folder.claim(item, "one") is None
+    old = time.time() - ABANDONED_SECONDS - 1
+    os.utime(claimed.path, (old, old))
+    with folder.claim(item, "one") as again:
+        assert again.died
+    # One that was killed before it wrote its name, likewise.
+    again.path.write_text("")
+    assert folder.claim(item, "one") is None
+    os.utime(again.path, (old, old))
+    assert folder.claim(item, "one") is not None
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of forks, from Python 3.12 on
+def test_processes_that_claim_at_the_same_time_share_without_locks(tmp_path):
+    folder = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False)
+    for n in range(0, 60, 2):  # half of them left by a process that was killed
+        leave(folder.claim(WorkItem("d", f"s{n}", "p", "auto"), "before"))
+    fork = multiprocessing.get_context("fork")
+    names, over = fork.Queue(), fork.Event()
+
+    def work():
+        fcntl.flock = lambda *_: None
+        names.put([n for n in range(60) if folder.claim(WorkItem("d", f"s{n}", "p", "auto"), "one") is not None])
+        over.wait(60)
+
+    children = [fork.Process(target=work) for _ in range(4)]
+    for child in children:
+        child.start()
+    taken = [names.get(timeout=60) for _ in children]
+    over.set()
+    for child in children:
+        child.join(60)
+    assert sorted(n for part in taken for n in part) == list(range(60))
+
+
+def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
+    folder, item = EvalFolder.open(tmp_path, ABOUT, resume=False, overwrite=False), WorkItem("d", "s", "p", "auto")
+    folder.place(item).mkdir(parents=True)
+    left = [tmp_path / ".eval.json.0123456789ab.tmp", folder.place(item) / ".A.pt.0123456789ab.tmp"]
+    kept = [tmp_path / ".report.html.0123456789ab.tmp", folder.place(item) / ".mine.tmp"]
+    for file in [*left, *kept]:
+        file.write_text("x")
+    with EvalFolder.open(tmp_path, ABOUT, resume=True, overwrite=False).claim(item, "one"):
+        assert not any(file.exists() for file in left)
+        assert all(file.exists() for file in kept)
 
 
 def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
@@ -227,21 +300,20 @@ def test_a_lock_is_held_by_one_and_keeps_the_content(tmp_path):
     (tmp_path / "lock").write_text("kept")
     first = hold(tmp_path / "lock")
     assert hold(tmp_path / "lock", wait=0.05) is None
-    first.close()
+    first.release()
     second = hold(tmp_path / "lock")
-    second.seek(0)
-    assert second.read() == b"kept"
-    second.close()
+    assert second is not None
+    second.release()
+    assert (tmp_path / "lock").read_text() == "kept"
 
 
-def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
-    import fcntl
-
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.ENOSYS])
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, code):
     def refuse(*_):
-        raise OSError(errno.ENOLCK, "No locks available")
+        raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
-    with pytest.raises(OSError, match="the file system knows no locks"):
+    with pytest.raises(OSError, match="the file system does not support locks"):
         hold(tmp_path / "lock")
 
 

@@ -19,7 +19,7 @@ import torch
 import torch.distributed as dist
 from trainings import RECIPE, tiny_job, with_network, write_frames
 
-from ufmstar_torch.eval.results.run_folder import FolderError
+from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train.ensemble import share_of_time
 from ufmstar_torch.train.fit import fit

@@ -15,7 +15,7 @@ import pytest
 import torch
 from trainings import RECIPE, tiny_job, with_network, write_frames
 
-from ufmstar_torch.eval.results.run_folder import FolderError
+from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, ResumeError, read_checkpoint
 from ufmstar_torch.train.fit import fit
@@ -215,7 +215,7 @@ def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
     others = [
         (replace(job, recipe=replace(recipe, learning_rate=0.5)), r"recipe\.learning_rate was 0\.01, now 0\.5"),
         (replace(job, settings=replace(job.settings, seed=3)), "seed was 0, now 3"),
-        (replace(job, data=replace(job.data, part="0:8")), r"data\.part was 0:12, now 0:8"),
+        (replace(job, data=replace(job.data, part="0:8")), r'data\.part was "0:12", now "0:8"'),
     ]
     for other, told in others:
         with pytest.raises(FolderError, match=told):

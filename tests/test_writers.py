@@ -174,15 +174,6 @@ class TestFrames:
             assert not writer.finished("a")
             assert writer.finished_frames() == []
 
-    def test_clear_removes_an_earlier_run_and_nothing_else(self, tmp_path: Path) -> None:
-        writer = FrameWriter(tmp_path)
-        writer.write("a", **frame())
-        writer.write_summary({"frames": 1})
-        (tmp_path / "notes.txt").write_text("mine")
-        (tmp_path / "depth" / "notes.txt").write_text("mine")
-        writer.clear()
-        assert set(tree(tmp_path)) == {"notes.txt", "depth/notes.txt"}
-
     @pytest.mark.parametrize("name", ["", "../a", "a/b", ".hidden", "a\\b"])
     def test_names_stay_in_the_folder(self, tmp_path: Path, name: str) -> None:
         with pytest.raises(ValueError, match="plain file name"):

@@ -232,7 +232,7 @@ def _run(options: Mapping[str, Any]) -> dict[str, Any]:
     from ufmstar_torch.eval.commands.run import run as run_job
     from ufmstar_torch.eval.commands.run_job import job_from
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-    from ufmstar_torch.eval.results.run_folder import FolderError
+    from ufmstar_torch.eval.results.folder import FolderError
 
     try:
         _set_threads(options["threads"])
@@ -315,9 +315,9 @@ def _demo(options: Any) -> dict[str, Any]:
     Raises:
         UsageError: the options do not fit, or what they name is not there.
     """
-    from ufmstar_torch.eval.commands.demo import DemoOptions, run_demo
+    from ufmstar_torch.eval.commands.demo import DemoError, DemoOptions, run_demo
     from ufmstar_torch.eval.commands.terminal import Bars
-    from ufmstar_torch.eval.results.demo_folder import DemoError
+    from ufmstar_torch.eval.results.folder import FolderError
 
     try:
         _set_threads(options.threads)
@@ -334,7 +334,7 @@ def _demo(options: Any) -> dict[str, Any]:
         )
         with Bars() as bars:
             return run_demo(chosen, bars.show)
-    except (DemoError, FileNotFoundError) as error:
+    except (DemoError, FolderError, FileNotFoundError) as error:
         raise UsageError(_one_line(error)) from error
 
 

@@ -101,9 +101,9 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
         FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
     """
     from ufmstar_torch import UfMStarConfig
-    from ufmstar_torch.eval.bench import benchmark_machine as machine
     from ufmstar_torch.eval.bench.benchmark_compile import measure_compilation
     from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
+    from ufmstar_torch.eval.results import machine
 
     _check(options)
     config = UfMStarConfig()

@@ -15,7 +15,6 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.bench.benchmark_machine import available_cores, hardware, load_average, versions
 from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
 from ufmstar_torch.eval.bench.contender import Contender
 from ufmstar_torch.eval.bench.lines import NETWORK, network_line, row_line
@@ -25,6 +24,7 @@ from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, Race, inferen
 from ufmstar_torch.eval.bench.windows import Work, repeated, run_windows
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.results.machine import available_cores, hardware, load_average, versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 
 FORMAT = 1

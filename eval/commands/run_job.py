@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.util import find_spec
 from typing import Any
 
 import torch
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.commands.run import Job
+from ufmstar_torch.eval.commands.run import RunJob
 from ufmstar_torch.eval.commands.run_options import OWN_DEPTH, check_options, parse_intrinsics, parse_size, parse_slice
-from ufmstar_torch.eval.engine.run_anchors import require_images
-from ufmstar_torch.eval.engine.run_maps import folder_source, own_depth_source
-from ufmstar_torch.eval.engine.run_source import Source, network_source
+from ufmstar_torch.eval.engine.load import network_source
+from ufmstar_torch.eval.engine.maps import folder_source, own_depth
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
 
 # How a run is carried out; the rest of the options says what is run.
 _CONDUCT = ("resume", "overwrite", "debug", "config")
 
 
-def job_from(options: Mapping[str, Any]) -> Job:
+def job_from(options: Mapping[str, Any]) -> RunJob:
     """The job that the options (``parse_run``) describe.
 
     Raises:
@@ -29,35 +31,25 @@ def job_from(options: Mapping[str, Any]) -> Job:
     """
     check_options(options)
     config = UfMStarConfig.from_dict(options["ufm"])
-    device = _device(options["device"])
+    device = require_device(options["device"])
     chosen = parse_slice(options["frames"])
     sequence = _sequence(options)
     if config.anchored:
-        require_images(sequence)
+        _require_images(sequence)
     indices = range(len(sequence))[chosen]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
-    return Job(
+    return RunJob(
         sequence=sequence,
         indices=indices,
-        source=_source(options, config, sequence, device),
+        source=_source(options, sequence, device),
+        config=config,
+        device=torch.device(device),
         settings={name: value for name, value in options.items() if name not in _CONDUCT},
+        every=options["model"] is not None and options["mode"] == "full",
         video=not options["no_video"],
         sheet=not options["no_sheet"],
     )
-
-
-def _device(name: str) -> str:
-    """The device, if it is there.
-
-    Raises:
-        ValueError: it is not.
-    """
-    try:
-        torch.zeros((), device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
-    return name
 
 
 def _sequence(options: Mapping[str, Any]) -> FrameSequence:
@@ -79,13 +71,25 @@ def _sequence(options: Mapping[str, Any]) -> FrameSequence:
     return sequence
 
 
-def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameSequence, device: str) -> Source:
+def _require_images(sequence: FrameSequence) -> None:
+    """What tracking needs.
+
+    Raises:
+        ValueError: the sequence has no images.
+        ModuleNotFoundError: OpenCV is not installed.
+    """
+    if all(entry.load_image is None for entry in sequence.entries):
+        raise ValueError(f"--anchors tracks corners of images, of which the sequence {sequence.name!r} has none")
+    if find_spec("cv2") is None:
+        raise ModuleNotFoundError("--anchors needs OpenCV: pip install 'ufmstar-torch[eval]'")
+
+
+def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) -> DepthSource:
     size = parse_size(options["size"])
     if options["model"] is not None:
         return network_source(
             options["model"],
             options["weights"],
-            config,
             spec=options["spec"],
             mode=options["mode"],
             samples=options["samples"],
@@ -96,14 +100,12 @@ def _source(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameSe
     if options["depth"] in OWN_DEPTH:
         if len(sequence.without_depth) == len(sequence):
             raise ValueError(f"--depth {options['depth']}: the sequence {sequence.name!r} has no depth maps")
-        return own_depth_source(config, size=size, device=device)
+        return own_depth(size)
     return folder_source(
         sequence,
         options["depth"],
-        config,
         variance=options["variance"],
         scale=options["depth_scale"],
         intrinsics=parse_intrinsics(options["map_intrinsics"], "--map-intrinsics"),
         size=size,
-        device=device,
     )

@@ -196,9 +196,7 @@ class Pointwise:
         """See :meth:`Estimator.update`; anchors do not matter."""
         a, e = _variances(prediction, self._uses_variances)
         out = self.ufm(prediction.depth[None], T_world_cam, prediction.intrinsics, _one(a), _one(e))
-        return _estimate(
-            depth=prediction.depth, variance=out.variance[0], valid=out.valid[0], aleatoric=a, epistemic=e
-        )
+        return _estimate(depth=prediction.depth, variance=out.variance[0], valid=out.valid[0], aleatoric=a, epistemic=e)
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""

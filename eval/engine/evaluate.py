@@ -249,9 +249,7 @@ def _result(row: Row, account: _Account, metrics: RowMetrics, sequence: FrameSeq
     key, frames = row.slug, account.frames(metrics.judged[row.slug])
     if not frames["judged"]:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
-        raise SequenceError(
-            f"no frame could be judged: {reasons or 'none of those that were read has ground truth'}"
-        )
+        raise SequenceError(f"no frame could be judged: {reasons or 'none of those that were read has ground truth'}")
     opened = Counter(skipped.reason for skipped in sequence.skipped)
     return RowResult(
         row=row,

@@ -1,4 +1,4 @@
-"""Figures against ground truth, as sinks of a stream: of rows, of a run with the network alone beside it, of regions."""
+"""Figures against ground truth, as sinks of a stream: of a run, of the rows of an evaluation, of image regions."""
 
 from __future__ import annotations
 

@@ -98,21 +98,21 @@ class DepthSource(Protocol):
     """
 
     @property
-    def label(self) -> str: ...  # noqa: D102
+    def label(self) -> str: ...
     @property
-    def networks(self) -> tuple[nn.Module, ...]: ...  # noqa: D102
+    def networks(self) -> tuple[nn.Module, ...]: ...
     @property
-    def identity(self) -> Mapping[str, Any]: ...  # noqa: D102
+    def identity(self) -> Mapping[str, Any]: ...
     @property
-    def digest(self) -> str: ...  # noqa: D102
+    def digest(self) -> str: ...
     @property
-    def passes(self) -> int: ...  # noqa: D102
+    def passes(self) -> int: ...
     @property
-    def needs_image(self) -> bool: ...  # noqa: D102
+    def needs_image(self) -> bool: ...
     @property
-    def cacheable(self) -> bool: ...  # noqa: D102
+    def cacheable(self) -> bool: ...
     @property
-    def is_truth(self) -> bool: ...  # noqa: D102
+    def is_truth(self) -> bool: ...
 
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""

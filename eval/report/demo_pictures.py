@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.demo_methods import NETWORK, UFM_STAR, Compared
+from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
+from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.calibration_plot import draw_calibration
 from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
@@ -18,6 +19,8 @@ from ufmstar_torch.eval.report.plots import Column, FramePanel, PanelScales, con
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.ufmstar import UfMStar
 
+# Rows of the demo beside UfM and UfM*: the member in turn alone, and all members on every image.
+NETWORK, ENSEMBLE = "network", "ensemble"
 SHEET, CURVES, PLY, ELLIPSOIDS = "contact_sheet.png", "calibration.png", "mixture.ply", "ellipsoids.ply"
 FILES = (SHEET, CURVES, PLY, ELLIPSOIDS, "mixture.npz", "curves.json")
 
@@ -33,22 +36,26 @@ class DemoPanel(FramePanel):
     own_sigma: NDArray[np.float32] | None = None
 
 
-def panel(name: str, note: str, image: NDArray[np.uint8], compared: Compared, truth: NDArray[np.float32]) -> DemoPanel:
+def panel(name: str, note: str, result: FrameResult) -> DemoPanel:
     """One row of the sheet: the alternated network's depth, its own sigma, that of UfM*, and the true error.
 
     Args:
         name: of the frame.
         note: what kind of room it is in.
-        image: [H, W, 3] uint8 RGB.
-        compared: the frame by all methods.
-        truth: [h, w] [m], 0 = none.
+        result: the frame through all rows, with an image and ground truth.
     """
-    own, star = compared.estimates[NETWORK], compared.estimates[UFM_STAR]
+    row, own = result.rows[UFM_STAR], result.rows[NETWORK].estimate
+    star, truth = row.estimate, row.truth
+    assert result.frame is not None
+    assert result.frame.image is not None
+    assert truth is not None
+    assert star.variance is not None
+    assert own.variance is not None
     depth = star.depth.float().numpy()
     return DemoPanel(
         name=name,
         note=note,
-        image=image,
+        image=result.frame.image,
         depth=depth,
         sigma=star.variance.float().sqrt().numpy(),
         own_sigma=own.variance.float().sqrt().numpy(),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR
-from ufmstar_torch.eval.report.demo_pictures import CURVES, ELLIPSOIDS, PLY, SHEET
+from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
+from ufmstar_torch.eval.report.demo_pictures import CURVES, ELLIPSOIDS, ENSEMBLE, NETWORK, PLY, SHEET
 from ufmstar_torch.eval.results.summary import aligned, number
 
 _COLUMNS = {

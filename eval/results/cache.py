@@ -24,8 +24,8 @@ class CacheError(Exception):
 
 
 class PredictionCache:
-    """A ``PredictionStore`` in files. Several processes may use one folder: a file is whole or absent, and those who write
-    the same one write the same.
+    """A ``PredictionStore`` in files. Several processes may use one folder: a file is whole or absent, and processes
+    that write the same file write the same content.
 
     Args:
         folder: made if it does not exist.

@@ -6,13 +6,16 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 from uuid import uuid4
 
 import numpy as np
 import torch
+
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")  # as write_together names them
 
 
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, durable: bool = False) -> None:
@@ -51,6 +54,13 @@ def write_together(files: Mapping[Path, Callable[[BinaryIO], object]], *, durabl
     finally:
         for left in temporary.values():
             left.unlink(missing_ok=True)
+
+
+def remove_temporaries(paths: Iterable[Path]) -> None:
+    """Remove those of the files that ``write_together`` began and a killed process left."""
+    for path in list(paths):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:

@@ -11,8 +11,8 @@ import torch
 
 from ufmstar_torch.eval.commands.eval_options import job_from
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
+from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.run_suite import Conduct, EvalJob, Evaluate, failures, run_job
-from ufmstar_torch.eval.results.store import EvalFolder
 from ufmstar_torch.eval.results.worker import Share, device_of, prepare, work
 from ufmstar_torch.eval.results.worklist import Shard
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ufmstar_torch.eval.bench.benchmark_machine import available_cores
+from ufmstar_torch.eval.results.machine import available_cores
 from ufmstar_torch.eval.results.worker import DONE, STOPPED, Share, as_json
 
 _POLL_SECONDS = 0.05

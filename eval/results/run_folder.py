@@ -1,4 +1,4 @@
-"""The output folder of a run: whose it is, and what is needed to go on in it after any kind of end.
+"""The output folder of a run, and what is needed to continue the run after any kind of end.
 
 ```
 OUT/frames.jsonl       one line per frame, in order: counts, means, times; or why it was skipped
@@ -7,7 +7,7 @@ OUT/resume/state.pt    UfM*'s state, the metrics' sums and the position, after t
 OUT/resume/lock        held while a run is going on
 OUT/resume/reserve     space that is given back when the disk is full, so that the summary can be written
 ```
-state.pt is replaced after every frame, last of all: a frame counts as finished once it is there. What a
+state.pt is replaced after every frame, last of all: a frame is finished once its state is stored. What a
 killed run wrote after that is written again, with the same content.
 """
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
@@ -25,17 +26,24 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
-from ufmstar_torch.eval.results.output_folder import FolderError as FolderError
-from ufmstar_torch.eval.results.output_folder import differences, hold
-from ufmstar_torch.eval.results.output_folder import flatten as flatten
+from ufmstar_torch.eval.results.files import to_json, write_atomic
+from ufmstar_torch.eval.results.folder import FolderError, FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.writers import FrameWriter
 
 FORMAT = 1
-PROGRAM = "ufmstar run"
-# Outputs that are made from the finished frames; the frames themselves are FrameWriter's.
-MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json")
+# Outputs that are made from the finished frames.
+_MADE_AT_END = ("preview.mp4", "contact_sheet.png", "mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json")
+_FRAMES = ("frames/*.npz", "depth/*.png", "sigma/*.png")
 _RESERVE_BYTES = 2**20
+RUN = FolderKind(
+    program="ufmstar run",
+    noun="run",
+    manifest="resume/run.json",
+    format=FORMAT,
+    lock="resume/lock",
+    clear=remover(*_FRAMES, "summary.json", "frames.jsonl", "resume/state.pt", "resume/reserve", *_MADE_AT_END),
+    temporary=(".*.tmp", "*/.*.tmp", ".preview.*.tmp.mp4"),
+)
 
 
 @dataclass
@@ -58,7 +66,7 @@ class Checkpoint:
 
 
 class RunFolder:
-    """An output folder, opened for a new run or to go on with one. Use :meth:`open`.
+    """The output folder of a new or continued run. Use :meth:`open`.
 
     Attributes:
         path: the folder.
@@ -67,17 +75,17 @@ class RunFolder:
         records: the lines of frames.jsonl up to there.
     """
 
-    def __init__(self, path: Path, lock: BinaryIO, checkpoint: Checkpoint, records: list[dict[str, Any]]) -> None:
-        self.path = path
-        self._lock = lock
-        self.writer = FrameWriter(path)
+    def __init__(self, folder: OutputFolder, checkpoint: Checkpoint, records: list[dict[str, Any]]) -> None:
+        self.path = folder.path
+        self._folder = folder
+        self.writer = FrameWriter(folder.path)
         self.checkpoint = checkpoint
         self.records = records
         self._journal: BinaryIO | None = None
 
     @classmethod
     def open(cls, path: str | Path, identity: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
-        """Prepare the folder; files that are not this program's are never touched.
+        """Prepare the folder; see ``OutputFolder.open``.
 
         Args:
             path: created if missing.
@@ -86,32 +94,15 @@ class RunFolder:
             overwrite: remove what an earlier run left, and start.
 
         Raises:
-            FolderError: the folder holds an earlier run and neither was asked for; other files; a run that was
-                started with other values (they are named), is still going on, or whose state cannot be read.
+            FolderError: the folder cannot be used as asked, or the state in it cannot be read.
             OSError: the folder cannot be made.
         """
-        out, identity = Path(path), to_json(identity)
-        if out.exists() and not out.is_dir():
-            raise FolderError(f"--out {out} is a file, expected a folder")
-        manifest = out / "resume" / "run.json"
-        if not manifest.is_file():
-            if out.is_dir() and any(out.iterdir()):
-                raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
-        elif resume:
-            _require_same(out, identity, _read_manifest(manifest))
-            lock = _lock(out)
-            try:
-                return cls(out, lock, *_load(out))
-            except FolderError:
-                lock.close()
-                raise
-        elif not overwrite:
-            raise FolderError(f"--out {out} holds an earlier run: --resume goes on with it, --overwrite replaces it")
-        (out / "resume").mkdir(parents=True, exist_ok=True)
-        lock = _lock(out)
-        _clear(out)
-        write_json_atomic(manifest, {"program": PROGRAM, "format": FORMAT, "identity": identity})
-        return cls(out, lock, Checkpoint(), [])
+        folder = OutputFolder.open(Path(path), RUN, {"identity": identity}, resume=resume, overwrite=overwrite)
+        with ExitStack() as held:
+            held.enter_context(folder)
+            run = cls(folder, *(_load(folder.path) if folder.resumed else (Checkpoint(), [])))
+            held.pop_all()
+        return run
 
     def __enter__(self) -> RunFolder:
         """Make the journal end at the last finished frame, and set space aside for the summary."""
@@ -126,10 +117,10 @@ class RunFolder:
         if self._journal is not None:
             self._journal.truncate(self.checkpoint.journal_bytes)
             self._journal.close()
-        self._lock.close()
+        self._folder.close()
 
     def commit(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
-        """Note a frame as handled, once its files are written.
+        """Record a frame as handled, once its files are written.
 
         Raises:
             OSError: a full disk, say; the folder stays at the frame before.
@@ -189,39 +180,3 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
         )
     sums = {name: {key: unpack(v) for key, v in values.items()} for name, values in stored.pop("metrics").items()}
     return Checkpoint(metrics=sums, **stored), records
-
-
-def _lock(out: Path) -> BinaryIO:
-    """Hold the folder; the lock goes with the process, however it ends.
-
-    Raises:
-        FolderError: another process holds it.
-    """
-    file = hold(out / "resume" / "lock")
-    if file is None:
-        raise FolderError(f"--out {out}: another run is writing there now")
-    return file
-
-
-def _clear(out: Path) -> None:
-    """Remove what the earlier run left: the frames in its three folders, and its files by their names."""
-    FrameWriter(out).clear()
-    for name in ("frames.jsonl", "resume/state.pt", "resume/reserve", *MADE_AT_END):
-        (out / name).unlink(missing_ok=True)
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        if manifest["program"] != PROGRAM or manifest["format"] != FORMAT:
-            raise ValueError(f"made by {manifest['program']}, format {manifest['format']}")
-        return dict(manifest["identity"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise FolderError(f"--resume: {path} is not a run's that can be continued ({error})") from error
-
-
-def _require_same(out: Path, now: Mapping[str, Any], then: Mapping[str, Any]) -> None:
-    """Raise FolderError, naming every value that differs."""
-    told = differences(then, now)
-    if told:
-        raise FolderError(f"--resume: the run in {out} was started with other input: {told}")

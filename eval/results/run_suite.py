@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.bench.benchmark_machine import hardware, versions
 from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -21,9 +20,10 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.results.cache import PredictionCache
+from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
 from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
+from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.store import CACHE, EvalFolder
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
 from ufmstar_torch.eval.sequences.frame import FrameError
 

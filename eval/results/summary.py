@@ -7,11 +7,11 @@ import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from statistics import mean, median
 from typing import Any
 
 from ufmstar_torch.eval.engine.judge import ALONE, UFM
+from ufmstar_torch.eval.results import machine
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 
@@ -93,14 +93,8 @@ def summarise(
 
 
 def versions() -> dict[str, str | None]:
-    """Of the packages that matter (None = not installed), of Python, and the platform."""
-    found: dict[str, str | None] = {}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
-    return {**found, "python": platform.python_version(), "platform": platform.platform()}
+    """Versions of the packages that a run depends on (None = not installed) and of Python, and the platform."""
+    return {**machine.versions({name: name for name in _PACKAGES}), "platform": platform.platform()}
 
 
 def _sequence(sequence: FrameSequence) -> dict[str, Any]:

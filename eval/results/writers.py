@@ -92,13 +92,6 @@ class FrameWriter:
         names = sorted(path.stem for path in (self.out_dir / "frames").glob("[!.]*.npz"))
         return [name for name in names if self.finished(name)]
 
-    def clear(self) -> None:
-        """Remove the frames and the summary of an earlier run in the same folder, and nothing else."""
-        for folder, ending in (("frames", "npz"), ("depth", "png"), ("sigma", "png")):
-            for path in (self.out_dir / folder).glob(f"*.{ending}"):
-                path.unlink()
-        (self.out_dir / "summary.json").unlink(missing_ok=True)
-
     def write(
         self,
         name: str,

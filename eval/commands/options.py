@@ -1,0 +1,260 @@
+"""Command lines from frozen dataclasses: an option for every field, its help from the class's docstring.
+
+```python
+@dataclass(frozen=True, kw_only=True)
+class GreetOptions:
+    \"""Greet somebody.
+
+    Attributes:
+        name: of the person.
+        times: how often.
+    \"""
+
+    name: str = positional()
+    times: int = 1
+
+options = parse(GreetOptions, ["Ada", "--times", "2"], "greet")
+```
+
+The form of an option follows from its field:
+
+- ``positional()``: an argument without a name; a field without a default is an option that must be given;
+- ``bool``: a flag, ``--name`` where the default is False, ``--no-name`` where it is True;
+- ``tuple[str, ...]``: one or several words;
+- a field whose type is a dataclass: a group of options, titled by the first line of that class's docstring;
+- ``fields_of(Config, prefix)``: an option for every field of a settings class; its value is a dict.
+
+Every command also takes ``--config FILE`` (YAML or JSON, keys as the fields are named). Unknown names and impossible
+values are refused.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from functools import cache, reduce
+from operator import or_
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser
+
+T = TypeVar("T")
+
+
+def positional() -> Any:
+    """A field that is an argument without a name."""
+    return field(metadata={"positional": True})
+
+
+def option(default: Any = MISSING, **how: Any) -> Any:
+    """A field whose form is not clear from its type.
+
+    Args:
+        default: without one, the option must be given.
+        **how: ``choices``: the values that are allowed; ``const``: the value of the option without a word behind it;
+            ``repeat``: whether words of further occurrences are added (else they replace the earlier ones);
+            ``also``: older names, ``("--depth-scale",)``.
+    """
+    return field(default=default, metadata=how)
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """The arguments of :func:`fields_of`."""
+
+    config: type
+    prefix: str
+    without: tuple[str, ...]
+    unset: bool
+    defaults: Mapping[str, Any]
+
+
+def fields_of(
+    config: type,
+    prefix: str = "",
+    *,
+    without: Sequence[str] = (),
+    unset: bool = False,
+    defaults: Mapping[str, Any] | None = None,
+) -> Any:
+    """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included.
+
+    The value of a bool is written out: ``--ufm.add_aleatoric false``.
+
+    Args:
+        config: a dataclass. ``choices``, ``symbol``, ``unit`` and ``range`` in its fields' metadata are used.
+        prefix: of the options' names; with a dot (``ufm.``) the names keep their underscores, and a configuration
+            file has the values below that key.
+        without: fields that are no options.
+        unset: leave out what is not given, instead of the class's own default.
+        defaults: other defaults than the class's own.
+    """
+    how = _Fields(config, prefix, tuple(without), unset, defaults or {})
+    return field(default_factory=dict, metadata={"fields_of": how})
+
+
+def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[str, Any] | None = None) -> T:
+    """The options that a command line means.
+
+    Args:
+        options: a dataclass; its ``USAGE``, if it has that attribute, replaces the generated usage line.
+        words: without the program's name.
+        prog: name of the command, for messages.
+        defaults: other defaults than the dataclass's, by name (``ufm.segment.sparse``).
+
+    Raises:
+        ValueError: an unknown option, a value of the wrong kind, or what ``options`` itself refuses; one line.
+        SystemExit: help was asked for.
+    """
+    from jsonargparse import ArgumentError
+
+    parser = parser_of(options, prog)
+    parser.set_defaults(dict(defaults or {}))
+    try:
+        values = parser.parse_args(list(words)).as_dict()
+    except (ArgumentError, TypeError) as error:  # TypeError: a list where a configuration file should have a mapping
+        raise ValueError(" ".join(str(error).split())) from error
+    return _build(options, values)
+
+
+def parser_of(options: type, prog: str) -> ArgumentParser:
+    """The parser for a dataclass of options; it raises ``ArgumentError`` instead of ending the program."""
+    from jsonargparse import ActionConfigFile, ArgumentParser
+
+    description, _ = _documentation(options)
+    usage = getattr(options, "USAGE", None)
+    parser = ArgumentParser(prog=prog, usage=usage, description=description, exit_on_error=False)
+    parser.add_argument("--config", action=ActionConfigFile, help="JSON or YAML file with any of these options")
+    _add_options(parser, parser, options)
+    return parser
+
+
+def as_dict(options: Any) -> dict[str, Any]:
+    """Options as plain values for JSON: groups merged into one level, tuples as lists, paths as text."""
+    plain: dict[str, Any] = {}
+    for f in fields(options):
+        value = getattr(options, f.name)
+        if is_dataclass(value):
+            plain |= as_dict(value)
+        elif isinstance(value, tuple):
+            plain[f.name] = list(value)
+        else:
+            plain[f.name] = str(value) if isinstance(value, Path) else value
+    return plain
+
+
+def _add_options(parser: ArgumentParser, group: Any, options: type) -> None:
+    hints, (_, help_) = get_type_hints(options), _documentation(options)
+    for f in fields(options):
+        hint = hints[f.name]
+        if "fields_of" in f.metadata:
+            _add_fields(group, f.metadata["fields_of"])
+        elif is_dataclass(hint) and isinstance(hint, type):
+            title = (_documentation(hint)[0] or "").splitlines()[0].rstrip(".")
+            _add_options(parser, parser.add_argument_group(title), hint)
+        else:
+            names, how = _form(f, hint)
+            group.add_argument(*names, help=help_.get(f.name, ""), **how)
+
+
+def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
+    """The names of an option and the arguments of ``add_argument``."""
+    name = f"--{f.name.replace('_', '-')}"
+    default = _default(f)
+    if hint is bool:
+        how = {"action": "store_false" if default else "store_true", "dest": f.name}
+        return [f"--no-{name[2:]}" if default else name], how
+    kind = hint
+    how = {} if default is MISSING else {"default": default}
+    parts = get_args(hint)
+    if types.NoneType in parts and default is None:
+        kind = reduce(or_, (part for part in parts if part is not types.NoneType))
+    if get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis:
+        kind = get_args(kind)[0]
+        how |= {"nargs": "+", "default": list(default)}
+        if f.metadata.get("repeat"):
+            how["action"] = "extend"
+    elif "const" in f.metadata:
+        how |= {"nargs": "?", "const": f.metadata["const"]}
+    how |= {"choices": f.metadata["choices"]} if "choices" in f.metadata else {"type": str if kind is Path else kind}
+    if f.metadata.get("positional"):
+        return [f.name], how
+    return [name, *f.metadata.get("also", ())], how | ({"required": True} if default is MISSING else {})
+
+
+def _add_fields(group: Any, wanted: _Fields) -> None:
+    """An option for every field of a settings class, and of the settings classes in it."""
+    hints, (_, help_) = get_type_hints(wanted.config), _documentation(wanted.config)
+    for f in fields(wanted.config):
+        if f.name in wanted.without:
+            continue
+        if is_dataclass(hints[f.name]):
+            _add_fields(group, _Fields(hints[f.name], f"{wanted.prefix}{f.name}.", (), wanted.unset, {}))
+            continue
+        parts = get_args(hints[f.name]) if get_origin(hints[f.name]) in (Union, types.UnionType) else (hints[f.name],)
+        parts += (types.NoneType,) if wanted.unset else ()
+        # Every word is a valid text, so that text is tried last.
+        kind = reduce(or_, sorted(dict.fromkeys(parts), key=lambda part: part is str))
+        how = {"choices": f.metadata["choices"]} if "choices" in f.metadata and not wanted.unset else {"type": kind}
+        name = wanted.prefix + f.name
+        group.add_argument(
+            f"--{name if '.' in name else name.replace('_', '-')}",
+            default=None if wanted.unset else wanted.defaults.get(f.name, _default(f)),
+            help=" ".join(text for text in (help_.get(f.name), _range(f)) if text),
+            **how,
+        )
+
+
+def _range(f: Field[Any]) -> str:
+    """The paper's symbol, the unit and the range of a field, where its metadata has them."""
+    if "range" not in f.metadata:
+        return ""
+    low, high, open_low = f.metadata["range"]
+    end = ")" if f.metadata.get("open_high") else "]"
+    return f"{f.metadata['symbol']} [{f.metadata['unit']}], {'(' if open_low else '['}{low:g}, {high:g}{end}"
+
+
+def _default(f: Field[Any]) -> Any:
+    return f.default_factory() if f.default_factory is not MISSING else f.default
+
+
+def _build(options: type[T], values: Mapping[str, Any]) -> T:
+    """The dataclass of parsed values, groups and settings included."""
+    hints, built = get_type_hints(options), {}
+    for f in fields(options):  # type: ignore[arg-type]
+        hint = hints[f.name]
+        if "fields_of" in f.metadata:
+            built[f.name] = _settings(f.metadata["fields_of"], values)
+        elif is_dataclass(hint) and isinstance(hint, type):
+            built[f.name] = _build(hint, values)
+        else:
+            value = values[f.name]
+            if value is not None and Path in (hint, *get_args(hint)):
+                value = Path(value)
+            built[f.name] = tuple(value) if isinstance(value, list) else value
+    return options(**built)
+
+
+def _settings(wanted: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of :func:`fields_of`."""
+    *path, _ = wanted.prefix.split(".")
+    for key in path:
+        values = values[key]
+    own = {f.name: values[f.name] for f in fields(wanted.config) if f.name not in wanted.without}
+    return {name: value for name, value in own.items() if not (wanted.unset and value is None)}
+
+
+@cache
+def _documentation(options: type) -> tuple[str | None, dict[str, str]]:
+    """The description in a class's docstring, and its attributes' texts, "beta1, beta2: ..." for both."""
+    from docstring_parser.google import parse as parse_docstring
+
+    found = parse_docstring(options.__doc__ or "")
+    texts = {}
+    for attribute in found.params:
+        for name in attribute.arg_name.split(","):
+            texts[name.strip()] = " ".join((attribute.description or "").split())
+    return found.description, texts

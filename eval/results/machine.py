@@ -1,0 +1,76 @@
+"""What a result was computed with: versions, hardware, the load of the machine, and the device."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+# Distributions by the name under which a report lists them.
+_PACKAGES = {"ufmstar_torch": "ufmstar-torch", "torch": "torch", "numba": "numba", "numpy": "numpy"}
+_PACKAGES |= {"torchvision": "torchvision", "llvmlite": "llvmlite"}
+# Settings of the environment that change how long a parallel loop takes, above all beside other work.
+_ENVIRONMENT = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
+
+
+def versions(packages: Mapping[str, str] = _PACKAGES) -> dict[str, str | None]:
+    """Versions of packages, given as {name in the result: distribution}, and of Python; None = not installed."""
+    installed: dict[str, str | None] = {}
+    for name, distribution in packages.items():
+        try:
+            installed[name] = version(distribution)
+        except PackageNotFoundError:
+            installed[name] = None
+    return {**installed, "python": platform.python_version()}
+
+
+def hardware() -> dict[str, Any]:
+    """The processor, how many of its cores this process may use, and the system."""
+    return {
+        "cpu": cpu_model(),
+        "cores": available_cores(),
+        "machine": platform.machine(),
+        "platform": platform.platform(),
+        "environment": {name: os.environ.get(name) for name in _ENVIRONMENT},
+    }
+
+
+def available_cores() -> int:
+    """Number of processors that this process may run on, at least 1."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def load_average() -> float | None:
+    """Mean number of running or waiting processes over the last minute; None where the system does not report it."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def cpu_model() -> str:
+    """The processor's name from /proc/cpuinfo, elsewhere from the platform module."""
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine() or "unknown"
+
+
+def require_device(name: str) -> str:
+    """The name of a device of torch, checked by an allocation on it.
+
+    Raises:
+        ValueError: the device does not exist here.
+    """
+    import torch
+
+    try:
+        torch.zeros((), device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
+    return name

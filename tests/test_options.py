@@ -1,0 +1,161 @@
+"""Command lines from dataclasses: every form of an option, configuration files, help, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.commands.options import as_dict, fields_of, option, parse, positional
+
+
+@dataclass(frozen=True)
+class _Output:
+    """Where it goes.
+
+    Attributes:
+        out: folder of the results.
+        resume: continue.
+        video: leave the video out.
+    """
+
+    out: Path
+    resume: bool = False
+    video: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    """Do something with a sequence.
+
+    Attributes:
+        sequence: a folder.
+        output: see there.
+        fps, rate: frames per second, over
+            two lines.
+        names: some words.
+        networks: repeatable.
+        sizes: in pixels [px].
+        kind: one of two.
+        long: frames.
+        truth_scale: metres per unit.
+    """
+
+    sequence: str = positional()
+    output: _Output
+    fps: float | None = None
+    rate: float = 30.0
+    names: tuple[str, ...] = ()
+    networks: tuple[str, ...] = option((), repeat=True)
+    sizes: tuple[int, ...] = option((224, 518))
+    kind: str = option("numba", choices=("numba", "torch"))
+    long: int | None = option(None, const=1000)
+    truth_scale: float | None = option(None, also=("--depth-scale",))
+    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
+    changes: dict[str, Any] = fields_of(UfMStarConfig, "change.", without=("segment", "backend"), unset=True)
+
+    def __post_init__(self) -> None:
+        if self.rate <= 0:
+            raise ValueError(f"--rate must be positive, got {self.rate}")
+
+
+def _parse(line: str, **defaults: Any) -> _Options:
+    return parse(_Options, line.split(), "prog", defaults)
+
+
+def test_defaults_and_required_ones():
+    options = _parse("seq --out o")
+    assert options.sequence == "seq"
+    assert options.output == _Output(Path("o"))
+    assert (options.fps, options.names, options.sizes, options.long) == (None, (), (224, 518), None)
+    assert UfMStarConfig.from_dict(options.ufm) == UfMStarConfig(on_bad_frame="skip")
+    assert options.changes == {}
+
+
+def test_every_form():
+    line = "seq --out o --resume --no-video --fps 25 --names a b --networks c --networks d e --sizes 48 --kind torch"
+    options = _parse(
+        f"{line} --long --depth-scale .001 --ufm.segment.prune none --ufm.add_aleatoric false --change.eta .2"
+    )
+    assert options.output == _Output(Path("o"), resume=True, video=False)
+    assert (options.fps, options.names, options.networks, options.sizes) == (25.0, ("a", "b"), ("c", "d", "e"), (48,))
+    assert (options.kind, options.long, options.truth_scale) == ("torch", 1000, 0.001)
+    assert options.ufm["segment"]["prune"] == "none"
+    assert options.ufm["add_aleatoric"] is False
+    assert options.changes == {"eta": 0.2}
+    assert _parse("seq --out o --long 7 --truth-scale 1").long == 7
+
+
+def test_defaults_of_the_caller_go_behind_what_is_given():
+    assert _parse("seq --out o", rate=5.0).rate == 5.0
+    assert _parse("seq --out o --rate 6", rate=5.0).rate == 6.0
+    assert _parse("seq --out o", **{"ufm.segment.sparse": 2}).ufm["segment"]["sparse"] == 2
+
+
+def test_plain_values_are_flat():
+    plain = as_dict(_parse("seq --out o --names a"))
+    assert plain["out"] == "o"
+    assert plain["names"] == ["a"]
+    assert plain["ufm"]["eta"] == 0.5
+    assert "output" not in plain
+
+
+def test_a_configuration_file(tmp_path):
+    file = tmp_path / "options.yaml"
+    file.write_text("out: there\nrate: 3\nvideo: false\nnames: [a, b]\nufm:\n  eta: .25\n  segment: {sparse: 3}\n")
+    options = _parse(f"seq --config {file} --rate 4")
+    assert options.output == _Output(Path("there"), video=False)
+    assert (options.rate, options.names, options.ufm["eta"]) == (4.0, ("a", "b"), 0.25)
+    assert options.ufm["segment"]["sparse"] == 3
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("seq", "out"),
+        ("--out o", "sequence"),
+        ("seq --out o --nope", "--nope"),
+        ("seq --out o --rate x", "rate"),
+        ("seq --out o --rate 0", "--rate must be positive, got 0.0"),
+        ("seq --out o --kind other", "choose from 'numba', 'torch'"),
+        ("seq --out o --ufm.nope 1", "--ufm.nope"),
+        ("seq --out o --ufm.segment.sparse x", "sparse"),
+        ("seq --out o --config {}", "'nope'"),
+        ("seq --out o --config missing.yaml", "missing.yaml"),
+    ],
+)
+def test_what_is_refused(line, reason, tmp_path):
+    file = tmp_path / "wrong.yaml"
+    file.write_text("nope: 1\n")
+    with pytest.raises(ValueError, match=reason) as refused:
+        _parse(line.format(file))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ["- a\n", "3\n", "a: [\n"])
+def test_a_file_that_is_no_configuration(text, tmp_path):
+    file = tmp_path / "wrong.yaml"
+    file.write_text(text)
+    with pytest.raises(ValueError, match="config") as refused:
+        _parse(f"seq --out o --config {file}")
+    assert "\n" not in str(refused.value)
+
+
+def test_help_has_the_attributes_texts(capsys):
+    with pytest.raises(SystemExit) as ended:
+        _parse("--help")
+    assert ended.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for expected in (
+        "Do something with a sequence.",
+        "Where it goes: --out",
+        "--fps FPS frames per second, over two lines.",
+        "--rate RATE frames per second, over two lines.",
+        "--no-video leave the video out.",
+        "--ufm.variance_floor VARIANCE_FLOOR",
+        "v_min [m^2], [0, inf]",
+    ):
+        assert expected in text
