@@ -12,20 +12,20 @@ counts as disagreement, and removes the frame-to-frame error of scale that is th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypedDict, Unpack
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.models.robust_fit import least_squares, robust_fit
+from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.models.robust_fit import robust_fit, solve_normal
 
 KINDS = ("inverse", "affine")
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class Alignment(Checked):
     """What makes a relative prediction x metric: 1/d or d is scale x + shift.
 
     Attributes:
@@ -42,9 +42,10 @@ class Alignment:
     kind: str
     scale: Tensor
     shift: Tensor
-    max_depth: float | None = None
+    max_depth: float | None = number(None, "d_max", "m", 0.0, open_low=True)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.kind not in KINDS:
             raise ValueError(f"Alignment.kind must be one of {KINDS}, got {self.kind!r}")
         for name in ("scale", "shift"):
@@ -57,22 +58,6 @@ class Alignment:
             raise ValueError(f"Alignment.scale and .shift must both be numbers or both [B], got {shapes}")
         if not (self.scale > 0).all():
             raise ValueError(f"Alignment.scale must be positive, got {self.scale.tolist()}")
-        if self.max_depth is not None and not self.max_depth > 0:
-            raise ValueError(f"Alignment.max_depth must be positive metres, got {self.max_depth}")
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Alignment:
-        """From JSON.
-
-        Raises:
-            ValueError: an unknown or missing key, or a value out of range.
-        """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"an alignment has no {unknown}; it has {sorted(known)}")
-        if missing := sorted(known - {"max_depth"} - set(values)):
-            raise ValueError(f"an alignment needs {missing}")
-        return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, exactly."""
@@ -92,9 +77,18 @@ class Alignment:
         Raises:
             ValueError: another shape, or as many images as there are alignments were expected.
         """
-        value = self._line(prediction)
+        require_maps("prediction", prediction)
+        scale, shift = self.scale, self.shift  # tensors without dimensions are numbers, on every device
+        if scale.dim():
+            if len(scale) != len(prediction):
+                raise ValueError(f"prediction must have the alignment's {len(scale)} images, got {len(prediction)}")
+            scale, shift = (v.to(prediction.device, prediction.dtype)[:, None, None] for v in (scale, shift))
+        value = scale * prediction + shift
         depth = value if self.kind == "affine" else 1 / torch.where(value > 0, value, 1)
-        return torch.where(self._possible(value, depth), depth, 0)
+        possible = (value > 0) & (depth < torch.inf)
+        if self.max_depth is not None:
+            possible = possible & (depth <= self.max_depth)
+        return torch.where(possible, depth, 0)
 
     def valid(self, prediction: Tensor) -> Tensor:
         """[B, H, W] where the aligned depth is finite, positive and at most ``max_depth``; errors as :meth:`depth`.
@@ -102,19 +96,6 @@ class Alignment:
         ``(~alignment.valid(x)).sum((1, 2))`` counts what an image loses: many mean that the shift is wrong.
         """
         return self.depth(prediction) > 0
-
-    def _line(self, prediction: Tensor) -> Tensor:
-        require_maps("prediction", prediction)
-        scale, shift = self.scale, self.shift
-        if scale.dim():
-            if len(scale) != len(prediction):
-                raise ValueError(f"prediction must have the alignment's {len(scale)} images, got {len(prediction)}")
-            scale, shift = (v.to(prediction.device, prediction.dtype)[:, None, None] for v in (scale, shift))
-        return scale * prediction + shift  # tensors without dimensions are numbers, on every device
-
-    def _possible(self, value: Tensor, depth: Tensor) -> Tensor:
-        possible = (value > 0) & (depth < torch.inf)
-        return possible if self.max_depth is None else possible & (depth <= self.max_depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +107,7 @@ class AlignmentFit:
         points: [B] usable measurements.
         inliers: [B] those that the final fit used.
         residual: [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m].
-        sums: for going on with further images.
+        sums: to which those of further images can be added.
     """
 
     alignment: Alignment
@@ -161,15 +142,39 @@ class AlignmentSums:
         """
         w, wx, wy, wxx, wxy = self.values.unbind(-1)
         if shift is None:
-            # Centred: sum w (x - mean)^2; the same in one pass loses digits only where x hardly varies.
-            spread = wxx - wx * wx / w
-            if not (spread > 1e-10 * wxx).all():
-                raise ValueError("the predictions at the measurements hardly differ: no shift can be told; give it")
-            scale = (wxy - wx * wy / w) / spread
-            return Alignment(self.kind, scale, (wy - scale * wx) / w, max_depth)
-        if not (wxx > 0).all():
-            raise ValueError("the predictions at the measurements are all 0: no scale can be told")
-        return Alignment(self.kind, (wxy - shift * wx) / wxx, torch.full_like(w, shift), max_depth)
+            gram = torch.stack([torch.stack([wxx, wx], -1), torch.stack([wx, w], -1)], -2)
+            theta, determined = solve_normal(gram, torch.stack([wxy, wy], -1))
+            scale, offset = theta.unbind(-1)
+        else:
+            theta, determined = solve_normal(wxx[..., None, None], (wxy - shift * wx)[..., None])
+            scale, offset = theta[..., 0], torch.full_like(w, shift)
+        require_each(determined, w, "has predictions that hardly differ, which determine no alignment; total weight:")
+        grows = "distance" if self.kind == "affine" else "nearness"
+        sentence = f"does not grow with {grows}, as kind {self.kind!r} says it does; the fitted scale is"
+        require_each(scale > 0, scale, sentence)
+        return Alignment(self.kind, scale, offset, max_depth)
+
+
+class FitOptions(TypedDict, total=False):
+    """Options of :func:`fit_inverse_depth` and :func:`fit_affine_depth`.
+
+    Keys:
+        weights: [B, H, W] inverse variances of 1/depth (or depth) up to a factor, 0 = do not use; None (default) =
+            equal, which in inverse depth fits stereo and structured light. There, for an error of constant size in
+            depth: depth**4.
+        pooled: one alignment for all images, as UfM* needs it, instead of one for each (default).
+        robust: True (default): leave out outliers, which may be almost half of the points; False: plain least squares.
+        min_points: fewer usable measurements (of an image, or in all if pooled) are an error; default 10.
+        max_depth: [m] of the resulting alignment; None (default) = no limit.
+        seed: of the robust fit's samples, default 0; the result is reproducible.
+    """
+
+    weights: Tensor | None
+    pooled: bool
+    robust: bool
+    min_points: int
+    max_depth: float | None
+    seed: int
 
 
 def fit_inverse_depth(
@@ -177,13 +182,8 @@ def fit_inverse_depth(
     depth: Tensor,
     valid: Tensor | None = None,
     *,
-    weights: Tensor | None = None,
     shift: float | None = None,
-    pooled: bool = False,
-    robust: bool = True,
-    min_points: int = 10,
-    max_depth: float | None = None,
-    seed: int = 0,
+    **options: Unpack[FitOptions],
 ) -> AlignmentFit:
     """Scale and shift with 1/depth = scale prediction + shift, by least squares in inverse depth.
 
@@ -192,20 +192,14 @@ def fit_inverse_depth(
         depth: [B, H, W] measured depth [m] at the same pixels (LiDAR, SLAM points, a depth sensor); pixels without a
             finite positive value are not used.
         valid: [B, H, W] bool, True = use; None = all measured.
-        weights: [B, H, W] inverse variances of 1/depth up to a factor, 0 = do not use; None = equal, which fits
-            stereo and structured light. For an error of constant size in depth, depth**4.
         shift: [1/m] if it is known (0: the prediction is inverse depth up to scale); None = fitted.
-        pooled: one alignment for all images, as UfM* needs it, instead of one for each.
-        robust: find and leave out outliers, of which there may be almost half; False = plain least squares.
-        min_points: fewer usable measurements (of an image, or in all if pooled) are an error.
-        max_depth: [m] of the resulting alignment.
-        seed: of the robust fit's samples; the result is reproducible.
+        options: see :class:`FitOptions`.
 
     Raises:
         ValueError: wrong shapes or types, too few measurements, predictions that hardly differ, or a scale that
             comes out negative, as for a network that predicts depth; the image is named.
     """
-    return _fit("inverse", prediction, depth, valid, weights, shift, pooled, robust, min_points, max_depth, seed)
+    return _fit("inverse", prediction, depth, valid, shift, **options)
 
 
 def fit_affine_depth(
@@ -213,20 +207,15 @@ def fit_affine_depth(
     depth: Tensor,
     valid: Tensor | None = None,
     *,
-    weights: Tensor | None = None,
     shift: float | None = 0.0,
-    pooled: bool = False,
-    robust: bool = True,
-    min_points: int = 10,
-    max_depth: float | None = None,
-    seed: int = 0,
+    **options: Unpack[FitOptions],
 ) -> AlignmentFit:
     """Scale (and shift) with depth = scale prediction + shift [m], by least squares in depth.
 
     As :func:`fit_inverse_depth`, for networks whose output grows with distance. ``shift`` is in metres and 0
-    unless asked for (None = fitted): most such networks miss the scale alone.
+    by default (None = fitted): most such networks miss the scale alone.
     """
-    return _fit("affine", prediction, depth, valid, weights, shift, pooled, robust, min_points, max_depth, seed)
+    return _fit("affine", prediction, depth, valid, shift, **options)
 
 
 def _fit(
@@ -234,13 +223,14 @@ def _fit(
     prediction: Tensor,
     depth: Tensor,
     valid: Tensor | None,
-    weights: Tensor | None,
     shift: float | None,
-    pooled: bool,
-    robust: bool,
-    min_points: int,
-    max_depth: float | None,
-    seed: int,
+    *,
+    weights: Tensor | None = None,
+    pooled: bool = False,
+    robust: bool = True,
+    min_points: int = 10,
+    max_depth: float | None = None,
+    seed: int = 0,
 ) -> AlignmentFit:
     unknowns = 2 if shift is None else 1
     if min_points < unknowns:
@@ -249,28 +239,18 @@ def _fit(
     count = use.sum(1)
     require_each(count >= min_points, count, f"needs at least {min_points} measurements with a prediction, has")
     y = measured if kind == "affine" else 1 / measured
-    design = torch.stack([x, torch.ones_like(x)], -1)[..., :unknowns]
-    target = y if shift is None else y - shift
+    inlier = use
     if robust:
-        fit = robust_fit(design, target, use, weight, seed=seed)
-        inlier, determined, theta = fit.inlier, fit.determined, fit.theta
-    else:
-        inlier = use
-        theta, determined = least_squares(design, target, weight * use)
-    require_each(
-        determined, count, "has predictions that hardly differ, so nothing can be told from them; measurements:"
-    )
-    grows = "distance" if kind == "affine" else "nearness"
-    require_each(
-        theta[:, 0] > 0, theta[:, 0], f"does not grow with {grows}, as kind {kind!r} says it does; the fitted scale is"
-    )
-    b = theta[:, 1] if shift is None else torch.full_like(theta[:, 0], shift)
+        design = torch.stack([x, torch.ones_like(x)], -1)[..., :unknowns]
+        inlier = robust_fit(design, y if shift is None else y - shift, use, weight, seed=seed).inlier
     w = weight * inlier
-    sums = torch.stack([v.sum(1) for v in (w, w * x, w * y, w * x * x, w * x * y)], -1)
-    residual = y - theta[:, :1] * x - b[:, None]
+    values = torch.stack([v.sum(1) for v in (w, w * x, w * y, w * x * x, w * x * y)], -1)
+    sums = AlignmentSums(kind, values[0] if pooled else values)
+    alignment = sums.alignment(shift=shift, max_depth=max_depth)
+    residual = y - alignment.scale.reshape(-1, 1) * x - alignment.shift.reshape(-1, 1)
     rms = ((residual.square() * inlier).sum(1) / inlier.sum(1)).sqrt()
-    a, b, count, used, rms, sums = (v[0] if pooled else v for v in (theta[:, 0], b, count, inlier.sum(1), rms, sums))
-    return AlignmentFit(Alignment(kind, a, b, max_depth), count, used, rms, AlignmentSums(kind, sums))
+    points, inliers, rms = (v[0] if pooled else v for v in (count, inlier.sum(1), rms))
+    return AlignmentFit(alignment, points, inliers, rms, sums)
 
 
 def _points(
@@ -303,7 +283,8 @@ def require_maps(name: str, value: Tensor) -> None:
 
 
 def require_each(fine: Tensor, value: Tensor, sentence: str) -> None:
-    """Raises ValueError for the first image b that is not ``fine`` [B]: "image b SENTENCE value[b]"."""
+    """Raises ValueError for the first image b that is not ``fine`` ([B], or [] of pooled images): "image b SENTENCE
+    value[b]"."""
     if not fine.all():
-        image = int((~fine).nonzero()[0])
-        raise ValueError(f"image {image} {sentence} {value[image].item():.6g}")
+        image = int((~fine).reshape(-1).nonzero()[0])
+        raise ValueError(f"image {image} {sentence} {value.reshape(-1)[image].item():.6g}")

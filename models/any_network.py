@@ -11,9 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.outputs import OutputSpec
+from ufmstar_torch.models.outputs import OutputSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
+
+Spec = ProgramSpec | Mapping[str, Any] | str | Path
 
 
 class WrappedNetwork(DepthNetwork):
@@ -80,36 +82,35 @@ def wrap_network(
     return WrappedNetwork(network, spec, preprocess or Preprocess())
 
 
-def load_torchscript(path: str | Path, outputs: OutputSpec, preprocess: Preprocess | None = None) -> WrappedNetwork:
+def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
     """A TorchScript file (``torch.jit.save``) as a network, on the CPU. Such a file is a program: load only
     what you trust.
 
+    Args:
+        path: the file.
+        spec: a :class:`ProgramSpec`, its plain values or a JSON file.
+
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a TorchScript file.
+        ValueError: it is not a TorchScript file, or the spec is missing or impossible.
     """
-    _check_file(path)
+    declared = ProgramSpec.required(spec)
     try:
-        module = torch.jit.load(str(path), map_location="cpu")
+        module = torch.jit.load(_existing(path), map_location="cpu")
     except RuntimeError as error:
         raise ValueError(f"{path} is not a readable TorchScript file: {error}") from error
-    return WrappedNetwork(module.eval(), outputs, preprocess or Preprocess())
+    return WrappedNetwork(module.eval(), declared.outputs, declared.preprocess or Preprocess())
 
 
-def load_exported(path: str | Path, outputs: OutputSpec, preprocess: Preprocess | None = None) -> WrappedNetwork:
-    """A ``torch.export`` file (``torch.export.save``, .pt2) as a network. Such a file is a program: load
-    only what you trust.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not such a file.
-    """
-    _check_file(path)
+def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
+    """A ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments, trust and errors as
+    :func:`load_torchscript`."""
+    declared = ProgramSpec.required(spec)
     try:
-        program = torch.export.load(str(path))
+        program = torch.export.load(_existing(path))
     except (RuntimeError, ValueError, BadZipFile) as error:
         raise ValueError(f"{path} is not a readable torch.export file: {error}") from error
-    return WrappedNetwork(_Exported(program.module()), outputs, preprocess or Preprocess())
+    return WrappedNetwork(_Exported(program.module()), declared.outputs, declared.preprocess or Preprocess())
 
 
 class _Exported(nn.Module):
@@ -127,9 +128,10 @@ class _Exported(nn.Module):
         return self
 
 
-def _check_file(path: str | Path) -> None:
+def _existing(path: str | Path) -> str:
     if not Path(path).is_file():
         raise FileNotFoundError(f"no network file {path}")
+    return str(path)
 
 
 def _named(result: Any) -> dict[str | int, Tensor]:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ufmstar_torch.camera import unproject
 from ufmstar_torch.models.alignment import KINDS, Alignment, require_each, require_maps
 from ufmstar_torch.models.robust_fit import robust_fit
 
@@ -85,18 +86,27 @@ def align_to_camera_height(
         ValueError: wrong shapes, values out of range, or no such plane; the image is named.
     """
     require_maps("prediction", prediction)
-    _check(kind, height_m, at_infinity, up_cam, max_tilt_deg, tolerance, min_share)
+    _require_options(kind, height_m, at_infinity, up_cam, max_tilt_deg, tolerance, min_share)
+    batch, inverse = len(prediction), kind == "inverse"
+    if tuple(intrinsics.shape) not in ((3, 3), (batch, 3, 3)):
+        raise ValueError(f"intrinsics must be [3, 3] or [{batch}, 3, 3], got {tuple(intrinsics.shape)}")
+    K = intrinsics.to(prediction.device, torch.float64).expand(batch, 3, 3)
+    rays = unproject(torch.ones_like(prediction, dtype=torch.float64), K).flatten(1, 2)  # third component 1
     x = prediction.detach().double().flatten(1)
-    rays = _rays(prediction, intrinsics)
-    down = _down(up_cam, len(x), x)
-    use = x.isfinite() & _looked_at(prediction, rays, down, valid)
-    use = use if kind == "inverse" and at_infinity is None else use & (x > (at_infinity or 0.0))
+    down = _down(up_cam, batch, x)
+    if valid is None:
+        area = (rays @ down[..., None])[..., 0] > math.sin(_BELOW_HORIZON) * rays.norm(dim=-1)
+    elif valid.dtype == torch.bool and valid.shape == prediction.shape:
+        area = valid.flatten(1)
+    else:
+        raise ValueError(f"valid must be bool {tuple(prediction.shape)}, got {valid.dtype} {tuple(valid.shape)}")
+    use = area & x.isfinite() & (x > (-math.inf if at_infinity is None else at_infinity))
     count = use.sum(1)
     require_each(count >= 10, count, "needs at least 10 pixels that look at the ground with a prediction, has")
     if at_infinity is None:
         reciprocal, infinity, inlier = _line(x, rays, down, use, seed)
     else:
-        y = torch.where(use, x - at_infinity if kind == "inverse" else 1 / x, 1)
+        y = torch.where(use, x - at_infinity if inverse else 1 / x, 1)
         reciprocal, down, inlier = _plane(y, rays, down, use, math.cos(math.radians(max_tilt_deg)), tolerance, seed)
         infinity = torch.full_like(reciprocal, at_infinity)
     share = inlier.sum(1) / count
@@ -104,10 +114,10 @@ def align_to_camera_height(
         share >= min_share, share, f"shows no ground plane on {min_share:.0%} of the pixels looked at; the share is"
     )
     # y = (n . r) / h' has slope 1/h' in the prediction's units, and 1/d = scale y must have slope 1/height.
-    scale = 1 / (reciprocal * height_m) if kind == "inverse" else reciprocal * height_m
+    scale = 1 / (reciprocal * height_m) if inverse else reciprocal * height_m
     if pooled:
         scale, infinity = scale.median(), infinity.median()
-    shift = -scale * infinity if kind == "inverse" else torch.zeros_like(scale)
+    shift = -scale * infinity if inverse else torch.zeros_like(scale)
     return GroundFit(Alignment(kind, scale, shift, max_depth), down, inlier.view(prediction.shape))
 
 
@@ -134,48 +144,24 @@ def _line(x: Tensor, rays: Tensor, down: Tensor, use: Tensor, seed: int) -> tupl
     below = (rays @ down[..., None])[..., 0]
     design = torch.stack([below, torch.ones_like(below)], -1)
     fit = robust_fit(design, torch.where(use, x, 0), use, torch.ones_like(x), seed=seed)
-    slope = fit.theta[:, 0]
-    require_each(
-        fit.determined & (slope > 0), slope, "does not grow downwards as inverse depth of a ground would; slope"
-    )
-    return slope, fit.theta[:, 1], fit.inlier
-
-
-def _rays(prediction: Tensor, intrinsics: Tensor) -> Tensor:
-    """[B, H W, 3] float64, with third component 1."""
-    batch, height, width = prediction.shape
-    if tuple(intrinsics.shape) not in ((3, 3), (batch, 3, 3)):
-        raise ValueError(f"intrinsics must be [3, 3] or [{batch}, 3, 3], got {tuple(intrinsics.shape)}")
-    K = intrinsics.to(prediction.device, torch.float64).expand(batch, 3, 3)
-    rows, columns = (torch.arange(n, dtype=K.dtype, device=K.device) for n in (height, width))
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    pixels = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3)
-    return pixels @ torch.linalg.inv(K).mT
+    slope, infinity = fit.theta.unbind(1)
+    fine = fit.determined & (slope > 0)
+    require_each(fine, slope, "does not grow downwards as inverse depth of a ground would; slope")
+    return slope, infinity, fit.inlier
 
 
 def _down(up_cam: Tensor | None, batch: int, like: Tensor) -> Tensor:
     """[B, 3] unit vectors."""
-    if up_cam is None:
-        return like.new_tensor([0.0, 1.0, 0.0]).expand(batch, 3)
-    if tuple(up_cam.shape) not in ((3,), (batch, 3)):
-        raise ValueError(f"up_cam must be [3] or [{batch}, 3], got {tuple(up_cam.shape)}")
-    down = -up_cam.to(like).expand(batch, 3)
-    size = down.norm(dim=-1, keepdim=True)
+    up = like.new_tensor([0.0, -1.0, 0.0]) if up_cam is None else up_cam.to(like)
+    if tuple(up.shape) not in ((3,), (batch, 3)):
+        raise ValueError(f"up_cam must be [3] or [{batch}, 3], got {tuple(up.shape)}")
+    size = up.norm(dim=-1, keepdim=True)
     if not ((size > 0) & size.isfinite()).all():
-        raise ValueError(f"up_cam must be a direction, got {up_cam.tolist()}")
-    return down / size
+        raise ValueError(f"up_cam must be a direction, got {up.tolist()}")
+    return (-up / size).expand(batch, 3)
 
 
-def _looked_at(prediction: Tensor, rays: Tensor, down: Tensor, valid: Tensor | None) -> Tensor:
-    """[B, H W] bool."""
-    if valid is None:
-        return (rays @ down[..., None])[..., 0] > math.sin(_BELOW_HORIZON) * rays.norm(dim=-1)
-    if valid.dtype != torch.bool or valid.shape != prediction.shape:
-        raise ValueError(f"valid must be bool {tuple(prediction.shape)}, got {valid.dtype} {tuple(valid.shape)}")
-    return valid.flatten(1)
-
-
-def _check(
+def _require_options(
     kind: str,
     height_m: float,
     at_infinity: float | None,
@@ -184,21 +170,19 @@ def _check(
     tolerance: float,
     min_share: float,
 ) -> None:
+    """Raises ValueError for the first option that is out of range or contradicts another."""
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {KINDS}, got {kind!r}")
     if not 0 < height_m < math.inf:
         raise ValueError(f"height_m must be positive metres, got {height_m}")
     if kind == "affine" and at_infinity != 0:
-        raise ValueError(f"at_infinity must be 0 for kind 'affine', whose shift no plane can tell, got {at_infinity}")
+        raise ValueError(f"at_infinity must be 0 for kind 'affine', as no plane fixes its shift, got {at_infinity}")
     if at_infinity is None and up_cam is None:
         raise ValueError(
             "one height gives one number: with at_infinity=None the exact up_cam is needed, since without it an "
             "unknown shift looks like a tilt of the ground"
         )
-    for name, value, limit in (
-        ("max_tilt_deg", max_tilt_deg, 90),
-        ("tolerance", tolerance, 1),
-        ("min_share", min_share, 1),
-    ):
+    limits = {"max_tilt_deg": (max_tilt_deg, 90), "tolerance": (tolerance, 1), "min_share": (min_share, 1)}
+    for name, (value, limit) in limits.items():
         if not 0 < value < limit:
             raise ValueError(f"{name} must be between 0 and {limit}, got {value}")

@@ -22,20 +22,11 @@ from torch import Tensor, nn
 _CONTAINERS = ("state_dict", "model_state_dict", "model")
 _PREFIXES = ("module.", "_orig_mod.", "state_dict.", "model.", "network.")
 _TORCH_SUFFIXES = (".pth", ".pt", ".ckpt", ".bin", ".tar")
+_UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SUFFIXES)}"
 # How the files of torch.save begin: an archive, or (before 1.6) the pickled magic number of its own format.
 _BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
 # What the restricted unpickler was seen to raise on damaged bytes; it documents none of it.
-_DAMAGE = (
-    EOFError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    AssertionError,
-    struct.error,
-)
+_DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, AttributeError, AssertionError)
 _SHOWN = 8  # keys named in an error message
 
 
@@ -96,10 +87,9 @@ def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
         if key in state and state[key].shape != expected[key].shape
     ]
     not_finite = [key for key in sorted(state) if not torch.isfinite(state[key]).all()]
-    faults = [("missing", missing), ("unexpected", unexpected), ("of another shape", shapes)]
-    faults.append(("with NaN or infinity", not_finite))
-    texts = [f"{len(keys)} {what}: {_some(keys)}" for what, keys in faults if keys]
-    if texts:
+    faults = {"missing": missing, "unexpected": unexpected, "of another shape": shapes}
+    faults["with NaN or infinity"] = not_finite
+    if texts := [f"{len(keys)} {what}: {some(keys)}" for what, keys in faults.items() if keys]:
         fit = f"{source} does not fit {type(module).__name__} ({len(expected)} keys)"
         raise CheckpointError(f"{fit}: {'; '.join(texts)}")
     module.load_state_dict(state, strict=True)
@@ -131,7 +121,7 @@ def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[st
             keys = [] if prefix is None else [name for name in names if name.startswith(prefix)]
             tensors = {key[len(prefix or "") :]: file.get_tensor(key) for key in keys}
         return tensors, json.loads(text)
-    except (safetensors.Error, json.JSONDecodeError) as error:
+    except (safetensors.SafetensorError, json.JSONDecodeError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
 
 
@@ -169,11 +159,11 @@ def _write(file: Any, path: Path, state: dict[str, Tensor], metadata: str) -> No
     if path.suffix == ".safetensors":
         # Tensors that share memory are not allowed there; a copy each costs little.
         separate = {key: value.clone() for key, value in state.items()}
-        file.write(_safetensors().save(separate, metadata={"metadata": metadata}))
+        file.write(_safetensors().torch.save(separate, metadata={"metadata": metadata}))
     elif path.suffix in _TORCH_SUFFIXES:
         torch.save({"state_dict": state, "metadata": json.loads(metadata)}, file)
     else:
-        raise _unknown_suffix(path)
+        raise CheckpointError(_UNKNOWN_SUFFIX.format(path))
 
 
 def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
@@ -181,13 +171,9 @@ def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
     if not path.is_file():
         raise FileNotFoundError(f"no file of weights {path}")
     if path.suffix == ".safetensors":
-        safetensors = _safetensors()
-        try:
-            return dict(safetensors.load_file(path))
-        except safetensors.Error as error:
-            raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
+        return read_safetensors(path)[0]
     if path.suffix not in _TORCH_SUFFIXES:
-        raise _unknown_suffix(path)
+        raise CheckpointError(_UNKNOWN_SUFFIX.format(path))
     return _weights_in(_read_torch(path), path, ignore)
 
 
@@ -203,7 +189,7 @@ def _read_torch(path: Path) -> Any:
             f"{path} is damaged or holds pickled Python objects (a whole module?), which are never loaded because "
             "they can run code; save the module's state_dict() with the program that made it, and load that"
         ) from error
-    except _DAMAGE as error:
+    except (*_DAMAGE, struct.error) as error:
         raise CheckpointError(f"{path} is damaged or not a file of torch.save: {error}") from error
 
 
@@ -215,9 +201,8 @@ def _weights_in(content: Any, path: Path, ignore: Collection[str]) -> dict[str, 
     if not isinstance(content, Mapping) or not content:
         raise CheckpointError(f"{path} holds no weights but {type(content).__name__}")
     content = {key: value for key, value in content.items() if key not in ignore}
-    others = [key for key, value in content.items() if not isinstance(value, Tensor) or not isinstance(key, str)]
-    if others:
-        raise CheckpointError(f"{path} holds more than named tensors: {_some(others)}")
+    if others := [k for k, value in content.items() if not isinstance(value, Tensor) or not isinstance(k, str)]:
+        raise CheckpointError(f"{path} holds more than named tensors: {some(others)}")
     return dict(content)
 
 
@@ -231,24 +216,17 @@ def _without_prefixes(state: dict[str, Tensor], keep: set[str] | None = None) ->
     return state
 
 
-def _some(keys: list[Any]) -> str:
+def some(keys: list[Any]) -> str:
+    """The first keys of a list as text, and how many more there are."""
     more = f", ... ({len(keys) - _SHOWN} more)" if len(keys) > _SHOWN else ""
     return ", ".join(str(key) for key in keys[:_SHOWN]) + more
 
 
-def _unknown_suffix(path: Path) -> CheckpointError:
-    return CheckpointError(f"{path} must end in .safetensors or one of {', '.join(_TORCH_SUFFIXES)}")
-
-
-class _safetensors:
-    """The functions of safetensors in use, imported when first needed."""
-
-    def __init__(self) -> None:
-        try:
-            from safetensors import SafetensorError, safe_open
-            from safetensors.torch import load_file, save
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                "a .safetensors file needs the package safetensors: pip install safetensors"
-            ) from error
-        self.Error, self.load_file, self.save, self.safe_open = SafetensorError, load_file, save, safe_open
+def _safetensors() -> Any:
+    """The package, imported when first needed."""
+    try:
+        import safetensors.torch
+    except ModuleNotFoundError as error:
+        message = "a .safetensors file needs the package safetensors: pip install safetensors"
+        raise ModuleNotFoundError(message) from error
+    return safetensors

@@ -7,18 +7,23 @@ CC BY-NC 4.0: not for commercial use.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from ufmstar_torch.checked import Checked
+from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face import HuggingFaceDepth, own_preprocess, patch_size
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, own_preprocess, patch_size, with_alignment
 from ufmstar_torch.models.hugging_face_files import read_checkpoint
+from ufmstar_torch.models.network import DepthNetwork
 
 SIZES = ("small", "base", "large")
 VARIANTS = ("indoor", "outdoor", "relative")
-# What the published checkpoints' image processors say; for directories without preprocessor_config.json.
+# The published checkpoints' image processors, for directories without preprocessor_config.json.
 _PROCESSOR = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225], "resample": 3}
 
 
@@ -88,3 +93,29 @@ class DepthAnything(HuggingFaceDepth):
             checkpoint = replace(checkpoint, processor=_PROCESSOR)
         preprocess = own_preprocess(checkpoint, size, keep_aspect)
         return cls.of_checkpoint(checkpoint, preprocess, dtype=dtype).to(device)
+
+
+@dataclass(frozen=True)
+class DepthAnythingSpec(Checked):
+    """Arguments of :meth:`DepthAnything.from_pretrained` for configuration files, and the alignment of a relative
+    checkpoint."""
+
+    size: tuple[int, int] = (518, 518)
+    keep_aspect: bool = False
+    alignment: Alignment | None = None
+
+
+def load_depth_anything(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
+    """The metric network in a directory, or of a hub name.
+
+    Args:
+        weights: directory or name.
+        spec: :class:`DepthAnythingSpec`, as plain values or a JSON file.
+
+    Raises:
+        ValueError: an unknown option, or a relative checkpoint without an alignment; others as
+            :meth:`DepthAnything.from_pretrained`.
+    """
+    declared = DepthAnythingSpec.read(spec or {})
+    network = DepthAnything.from_pretrained(weights, size=declared.size, keep_aspect=declared.keep_aspect)
+    return with_alignment(network, declared.alignment)

@@ -21,9 +21,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from ufmstar_torch.models.checkpoints import fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
-from ufmstar_torch.models.network import Backbone
-from ufmstar_torch.models.onnx_weights import ConvLayer, read_conv_chain
+from ufmstar_torch.models.network import Backbone, require_image
+from ufmstar_torch.models.onnx_weights import read_convolutions
 from ufmstar_torch.models.preprocess import Preprocess
 
 MULTIPLE = 32  # [px] five halvings
@@ -33,6 +34,8 @@ _STRIDES = (2, 1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1, 2, 1)
 _SKIPS = {1: 5, 2: 3, 3: 1}
 # [m] Depth that an untrained network predicts: typical of rooms, and where a ReLU has a gradient.
 INITIAL_DEPTH = 2.5
+# [1] Largest relative difference between ONNX Runtime's depth and ours that is rounding.
+_AGREEMENT = 1e-3
 # The last activation, and what it turns into INITIAL_DEPTH.
 _POSITIVE: dict[str, tuple[type[nn.Module], float]] = {
     "relu": (nn.ReLU, INITIAL_DEPTH),
@@ -199,7 +202,7 @@ class FastDepth(Backbone):
         Raises:
             ValueError: the image has another shape or type.
         """
-        _check_image(image)
+        require_image(image, MULTIPLE)
         x, skips = image, {}
         for i, block in enumerate(self.encoder):
             x = block(x)
@@ -219,21 +222,21 @@ class FastDepth(Backbone):
     def from_onnx(cls, path: str | Path, *, dropout: float = 0.0, size: tuple[int, int] = (224, 224)) -> FastDepth:
         """The network with the weights of an ONNX export, in eval mode.
 
-        The widths are read from the file; every convolution's place in the graph is compared with this
-        network's, every initialiser must be used and every parameter filled. Batch norms stay batch norms
-        (with their counters), so fine-tuning goes on as if from a checkpoint after ``.train()``; a file
-        that has them folded gives a network without norm layers (``norm=False``).
+        The widths are read from the file, every weight in it must be used and every parameter filled, and on one
+        random image the network must agree with ONNX Runtime. Batch norms stay batch norms (with their counters), so
+        fine-tuning goes on as if from a checkpoint after ``.train()``; a file that has them folded gives a network
+        without norm layers (``norm=False``).
 
         Args:
             path: the ONNX file.
             dropout, size: as in the class.
 
         Raises:
-            ModuleNotFoundError: ``onnx`` is not installed.
+            ModuleNotFoundError: ``onnx`` or ``onnxruntime`` is not installed (extra ``models``).
             FileNotFoundError: there is no such file.
             ValueError: the file is broken or holds another network.
         """
-        layers = read_conv_chain(path)
+        layers = read_convolutions(path)
         expected = 1 + 2 * (len(_STRIDES) - 1) + 2 * 5 + 1
         if len(layers) != expected:
             raise ValueError(f"{path} is not a FastDepth: expected {expected} convolutions, got {len(layers)}")
@@ -243,8 +246,14 @@ class FastDepth(Backbone):
         outputs = [layer.weight.shape[0] for layer in layers]
         encoder, decoder = (outputs[0], *outputs[2:27:2]), tuple(outputs[28:37:2])
         network = cls(FastDepthWidths(encoder, decoder), norm=not folded.pop(), dropout=dropout, size=size)
-        network._fill(layers, str(path))
-        return network.eval()
+        state: dict[str, Tensor] = {}
+        for (name, unit), layer in zip(network._units(), layers, strict=True):
+            state |= {f"{name}.{key}": value for key, value in layer.state().items()}
+            if isinstance(unit.norm, nn.BatchNorm2d):
+                unit.norm.eps = layer.norm_eps
+        fill(network, state, str(path))
+        _require_same_function(network.eval(), path)
+        return network
 
     def folded(self) -> FastDepth:
         """A copy for inference with every batch norm folded into its convolution, in eval mode: the same
@@ -264,50 +273,51 @@ class FastDepth(Backbone):
             if isinstance(module, ConvUnit):
                 yield name, module
 
-    def _structures(self) -> list[dict[str, object]]:
-        """What ``ConvLayer.structure`` should be for every convolution of this network."""
-        names = [name for name, _ in self._units()]
-        structures = []
-        for name, unit in self._units():
-            decoder = name.startswith("decoder") and name.endswith("pointwise")
-            skip = _SKIPS.get(int(name.split(".")[1])) if decoder else None
-            structures.append(
-                {
-                    "weight": tuple(unit.conv.weight.shape),
-                    "stride": unit.conv.stride[0],
-                    "padding": unit.conv.padding[0],
-                    "groups": unit.conv.groups,
-                    "activation": type(unit.activation).__name__.lower(),
-                    "upsampled": decoder,
-                    "skip": None if skip is None else names.index(f"encoder.{skip}.pointwise"),
-                }
-            )
-        return structures
 
-    def _fill(self, layers: list[ConvLayer], path: str) -> None:
-        """Load the layers' weights after comparing their place in the graph with this network's."""
-        state: dict[str, Tensor] = {}
-        for (name, unit), layer, structure in zip(self._units(), layers, self._structures(), strict=True):
-            found = layer.structure()
-            wrong = [
-                f"{key} {found[key]}, expected {structure[key]}" for key in structure if found[key] != structure[key]
-            ]
-            if wrong:
-                raise ValueError(f"{path} is not a FastDepth: the convolution for {name} has {'; '.join(wrong)}")
-            state[f"{name}.conv.weight"] = layer.weight
-            bias = layer.bias
-            if isinstance(unit.norm, nn.BatchNorm2d):
-                unit.norm.eps = layer.norm_eps
-                counter = {"num_batches_tracked": torch.zeros((), dtype=torch.int64)}
-                state.update({f"{name}.norm.{key}": value for key, value in (counter | layer.norm).items()})
-                if bias is not None:
-                    # A bias before batch norm only shifts the mean that is subtracted again.
-                    state[f"{name}.norm.running_mean"] = layer.norm["running_mean"] - bias
-            elif bias is None:
-                state[f"{name}.conv.bias"] = torch.zeros(len(layer.weight))
-            else:
-                state[f"{name}.conv.bias"] = bias
-        self.load_state_dict(state, strict=True)
+def load_fastdepth(
+    weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, positive: str = "relu"
+) -> FastDepth:
+    """The network in an ONNX export or a state_dict file, with the widths of the file.
+
+    Raises:
+        ValueError: the file does not fit, or ``positive`` contradicts an ONNX export, which ends in a ReLU.
+        FileNotFoundError, ModuleNotFoundError: as :meth:`FastDepth.from_onnx` and ``load_state_dict_file``.
+    """
+    if weights.suffix == ".onnx":
+        if positive != "relu":
+            raise ValueError(f"an ONNX export of FastDepth ends in a ReLU, got positive={positive!r}")
+        return FastDepth.from_onnx(weights, dropout=dropout, size=size)
+    state = load_state_dict_file(weights)
+    try:
+        widths = FastDepthWidths.of_state_dict(state)
+    except ValueError as error:
+        raise ValueError(f"{weights}: {error}") from error
+    norm = "encoder.0.norm.weight" in state
+    network = FastDepth(widths, norm=norm, dropout=dropout, positive=positive, size=size)
+    fill(network, state, str(weights))
+    return network
+
+
+def _require_same_function(network: FastDepth, path: str | Path) -> None:
+    """Raises ValueError where ONNX Runtime returns another depth than the network, on an image of large noise, which
+    reaches both ends of the activations."""
+    from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
+    from ufmstar_torch.models.outputs import METRIC, OutputSpec
+
+    graph = OnnxNetwork(path, OnnxSpec(OutputSpec(METRIC)), threads=1)
+    size = [side or 2 * MULTIPLE for side in graph.size]
+    image = 8 * torch.rand(graph.batch or 1, 3, *size, generator=torch.Generator().manual_seed(0)) - 4
+    with torch.inference_mode():
+        try:
+            depth, expected = network(image).depth, graph(image).depth
+        except ValueError as error:
+            raise ValueError(f"{path} is not a FastDepth: {error}") from error
+    apart, largest = float((depth - expected).abs().max()), float(expected.abs().max())
+    if not apart <= _AGREEMENT * largest:
+        raise ValueError(
+            f"{path} is not a FastDepth: its graph computes another depth from the same weights (up to {apart:.3g} m "
+            f"apart, of at most {largest:.3g} m)"
+        )
 
 
 def _bias(unit: ConvUnit) -> Tensor:
@@ -315,14 +325,3 @@ def _bias(unit: ConvUnit) -> Tensor:
     bias = unit.norm.bias if isinstance(unit.norm, nn.BatchNorm2d) else unit.conv.bias
     assert isinstance(bias, Tensor)
     return bias
-
-
-def _check_image(image: Tensor) -> None:
-    if image.dim() != 4 or image.shape[1] != 3 or not torch.is_floating_point(image):
-        raise ValueError(f"image must be floating-point [B, 3, H, W] in [0, 1], got {image.dtype} {tuple(image.shape)}")
-    height, width = image.shape[-2:]
-    if height % MULTIPLE or width % MULTIPLE or not height or not width:
-        raise ValueError(
-            f"image must have a height and width that are multiples of {MULTIPLE} px, got {height} x {width}; "
-            "FastDepth.preprocess makes 224 x 224"
-        )

@@ -1,12 +1,13 @@
 """Depth models of Hugging Face's ``transformers``, from a hub name or a local directory.
 
-What such a model's numbers mean stands in few of the configurations ("depth_estimation_type"). Where it does
-not, it has to be declared, as always here; where both exist, they have to agree.
+Few configurations state what the model's numbers mean ("depth_estimation_type"). The others need a declaration, as
+every network here; where both exist, they have to agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,17 +15,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ufmstar_torch.checked import Checked
 from ufmstar_torch.models.aligned import AlignedNetwork
 from ufmstar_torch.models.alignment import KINDS, Alignment
 from ufmstar_torch.models.hugging_face_files import Checkpoint, load_model, read_checkpoint
-from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.network import DepthNetwork, require_image
 from ufmstar_torch.models.outputs import METRIC
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 # Pillow's numbers, which the configurations use.
 _LINEAR, _CUBIC = 2, 3
-# What "depth_estimation_type" says, in the words of this package. "relative" is inverse depth in all of them.
+# "depth_estimation_type" in the terms of this package; "relative" is inverse depth in all of them.
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
 
 
@@ -47,16 +49,7 @@ class RawDepth(nn.Module):
         Raises:
             ValueError: the image has another shape, or sides that are no multiples of ``multiple``.
         """
-        if image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
-            raise ValueError(
-                f"image must be floating-point [B, 3, H, W] as preprocess returns it, got {image.dtype} "
-                f"{tuple(image.shape)}"
-            )
-        size = (image.shape[-2], image.shape[-1])
-        if 0 in size or size[0] % self.multiple or size[1] % self.multiple:
-            raise ValueError(
-                f"image must have sides that are multiples of {self.multiple} px, got {size[0]} x {size[1]}"
-            )
+        size = require_image(image, self.multiple)
         dtype = next(self.model.parameters()).dtype
         depth: Tensor = self.model(pixel_values=image.to(dtype)).predicted_depth
         depth = depth if depth.dtype == torch.float64 else depth.float()
@@ -118,11 +111,14 @@ class HuggingFaceDepth(DepthNetwork):
         Raises:
             ValueError: the network is relative, or the image does not fit.
         """
-        self.require_metric()
-        return DepthPrediction(self.raw(image) * self.scale)
+        return DepthPrediction(self.required().raw(image) * self.scale)
 
-    def require_metric(self) -> None:
-        """Raises ValueError if the network is relative."""
+    def required(self) -> Self:
+        """This network.
+
+        Raises:
+            ValueError: it is relative.
+        """
         if not self.is_metric:
             what = "inverse depth" if self.kind == "inverse" else "depth"
             raise ValueError(
@@ -130,6 +126,7 @@ class HuggingFaceDepth(DepthNetwork):
                 "give it an Alignment, fitted to measured depth (fit_inverse_depth, fit_affine_depth) or to the "
                 "camera's height (align_to_camera_height), by network.aligned(alignment); or use a metric checkpoint"
             )
+        return self
 
     def aligned(self, alignment: Alignment) -> AlignedNetwork:
         """The metric network that a relative one becomes by a fixed alignment; the weights are shared.
@@ -193,64 +190,113 @@ def from_hugging_face(
     return network.to(device)
 
 
+@dataclass(frozen=True)
+class HuggingFaceSpec(Checked):
+    """Arguments of :func:`from_hugging_face` for configuration files, and the alignment of a relative network."""
+
+    kind: str | None = None
+    scale: float = 1.0
+    size: tuple[int, int] | None = None
+    keep_aspect: bool | None = None
+    preprocess: Preprocess | None = None
+    allow_missing: tuple[str, ...] = ()
+    alignment: Alignment | None = None
+
+
+def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
+    """The metric network in a directory, or of a hub name.
+
+    Args:
+        weights: directory or name.
+        spec: :class:`HuggingFaceSpec`, as plain values or a JSON file.
+
+    Raises:
+        ValueError: an unknown option, or a relative checkpoint without an alignment; others as
+            :func:`from_hugging_face`.
+    """
+    declared = HuggingFaceSpec.read(spec or {})
+    options = {f.name: getattr(declared, f.name) for f in fields(declared) if f.name != "alignment"}
+    return with_alignment(from_hugging_face(weights, **options), declared.alignment)
+
+
+def with_alignment(network: HuggingFaceDepth, alignment: Alignment | None) -> DepthNetwork:
+    """The aligned network, or without an alignment the network itself.
+
+    Raises:
+        ValueError: the network is relative and has no alignment, or is metric and has one.
+    """
+    if alignment is not None:
+        return network.aligned(alignment)
+    try:
+        return network.required()
+    except ValueError as error:
+        example = f'{{"alignment": {{"kind": "{network.kind}", "scale": ..., "shift": ...}}}}'
+        raise ValueError(f"{error}. In a spec: {example}") from error
+
+
 def own_preprocess(
     checkpoint: Checkpoint, size: tuple[int, int] | None = None, keep_aspect: bool | None = None
 ) -> Preprocess:
     """The preprocessing that a checkpoint's image processor describes.
 
     Raises:
-        ValueError: it says nothing of what is needed, or wants what ``Preprocess`` cannot do.
+        ValueError: the description lacks what is needed, or asks for what ``Preprocess`` cannot do.
     """
-    says = checkpoint.processor
-    unknown = [name for name in ("do_center_crop", "do_flip_channel_order") if says.get(name)]
-    if unknown or says.get("resample", _CUBIC) not in (_LINEAR, _CUBIC):
+    processor, name = checkpoint.processor, checkpoint.name
+    unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if processor.get(option)]
+    resample = processor.get("resample", _CUBIC)
+    if unknown or resample not in (_LINEAR, _CUBIC):
         raise ValueError(
-            f"{checkpoint.name}: its image processor asks for {unknown or 'resample ' + str(says['resample'])}, which "
-            "is not supported: give a Preprocess of your own"
+            f"{name}: its image processor asks for {unknown or f'resample {resample}'}, which is not supported: give a "
+            "Preprocess of your own"
         )
-    own = says.get("size")
+    own = processor.get("size")
     if size is None and isinstance(own, dict) and {"height", "width"} <= set(own):
         size = (int(own["height"]), int(own["width"]))
-    if size is None or not says:
-        raise ValueError(f"{checkpoint.name} does not say what its input needs: give size or a Preprocess of your own")
-    keep = bool(says.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
-    multiple = max(patch_size(checkpoint), int(says.get("ensure_multiple_of") or says.get("size_divisor") or 1))
-    normal = bool(says.get("do_normalize", True))
-    mean, std = (says.get(name) if normal else None for name in ("image_mean", "image_std"))
-    if normal and (mean is None or std is None):
-        raise ValueError(f"{checkpoint.name}: its image processor normalises, but names no image_mean and image_std")
-    return Preprocess.from_dict(
-        {
-            "size": tuple(size),
-            "aspect_multiple": multiple if keep else None,
-            "value_range": 255 * float(says.get("rescale_factor", 1 / 255)) if says.get("do_rescale", True) else 255.0,
-            "mean": tuple(mean or (0.0, 0.0, 0.0)),
-            "std": tuple(std or (1.0, 1.0, 1.0)),
-            "cubic": says.get("resample", _CUBIC) == _CUBIC,
-        }
+    if size is None or not processor:
+        raise ValueError(f"{name} does not say what its input needs: give size or a Preprocess of your own")
+    keep = bool(processor.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
+    divisor = int(processor.get("ensure_multiple_of") or processor.get("size_divisor") or 1)
+    mean, std = processor.get("image_mean"), processor.get("image_std")
+    if not processor.get("do_normalize", True):
+        mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    if mean is None or std is None:
+        raise ValueError(f"{name}: its image processor normalises, but names no image_mean and image_std")
+    factor = float(processor.get("rescale_factor", 1 / 255)) if processor.get("do_rescale", True) else 1.0
+    return Preprocess(
+        size=tuple(size),  # type: ignore[arg-type]
+        aspect_multiple=max(patch_size(checkpoint), divisor) if keep else None,
+        value_range=255 * factor,
+        mean=tuple(mean),
+        std=tuple(std),
+        cubic=resample == _CUBIC,
     )
 
 
 def patch_size(checkpoint: Checkpoint) -> int:
-    """[px] what an input's sides have to be multiples of: Depth Anything's patches; 1 where others decide."""
+    """[px] what an input's sides have to be multiples of: the patch of a vision transformer, otherwise 1."""
     value: Any = checkpoint.config.get("patch_size", 14 if checkpoint.model_type == "depth_anything" else 1)
     return int(max(value)) if isinstance(value, (list, tuple)) else int(value or 1)
 
 
 def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
-    said = checkpoint.config.get(
-        "depth_estimation_type", "relative" if checkpoint.model_type == "depth_anything" else None
-    )
-    if said is not None and said not in _DECLARED:
-        raise ValueError(f"{checkpoint.name}: depth_estimation_type must be one of {list(_DECLARED)}, got {said!r}")
-    own = None if said is None else _DECLARED[said]
-    if own is None and kind is None:
+    """ "metric", "inverse" or "affine", from the configuration and the declaration."""
+    default = "relative" if checkpoint.model_type == "depth_anything" else None
+    stated = checkpoint.config.get("depth_estimation_type", default)
+    if stated is None and kind is None:
         raise ValueError(
             f"{checkpoint.name} ({checkpoint.model_type}) does not say whether its depth is metric: declare "
             "kind='metric', 'inverse' (inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
         )
-    if own is not None and kind not in (None, own):
-        raise ValueError(f"kind={kind!r}, but {checkpoint.name} says depth_estimation_type {said!r}, which is {own!r}")
+    if stated is None:
+        return str(kind)
+    if stated not in _DECLARED:
+        raise ValueError(f"{checkpoint.name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
+    own = _DECLARED[stated]
+    if kind not in (None, own):
+        raise ValueError(
+            f"kind={kind!r}, but {checkpoint.name} says depth_estimation_type {stated!r}, which is {own!r}"
+        )
     if own == METRIC and "max_depth" not in checkpoint.config:
         raise ValueError(f"{checkpoint.name} says metric, but not the max_depth [m] that its output is a share of")
-    return own or kind or ""
+    return own

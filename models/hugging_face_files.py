@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,9 +15,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from ufmstar_torch.models.checkpoints import CheckpointError
+from ufmstar_torch.models.checkpoints import CheckpointError, some
 
-_SHOWN = 5  # weights named in an error message
 _TO_DOWNLOAD = "with a connection, `hf download NAME --local-dir DIR` fetches it; a directory needs no connection"
 
 
@@ -30,7 +29,7 @@ class Checkpoint:
         folder: None if it comes from the hub.
         config: config.json.
         processor: preprocessor_config.json, empty if there is none.
-        options: for every further question to ``transformers``.
+        options: keyword arguments for every further call of ``transformers``.
     """
 
     name: str
@@ -62,24 +61,27 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None, local_files_o
     if folder is not None and not (folder / "config.json").is_file():
         what = f"{folder} has no config.json" if folder.is_dir() else f"no such directory: {folder}"
         raise FileNotFoundError(f"{what}; a checkpoint of transformers is a directory with config.json and weights")
+    source = str(folder or name)
     options = {"local_files_only": local_files_only or folder is not None, "revision": revision or "main"}
-    try:
-        config, _ = PreTrainedConfig.get_config_dict(str(folder or name), **options)
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        if folder is None:
-            raise OSError(
-                f"{name} is no directory and cannot be had from the Hugging Face hub: {error}; {_TO_DOWNLOAD}"
-            ) from error
-        raise CheckpointError(f"{folder}/config.json cannot be read: {error}") from error
-    processor: dict[str, Any] = {}
-    if folder is None or any((folder / f).is_file() for f in ("preprocessor_config.json", "processor_config.json")):
+
+    def read(file: str, reader: Callable[..., tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
         try:
-            processor, _ = ImageProcessingMixin.get_image_processor_dict(str(folder or name), **options)
+            values = reader(source, **options)[0]
         except (OSError, ValueError, TypeError, AttributeError) as error:
-            raise CheckpointError(f"{folder or name}: preprocessor_config.json cannot be read: {error}") from error
-    if not isinstance(config, dict) or not isinstance(processor, dict):
-        raise CheckpointError(f"{folder or name}: config.json and preprocessor_config.json must hold JSON objects")
-    return Checkpoint(str(folder or name), folder, config, processor, options)
+            if folder is None and file == "config.json":
+                raise OSError(
+                    f"{name} is no directory and cannot be had from the Hugging Face hub: {error}; {_TO_DOWNLOAD}"
+                ) from error
+            raise CheckpointError(f"{source}: {file} cannot be read: {error}") from error
+        if not isinstance(values, dict):
+            raise CheckpointError(f"{source}: {file} must hold a JSON object")
+        return values
+
+    config = read("config.json", PreTrainedConfig.get_config_dict)
+    files = ("preprocessor_config.json", "processor_config.json")
+    has_processor = folder is None or any((folder / file).is_file() for file in files)
+    processor = read(files[0], ImageProcessingMixin.get_image_processor_dict) if has_processor else {}
+    return Checkpoint(source, folder, config, processor, options)
 
 
 def load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: Sequence[str] = ()) -> nn.Module:
@@ -110,14 +112,12 @@ def load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: Sequen
         ) from error
     missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(allow_missing)))
     if missing:
-        more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
         raise CheckpointError(
-            f"{checkpoint.name} lacks weights, which would stay random: {', '.join(missing[:_SHOWN])}{more}; where the "
-            "model does not use them, name them in allow_missing"
+            f"{checkpoint.name} lacks weights, which would stay random: {some(missing)}; where the model does not use "
+            "them, name them in allow_missing"
         )
-    broken = [key for key, value in model.state_dict().items() if not value.isfinite().all()]
-    if broken:
-        raise CheckpointError(f"{checkpoint.name} has weights that are not finite: {', '.join(broken[:_SHOWN])}")
+    if broken := [key for key, value in model.state_dict().items() if not value.isfinite().all()]:
+        raise CheckpointError(f"{checkpoint.name} has weights that are not finite: {some(broken)}")
     return model.eval()
 
 
@@ -129,7 +129,7 @@ def _is_path(name: str) -> bool:
 
 @contextmanager
 def _quiet(local: bool) -> Iterator[None]:
-    """No progress bar for reading a local file of a second, and no report on the weights, which are checked here."""
+    """Without the progress bar of a local file, and without a report on the weights, which are checked here."""
     from transformers.utils import logging
 
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()

@@ -18,9 +18,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.checkpoints import CheckpointError, load_state_dict_file
+from ufmstar_torch.models.checkpoints import CheckpointError, fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
-from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models.network import Backbone, fits, require_image
 from ufmstar_torch.models.preprocess import Preprocess
 
 MULTIPLE = 32  # [px] five halvings
@@ -122,7 +122,7 @@ class MonodepthResNet(Backbone):
         super().__init__()
         if len(decoder) != LEVELS or min(decoder) < 1:
             raise ValueError(f"decoder must be {LEVELS} positive numbers of channels, got {decoder}")
-        if not _fits(*size):
+        if not fits(*size, MULTIPLE, SMALLEST):
             raise ValueError(f"size must be multiples of {MULTIPLE} px, at least {SMALLEST}, got {size}")
         self.layers, self.strides = layers, strides
         self.preprocess = Preprocess.nyu(size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
@@ -150,7 +150,7 @@ class MonodepthResNet(Backbone):
         Raises:
             ValueError: the image has another shape or type.
         """
-        _check_image(image)
+        require_image(image, MULTIPLE, SMALLEST)
         skips = self.encoder(image)
         x = skips.pop()
         for level in reversed(self.levels):
@@ -210,6 +210,21 @@ def shape_of_state_dict(state: Mapping[str, Tensor]) -> tuple[int, tuple[int, ..
     return layers, tuple(len(state[key]) for key in decoder)
 
 
+def load_monodepth_resnet(
+    weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, strides: str = "v1.5"
+) -> MonodepthResNet:
+    """The network in a state_dict file, with the layers and widths of the file; errors as
+    ``checkpoints.load_weights``."""
+    state = load_state_dict_file(weights)
+    try:
+        layers, decoder = shape_of_state_dict(state)
+    except ValueError as error:
+        raise ValueError(f"{weights}: {error}") from error
+    network = MonodepthResNet(layers, strides=strides, dropout=dropout, decoder=decoder, size=size)
+    fill(network, state, str(weights))
+    return network
+
+
 def _fill_encoder(encoder: ResNetEncoder, state: Mapping[str, Tensor], source: str) -> None:
     """Load every tensor of a classifier's weights but the classifier itself.
 
@@ -250,17 +265,3 @@ def _torchvision_models() -> Any:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("a ResNet encoder needs torchvision: pip install torchvision") from error
     return torchvision.models
-
-
-def _fits(height: int, width: int) -> bool:
-    return not height % MULTIPLE and not width % MULTIPLE and min(height, width) >= SMALLEST
-
-
-def _check_image(image: Tensor) -> None:
-    if image.dim() != 4 or image.shape[1] != 3 or not torch.is_floating_point(image):
-        raise ValueError(f"image must be floating-point [B, 3, H, W], got {image.dtype} {tuple(image.shape)}")
-    if not _fits(*image.shape[-2:]):
-        raise ValueError(
-            f"image must have a height and width that are multiples of {MULTIPLE} px, at least {SMALLEST}, got "
-            f"{image.shape[-2]} x {image.shape[-1]}; MonodepthResNet.preprocess makes such images"
-        )

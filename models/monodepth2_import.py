@@ -18,7 +18,7 @@ from torch import Tensor
 from ufmstar_torch.models.checkpoints import CheckpointError, load_state_dict_file
 from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD, LEVELS, MonodepthResNet
 
-# What encoder.pth tells about its training beside the weights.
+# What encoder.pth holds beside the weights.
 _NO_WEIGHTS = ("height", "width", "use_stereo")
 # Monodepth2 normalises every colour of an image in [0, 1] by these.
 _MEAN, _STD = 0.45, 0.225
@@ -64,18 +64,18 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     loaded: dict[str, Tensor] = {}
     for path, place in ((encoder_path, _encoder_place), (depth_path, _decoder_place)):
         state = load_state_dict_file(path, ignore=_NO_WEIGHTS)
-        found, unused = {}, {}
+        fitting, unused = {}, {}
         for key, value in state.items():
             target, reason = place(key)
             reason = reason or _fault(target, value, expected)
             if reason:
                 unused[key] = reason
             else:
-                found[target] = value
-        if not found:
+                fitting[target] = value
+        if not fitting:
             why = ": ".join(next(iter(unused.items()), ("it is empty",)))
             raise CheckpointError(f"nothing in {path} fits the network; {why}")
-        loaded |= found
+        loaded |= fitting
         skipped |= unused
     _to_imagenet_colours(loaded)
     network.load_state_dict(expected | loaded, strict=True)

@@ -44,3 +44,29 @@ class Backbone(DepthNetwork):
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; no variances."""
         return DepthPrediction(self.depth(self.features(image)))
+
+
+def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[int, int]:
+    """(H, W) [px] of a network's input.
+
+    Args:
+        image: what must be floating-point [B, 3, H, W].
+        multiple: [px] that H and W must be multiples of.
+        smallest: [px] allowed for H and W.
+
+    Raises:
+        ValueError: another shape, type or size.
+    """
+    if image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
+        shape = f"{image.dtype} {tuple(image.shape)}"
+        raise ValueError(f"image must be floating-point [B, 3, H, W] as the network's preprocess makes it, got {shape}")
+    height, width = image.shape[-2:]
+    if not fits(height, width, multiple, smallest):
+        wanted = f"multiples of {multiple} px" + (f", at least {smallest}" if smallest > multiple else "")
+        raise ValueError(f"image must have a height and width that are {wanted}, got {height} x {width}")
+    return height, width
+
+
+def fits(height: int, width: int, multiple: int, smallest: int) -> bool:
+    """Whether both sides [px] are multiples of ``multiple`` and at least ``smallest``."""
+    return not height % multiple and not width % multiple and min(height, width) >= smallest

@@ -1,17 +1,13 @@
 """Any depth network that was exported to ONNX, run by ONNX Runtime.
 
 What the graph states (names, sizes, types, a fixed batch) is read from it; what it cannot state (how the
-input is scaled, in which unit the output is) is declared by an :class:`OnnxSpec`, in JSON for instance::
-
-    {"preprocess": {"resize_height": 250, "crop": [228, 304], "size": [224, 224]},
-     "outputs": {"kind": "metric", "scale": 1.0}}
+input is scaled, in which unit the output is) is declared by an :class:`OnnxSpec`.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.outputs import OutputSpec
+from ufmstar_torch.checked import choice
+from ufmstar_torch.models.network import DepthNetwork, require_image
+from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -37,11 +34,11 @@ _ERRORS_ONLY = 3  # ONNX Runtime's severity; below it, it reports every unused w
 
 
 @dataclass(frozen=True)
-class OnnxSpec:
-    """What an ONNX file does not say about itself.
+class OnnxSpec(ProgramSpec):
+    """What an ONNX file does not state.
 
     Attributes:
-        outputs: which output is depth, in which unit; and the variances, if any.
+        outputs: as in :class:`ProgramSpec`; outputs are named.
         preprocess: what the input needs; None: the image in [0, 1], stretched to the graph's size if that
             is fixed. A fixed size of the graph is taken over where ``preprocess.size`` is None.
         input: name of the image input; None where the graph has only one.
@@ -52,69 +49,14 @@ class OnnxSpec:
         ValueError: a field is out of range.
     """
 
-    outputs: OutputSpec
-    preprocess: Preprocess | None = None
     input: str | None = None
-    layout: str = "NCHW"
-    channels: str = "rgb"
+    layout: str = choice("NCHW", "NHWC")
+    channels: str = choice("rgb", "bgr")
 
     def __post_init__(self) -> None:
-        if not isinstance(self.outputs, OutputSpec):
-            raise ValueError(f"OnnxSpec.outputs must be an OutputSpec, got {type(self.outputs).__name__}")
+        super().__post_init__()
         if isinstance(self.outputs.depth, int):
             raise ValueError(f"OnnxSpec.outputs must name ONNX outputs, got position {self.outputs.depth}")
-        if self.layout not in ("NCHW", "NHWC"):
-            raise ValueError(f"OnnxSpec.layout must be 'NCHW' or 'NHWC', got {self.layout!r}")
-        if self.channels not in ("rgb", "bgr"):
-            raise ValueError(f"OnnxSpec.channels must be 'rgb' or 'bgr', got {self.channels!r}")
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> OnnxSpec:
-        """From JSON's plain values.
-
-        Raises:
-            ValueError: an unknown key, no ``outputs``, or a field out of range.
-        """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"an ONNX spec has no {unknown}; it has {sorted(known)}")
-        plain = dict(values)
-        if not isinstance(plain.get("outputs"), Mapping):
-            raise ValueError("an ONNX spec must declare its outputs, as {'outputs': {'kind': 'metric', ...}}")
-        plain["outputs"] = OutputSpec.from_dict(plain["outputs"])
-        if plain.get("preprocess") is not None:
-            plain["preprocess"] = Preprocess.from_dict(plain["preprocess"])
-        return cls(**plain)
-
-    @classmethod
-    def from_json(cls, path: str | Path) -> OnnxSpec:
-        """From a JSON file.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: not JSON, or as :meth:`from_dict`; the message names the file.
-        """
-        values = read_json(path)
-        try:
-            return cls.from_dict(values)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-
-
-def read_json(path: str | Path) -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not JSON, or not an object; the message names the file.
-    """
-    try:
-        values = json.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
-    if not isinstance(values, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {type(values).__name__}")
-    return values
 
 
 class OnnxNetwork(DepthNetwork):
@@ -160,35 +102,31 @@ class OnnxNetwork(DepthNetwork):
         if self.input_type not in _NUMPY_TYPES:
             raise ValueError(f"{self.path}: input {name!r} is {self.input_type}, expected one of {list(_NUMPY_TYPES)}")
         shape = [d if isinstance(d, int) and d > 0 else None for d in inputs[name].shape]
-        channels, self.size = _channels_and_size(shape, self.spec.layout)
-        if len(shape) != 4 or channels not in (3, None):
+        order = (0, 1, 2, 3) if self.spec.layout == "NCHW" else (0, 3, 1, 2)
+        if len(shape) != 4 or shape[order[1]] not in (3, None):
             raise ValueError(
                 f"{self.path}: input {name!r} has shape {inputs[name].shape}, expected 4 dimensions with 3 "
                 f"channels in layout {self.spec.layout}"
             )
-        self.batch = shape[0]
+        self.batch, _, *self.size = (shape[i] for i in order)
         outputs = [o.name for o in self.session.get_outputs()]
-        missing = [n for n in self.spec.outputs.names() if n not in outputs]
-        if missing or (self.spec.outputs.depth is None and len(outputs) != 1):
-            raise ValueError(
-                f"{self.path}: the graph's outputs are {outputs}; "
-                + (f"it has no {missing}" if missing else "declare which one is depth")
-            )
         declared = [str(n) for n in self.spec.outputs.names()]
+        missing = [n for n in declared if n not in outputs]
+        if missing or (self.spec.outputs.depth is None and len(outputs) != 1):
+            fault = f"it has no {missing}" if missing else "declare which one is depth"
+            raise ValueError(f"{self.path}: the graph's outputs are {outputs}; {fault}")
         self.fetched = outputs if self.spec.outputs.depth is None else declared
 
     def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:
         height, width = self.size
         if height is None or width is None:
             return preprocess
-        if preprocess.size is None:
-            return replace(preprocess, size=(height, width))
-        if tuple(preprocess.size) != (height, width):
+        if preprocess.size is not None and tuple(preprocess.size) != (height, width):
             raise ValueError(
                 f"{self.path}: input {self.input!r} has a fixed size of {height} x {width} px, but the spec's "
                 f"preprocess.size is {preprocess.size}"
             )
-        return preprocess
+        return replace(preprocess, size=(height, width))
 
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] on the image's device.
@@ -217,14 +155,10 @@ class OnnxNetwork(DepthNetwork):
         return prediction
 
     def _check(self, image: Tensor) -> None:
-        height, width = self.size
-        fits = image.dim() == 4 and image.shape[1] == 3 and torch.is_floating_point(image)
-        fits = fits and height in (None, image.shape[-2]) and width in (None, image.shape[-1])
-        if not fits:
-            raise ValueError(
-                f"{self.path}: the image for input {self.input!r} must be floating-point [B, 3, {height or 'H'}, "
-                f"{width or 'W'}], got {image.dtype} {tuple(image.shape)}"
-            )
+        height, width = require_image(image)
+        if self.size[0] not in (None, height) or self.size[1] not in (None, width):
+            fixed = " x ".join(str(side or "any") for side in self.size)
+            raise ValueError(f"{self.path}: input {self.input!r} has a fixed size of {fixed}, got {height} x {width}")
         if self.batch and len(image) % self.batch:
             raise ValueError(
                 f"{self.path}: input {self.input!r} has a fixed batch of {self.batch}, which must divide the "
@@ -270,8 +204,8 @@ def _session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSe
         raise ValueError(f"{path} is not an ONNX file that ONNX Runtime can run: {error}") from error
 
 
-def _channels_and_size(shape: Sequence[int | None], layout: str) -> tuple[int | None, tuple[int | None, int | None]]:
-    if len(shape) != 4:
-        return None, (None, None)
-    channels, height, width = (shape[1], shape[2], shape[3]) if layout == "NCHW" else (shape[3], shape[1], shape[2])
-    return channels, (height, width)
+def load_onnx(
+    weights: Path, spec: OnnxSpec | Mapping[str, Any] | str | Path | None = None, **options: Any
+) -> OnnxNetwork:
+    """An ONNX network from a spec, its plain values or a JSON file; options and errors as :class:`OnnxNetwork`."""
+    return OnnxNetwork(weights, OnnxSpec.required(spec), **options)

@@ -7,22 +7,24 @@ depth, disparity or depth up to scale (and shift) are refused here, where their 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ufmstar_torch.checked import Checked, choice, number
+from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 METRIC = "metric"
 NOT_METRIC = ("inverse", "disparity", "relative", "affine")
-SPREADS = ("variance", "std", "log_variance")
 
 
 @dataclass(frozen=True)
-class OutputSpec:
+class OutputSpec(Checked):
     """The meaning of a network's outputs.
 
     Attributes:
@@ -43,11 +45,11 @@ class OutputSpec:
 
     kind: str
     depth: str | int | None = None
-    scale: float = 1.0
+    scale: float = number(1.0, "", "m", 0.0, open_low=True, open_high=True)
     aleatoric: str | int | None = None
-    aleatoric_kind: str = "variance"
+    aleatoric_kind: str = choice("variance", "std", "log_variance")
     epistemic: str | int | None = None
-    epistemic_kind: str = "variance"
+    epistemic_kind: str = choice("variance", "std", "log_variance")
     resize: bool = False
 
     def __post_init__(self) -> None:
@@ -59,25 +61,7 @@ class OutputSpec:
             )
         if self.kind != METRIC:
             raise ValueError(f"OutputSpec.kind must be {METRIC!r} (refused: {NOT_METRIC}), got {self.kind!r}")
-        if not 0 < self.scale < float("inf"):
-            raise ValueError(f"OutputSpec.scale must be positive metres per unit, got {self.scale}")
-        for name in ("aleatoric_kind", "epistemic_kind"):
-            if getattr(self, name) not in SPREADS:
-                raise ValueError(f"OutputSpec.{name} must be one of {SPREADS}, got {getattr(self, name)!r}")
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> OutputSpec:
-        """From JSON.
-
-        Raises:
-            ValueError: an unknown key, no ``kind``, or a field out of range.
-        """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"outputs have no {unknown}; they have {sorted(known)}")
-        if "kind" not in values:
-            raise ValueError(f"outputs must declare their 'kind': {METRIC!r} for depth in a known unit of length")
-        return cls(**values)
+        super().__post_init__()
 
     def names(self) -> list[str | int]:
         """The outputs that are declared by name."""
@@ -133,3 +117,39 @@ class OutputSpec:
                 "is used with; set resize to bring it there"
             )
         return F.interpolate(value[:, None], size, mode="nearest-exact")[:, 0]
+
+
+@dataclass(frozen=True)
+class ProgramSpec(Checked):
+    """What the file of a saved program does not state, in JSON for instance::
+
+        {"preprocess": {"resize_height": 250, "crop": [228, 304], "size": [224, 224]},
+         "outputs": {"kind": "metric", "scale": 1.0}}
+
+    Attributes:
+        outputs: which output is depth, in which unit; and the variances, if any.
+        preprocess: what the input needs; None: the image in [0, 1] at its own size.
+
+    Raises:
+        ValueError: a field is out of range.
+    """
+
+    outputs: OutputSpec
+    preprocess: Preprocess | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, kind in (("outputs", OutputSpec), ("preprocess", Preprocess | None)):
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise ValueError(f"{type(self).__name__}.{name} must be settings, got {type(value).__name__}")
+
+    @classmethod
+    def required(cls, spec: Self | Mapping[str, Any] | str | Path | None) -> Self:
+        """As :meth:`read`, with an explanation where ``spec`` is None."""
+        if spec is None:
+            raise ValueError(
+                "this network needs a spec, which declares what its file does not state; for metric depth in metres "
+                '{"outputs": {"kind": "metric"}}'
+            )
+        return cls.read(spec)

@@ -13,8 +13,7 @@ mean over a depth edge is a place where nothing is.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -22,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
+from ufmstar_torch.checked import Checked, number
 
 # [1] What a float image may exceed [0, 1] by: filters that overshoot, noise; but not a range of 0..255.
 _RANGE_SLACK = 0.5
@@ -40,7 +40,7 @@ class Geometry:
 
 
 @dataclass(frozen=True)
-class Preprocess:
+class Preprocess(Checked):
     """What a network wants to see; immutable, usable as a function.
 
     Attributes:
@@ -60,28 +60,25 @@ class Preprocess:
         ValueError: a field is out of range.
     """
 
-    resize_height: int | None = None
+    resize_height: int | None = number(None, "", "px", 1)
     crop: tuple[int, int] | None = None
     size: tuple[int, int] | None = None
-    aspect_multiple: int | None = None
-    value_range: float = 1.0
+    aspect_multiple: int | None = number(None, "", "px", 1)
+    value_range: float = number(1.0, "", "1", 0.0, open_low=True)
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     antialias: bool = True
     cubic: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("crop", "size"):
             value = getattr(self, name)
             if value is not None and (len(value) != 2 or min(value) < 1 or any(v != int(v) for v in value)):
                 raise ValueError(f"Preprocess.{name} must be (height, width) in pixels, got {value}")
-        if self.resize_height is not None and self.resize_height < 1:
-            raise ValueError(f"Preprocess.resize_height must be positive, got {self.resize_height}")
         multiple = self.aspect_multiple
-        if multiple is not None and (multiple < 1 or multiple != int(multiple) or self.size is None):
-            raise ValueError(f"Preprocess.aspect_multiple must be positive pixels and goes with size, got {multiple}")
-        if not self.value_range > 0:
-            raise ValueError(f"Preprocess.value_range must be positive, got {self.value_range}")
+        if multiple is not None and (multiple != int(multiple) or self.size is None):
+            raise ValueError(f"Preprocess.aspect_multiple must be whole pixels and needs a size, got {multiple}")
         if len(self.mean) != 3 or len(self.std) != 3 or not min(self.std) > 0:
             raise ValueError(
                 f"Preprocess.mean and .std must be 3 numbers, std positive, got {self.mean} and {self.std}"
@@ -92,23 +89,6 @@ class Preprocess:
         """NYU Depth V2's validation as FastDepth uses it: height 250 (480 x 640 becomes 250 x 333), centre
         228 x 304, then ``size``. Portrait images are resized to width 304 instead."""
         return replace(cls(resize_height=250, crop=(228, 304), size=size), **changes)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Preprocess:
-        """From JSON: lists become tuples.
-
-        Raises:
-            ValueError: an unknown key, or a field out of range.
-        """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"Preprocess has no {unknown}; it has {sorted(known)}")
-        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**plain)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The fields as plain values."""
-        return asdict(self)
 
     def geometry(self, height: int, width: int) -> Geometry:
         """The sizes of every step for an image of height x width [px].

@@ -55,13 +55,16 @@ def least_squares(design: Tensor, target: Tensor, weight: Tensor) -> tuple[Tenso
         theta [B, p] (NaN where undetermined) and determined [B].
     """
     weighted = design * weight[..., None]
-    gram = weighted.mT @ design
+    return solve_normal(weighted.mT @ design, (weighted.mT @ target[..., None])[..., 0])
+
+
+def solve_normal(gram: Tensor, moment: Tensor) -> tuple[Tensor, Tensor]:
+    """theta [..., p] of gram [..., p, p] theta = moment [..., p], NaN where undetermined, and determined [...]."""
     size = gram.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(gram.dtype).tiny).sqrt()
     unit = gram / (size[..., :, None] * size[..., None, :])
     determined = torch.linalg.eigvalsh(unit)[..., 0] > _RANK
     eye = torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device)
-    solvable = torch.where(determined[..., None, None], unit, eye)
-    theta = torch.linalg.solve(solvable, (weighted.mT @ target[..., None])[..., 0] / size) / size
+    theta = torch.linalg.solve(torch.where(determined[..., None, None], unit, eye), moment / size) / size
     return torch.where(determined[..., None], theta, torch.nan), determined
 
 
@@ -88,20 +91,15 @@ def robust_fit(
         admissible: whether theta [..., p] is possible at all, [...] bool.
         seed: of the samples.
     """
-    root = weight.sqrt()
-    pick = _random_points(valid, min(_JUDGES, valid.shape[1]), seed)
-    count = valid.sum(1).clamp_max(pick.shape[1])
-    judge_design = design.gather(1, pick[..., None].expand(-1, -1, design.shape[-1]))
-    judge_target, judge_root, judge_valid = (value.gather(1, pick) for value in (target, root, valid))
-    bound = None if tolerance is None else tolerance.gather(1, pick)
-    theta = _best_hypothesis(judge_design, judge_target, judge_root, judge_valid, count, bound, admissible, seed)
-    inlier, determined = valid, valid.new_zeros(len(valid))
+    unit = weight.sqrt() if tolerance is None else 1 / tolerance.clamp_min(torch.finfo(tolerance.dtype).tiny)
     # Residuals in units of their expected size (up to a factor), or of the tolerance.
-    unit = root if tolerance is None else 1 / tolerance.clamp_min(torch.finfo(tolerance.dtype).tiny)
+    scaled, goal = design * unit[..., None], target * unit
+    theta = _best_hypothesis(scaled, goal, valid, tolerance is not None, admissible, seed)
+    inlier, determined = valid, valid.new_zeros(len(valid))
     for _ in range(_REFITS):
-        previous, residual = inlier, (target - (design @ theta[..., None])[..., 0]).abs() * unit
+        previous, residual = inlier, (goal - (scaled @ theta[..., None])[..., 0]).abs()
         near = valid if tolerance is None else valid & (residual <= 1)
-        inlier = near & (residual <= _cut(residual, target * unit, near, design.shape[-1]))
+        inlier = near & (residual <= _cut(residual, goal, near, design.shape[-1]))
         refit, determined = least_squares(design, target, weight * inlier)
         theta = torch.where(determined[:, None], refit, theta)
         if torch.equal(inlier, previous):
@@ -114,42 +112,35 @@ def masked_median(value: Tensor, valid: Tensor) -> Tensor:
     return torch.where(valid, value, torch.nan).nanmedian(-1).values.nan_to_num(torch.inf)
 
 
-def _random_points(valid: Tensor, number: int, seed: int) -> Tensor:
-    """[B, number] indices, valid ones first, in random order; a row's choice does not depend on the batch."""
-    generator = torch.Generator().manual_seed(seed)
-    keys = torch.rand(valid.shape[1], generator=generator, dtype=torch.float64).to(valid.device)
-    return torch.where(valid, keys, -1.0).topk(number, dim=1).indices
-
-
 def _best_hypothesis(
     design: Tensor,
     target: Tensor,
-    root: Tensor,
     valid: Tensor,
-    count: Tensor,
-    tolerance: Tensor | None,
+    bounded: bool,
     admissible: Callable[[Tensor], Tensor] | None,
     seed: int,
 ) -> Tensor:
-    """theta [B, p] of the minimal sample that the judges like best."""
-    unknowns = design.shape[-1]
-    generator = torch.Generator().manual_seed(seed + 1)
+    """theta [B, p] of the minimal sample with the smallest residuals: in the median, or where ``bounded`` in the sum
+    of squares, each at most 1. The samples of a row do not depend on the others in the batch."""
+    generator, unknowns = torch.Generator().manual_seed(seed), design.shape[-1]
+    row = torch.arange(len(design), device=design.device)
+    keys = torch.rand(valid.shape[1], generator=generator, dtype=torch.float64).to(design.device)
+    judges = torch.where(valid, keys, -1.0).topk(min(_JUDGES, valid.shape[1])).indices  # valid ones first
+    design, target, valid = (value[row[:, None], judges] for value in (design, target, valid))
     share = torch.rand(_HYPOTHESES, unknowns, generator=generator, dtype=torch.float64).to(design.device)
-    chosen = (share * count[:, None, None]).long().clamp_max(design.shape[1] - 1).flatten(1)  # [B, N p]
-    rows = design.gather(1, chosen[..., None].expand(-1, -1, unknowns)).unflatten(1, (-1, unknowns))
-    values = target.gather(1, chosen).unflatten(1, (-1, unknowns))
-    theta, _ = torch.linalg.solve_ex(rows, values)  # repeated points make singular systems: not finite, or judged bad
+    chosen = (share * valid.sum(1)[:, None, None]).long()  # [B, N, p]
+    sample = row[:, None, None], chosen
+    theta, _ = torch.linalg.solve_ex(design[sample], target[sample])  # of repeated points: not finite, or judged bad
     usable = theta.isfinite().all(-1)
+    theta = theta.nan_to_num()
     if admissible is not None:
         usable = usable & admissible(theta)
-    residual = (target[:, None] - theta.nan_to_num() @ design.mT).abs()
-    if tolerance is None:
-        score = masked_median(residual * root[:, None], valid[:, None].expand_as(residual))
+    residual = (target[:, None] - theta @ design.mT).abs()  # [B, N, P]
+    if bounded:
+        score = (residual.clamp_max(1).square() * valid[:, None]).sum(-1)
     else:
-        relative = (residual / tolerance.clamp_min(torch.finfo(tolerance.dtype).tiny)[:, None]).clamp_max(1)
-        score = (relative.square() * valid[:, None]).sum(-1)
-    best = torch.where(usable, score, torch.inf).argmin(1)
-    return theta.nan_to_num()[torch.arange(len(theta), device=theta.device), best]
+        score = masked_median(residual, valid[:, None].expand_as(residual))
+    return theta[row, torch.where(usable, score, torch.inf).argmin(1)]
 
 
 def _cut(residual: Tensor, target: Tensor, valid: Tensor, unknowns: int) -> Tensor:

@@ -2,38 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
+from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble
 from ufmstar_torch.models.heads import HEADS, UncertaintyNetwork, with_head
 from ufmstar_torch.models.network import Backbone
 from ufmstar_torch.models.preprocess import Preprocess
 
-ARCHITECTURES = ("fastdepth", "monodepth2")
-METHODS = ("depth", "aleatoric", "evidential", "mc_dropout", "batch_ensemble")
 _MULTIPLE = 32  # [px] both architectures halve the image five times
 _SMALLEST = {"fastdepth": 32, "monodepth2": 64}  # [px]
-_CHOICES = {
-    "architecture": ARCHITECTURES,
-    "method": METHODS,
-    "layers": (18, 34, 50),
-    "strides": ("v1", "v1.5"),
-    "preprocess": ("nyu", "resize"),
-    "positive": ("relu", "softplus"),
-}
-# Fields that say something of one architecture only; elsewhere they must keep their defaults, so that
-# two specs of the same network are equal.
+# Fields of one architecture; with the other they keep their defaults, so that two specs of the same network are equal.
 _ONLY = {"widths": "fastdepth", "norm": "fastdepth", "positive": "fastdepth"}
 _ONLY |= {"layers": "monodepth2", "strides": "monodepth2"}
 
 
 @dataclass(frozen=True)
-class NetworkSpec:
+class NetworkSpec(Checked):
     """Everything that decides what :func:`build_network` builds, apart from the weights.
 
-    An ensemble is several "aleatoric" networks of one spec; how many, its files say.
+    An ensemble is several "aleatoric" networks of one spec; its files state how many.
 
     Attributes:
         architecture: "fastdepth" or "monodepth2".
@@ -55,36 +44,30 @@ class NetworkSpec:
         ValueError: a value that cannot be, or fields that contradict each other.
     """
 
-    architecture: str = "fastdepth"
-    method: str = "aleatoric"
+    architecture: str = choice("fastdepth", "monodepth2")
+    method: str = choice("aleatoric", "depth", "evidential", "mc_dropout", "batch_ensemble")
     widths: str | float = "full"
     norm: bool = True
-    positive: str = "relu"
-    layers: int = 50
-    strides: str = "v1.5"
-    dropout: float = 0.0
-    members: int = 1
+    positive: str = choice("relu", "softplus")
+    layers: int = choice(50, 34, 18)
+    strides: str = choice("v1.5", "v1")
+    dropout: float = number(0.0, "p", "1", 0.0, 1.0, open_high=True)
+    members: int = number(1, "N", "networks", 1)
     size: tuple[int, int] = (224, 224)
-    preprocess: str = "nyu"
+    preprocess: str = choice("nyu", "resize")
 
     def __post_init__(self) -> None:
-        for name, choices in _CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise ValueError(f"NetworkSpec.{name} must be one of {list(choices)}, got {getattr(self, name)!r}")
-        if not _is_width(self.widths):
-            raise ValueError(f"NetworkSpec.widths must be 'full', 'pruned' or a positive number, got {self.widths!r}")
-        if type(self.norm) is not bool:
-            raise ValueError(f"NetworkSpec.norm must be true or false, got {self.norm!r}")
-        if not _is_number(self.dropout) or not 0 <= self.dropout < 1:
-            raise ValueError(f"NetworkSpec.dropout must lie in [0, 1), got {self.dropout!r}")
+        super().__post_init__()
+        width = self.widths
+        positive = isinstance(width, (int, float)) and not isinstance(width, bool) and 0 < width < float("inf")
+        if width not in ("full", "pruned") and not positive:
+            raise ValueError(f"NetworkSpec.widths must be 'full', 'pruned' or a positive number, got {width!r}")
         if self.method == "mc_dropout" and not self.dropout:
             raise ValueError("NetworkSpec.dropout must be positive for 'mc_dropout', which samples by it")
-        several = self.method == "batch_ensemble"
-        if type(self.members) is not int or (self.members < 2 if several else self.members != 1):
-            wanted = "at least 2 for 'batch_ensemble'" if several else f"1 for {self.method!r}"
-            raise ValueError(f"NetworkSpec.members must be {wanted}, got {self.members!r}")
-        size = self.size
-        smallest = _SMALLEST[self.architecture]
+        if (self.members > 1) != (self.method == "batch_ensemble"):
+            wanted = "1" if self.members > 1 else "at least 2"
+            raise ValueError(f"NetworkSpec.members must be {wanted} for {self.method!r}, got {self.members}")
+        size, smallest = self.size, _SMALLEST[self.architecture]
         if type(size) is not tuple or len(size) != 2 or not all(_is_side(side, smallest) for side in size):
             wanted = f"multiples of {_MULTIPLE} px from {smallest} px on"
             raise ValueError(f"NetworkSpec.size must be (height, width) in {wanted}, got {size!r}")
@@ -92,22 +75,9 @@ class NetworkSpec:
             if _ONLY.get(f.name, self.architecture) != self.architecture and getattr(self, f.name) != f.default:
                 raise ValueError(f"NetworkSpec.{f.name} is of {_ONLY[f.name]!r} only, not of {self.architecture!r}")
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> NetworkSpec:
-        """From JSON: lists become tuples, what is missing takes its default.
-
-        Raises:
-            ValueError: an unknown key, or a value that cannot be.
-        """
-        known = [f.name for f in fields(cls)]
-        if unknown := sorted(set(values) - set(known)):
-            raise ValueError(f"NetworkSpec has no {unknown}; it has {known}")
-        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**plain)
-
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain values for JSON."""
-        return {**asdict(self), "size": list(self.size)}
+        return {**super().to_dict(), "size": list(self.size)}
 
     def input(self) -> Preprocess:
         """What brings a camera image to the network's input."""
@@ -153,16 +123,6 @@ def build_network(
     network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric")
     several = spec.method == "batch_ensemble"
     return BatchEnsemble(network, spec.members, init=init, std=std) if several else network
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _is_width(value: object) -> bool:
-    if isinstance(value, str):
-        return value in ("full", "pruned")
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")
 
 
 def _is_side(value: object, smallest: int) -> bool:

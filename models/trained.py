@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from torch import Tensor
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
 from ufmstar_torch.models.checkpoints import CheckpointError, fill, read_safetensors, save_checkpoint
 from ufmstar_torch.models.dropout import MonteCarloDropout
-from ufmstar_torch.models.ensemble import LazyMember
+from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.spec import NetworkSpec, build_network
@@ -31,12 +32,12 @@ _KEYS = {"format", "version", "spec", "networks", "info"}
 
 @dataclass(frozen=True)
 class TrainedInfo:
-    """What a file says of itself.
+    """What a file holds besides weights.
 
     Attributes:
         path: of the file.
         spec: of every network in it.
-        networks: how many there are (a BatchEnsemble is one).
+        networks: their number (a BatchEnsemble is one).
         info: what was given to :func:`save_trained`: the training's command, data, figures.
     """
 
@@ -47,7 +48,7 @@ class TrainedInfo:
 
     @property
     def members(self) -> int:
-        """How many networks :func:`load_trained` makes of it."""
+        """Number of networks that :func:`load_trained` returns."""
         return self.networks * self.spec.members
 
 
@@ -94,7 +95,7 @@ def save_trained(
 
 
 def read_info(path: str | Path) -> TrainedInfo:
-    """What a file says of itself, without reading its weights.
+    """What a file holds besides its weights, which are not read.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -114,7 +115,7 @@ def load_trained(
 
     Args:
         path: a file, or several, whose networks follow each other.
-        lazy: read a network's weights when it is first called; what the files say of themselves is read now.
+        lazy: read a network's weights when it is first called; their metadata are read now.
         offload: as :class:`LazyMember` has it.
 
     Raises:
@@ -129,13 +130,20 @@ def load_trained(
             continue
         preprocess = file.info.spec.input()
         later = [
-            LazyMember(_MemberOf(file, n), preprocess, name=f"{file.path}, member {n}", offload=offload)
+            LazyMember(partial(file.member, n), preprocess, name=f"{file.path}, member {n}", offload=offload)
             for n in range(file.info.members)
         ]
         for member in later if not lazy else []:
             member.network()
         members += later
     return members
+
+
+def load_ensemble(weights: Path) -> DepthNetwork:
+    """All networks in a file as one: the network itself, or an :class:`Ensemble` of several; errors as
+    :func:`load_trained`."""
+    members = load_trained(weights)
+    return members[0] if len(members) == 1 else Ensemble(members)
 
 
 def load_for_training(path: str | Path) -> list[UncertaintyNetwork | BatchEnsemble]:
@@ -196,19 +204,8 @@ class _TrainedFile:
         return network.eval()
 
 
-@dataclass(frozen=True)
-class _MemberOf:
-    """Reads one member: a loader for :class:`LazyMember` that can be copied and pickled."""
-
-    file: _TrainedFile
-    n: int
-
-    def __call__(self) -> DepthNetwork:
-        return self.file.member(self.n)
-
-
 def _parse(path: Path, metadata: Any) -> TrainedInfo:
-    """What a file says of itself, checked."""
+    """The metadata of a file, checked."""
     if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
         raise CheckpointError(f"{path} holds no trained networks of this package (it does not name the format)")
     version = metadata.get("version")

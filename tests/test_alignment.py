@@ -293,7 +293,7 @@ def test_alignments_go_through_json_exactly_and_check_their_values():
         (("inverse", math.nan, 0.0), "scale must be finite"),
         (("inverse", 1.0, math.inf), "shift must be finite"),
         (("inverse", torch.ones(2), 0.0), "both be numbers or both"),
-        (("inverse", 1.0, 0.0, -1.0), "max_depth must be positive"),
+        (("inverse", 1.0, 0.0, -1.0), "max_depth must lie in"),
     ):
         with pytest.raises(ValueError, match=message):
             Alignment(*values)

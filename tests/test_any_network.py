@@ -25,9 +25,10 @@ from ufmstar_torch.models import (
 )
 from ufmstar_torch.models.any_network import load_exported, load_torchscript
 from ufmstar_torch.models.load import network_names
+from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.prediction import DepthPrediction
 
-METRIC = OutputSpec("metric")
+METRIC = ProgramSpec(OutputSpec("metric"))
 
 
 @pytest.fixture
@@ -197,7 +198,7 @@ def test_refusals_by_name(tmp_path: Path) -> None:
     for name in ("onnx", "torchscript", "exported"):
         with pytest.raises(ValueError, match="needs a spec"):
             load_network(name, "n")
-    with pytest.raises(ValueError, match=r"'outputs' and, if needed, 'preprocess', got \['kind'\]"):
+    with pytest.raises(ValueError, match=r"ProgramSpec has no \['kind'\]; it has \['outputs', 'preprocess'\]"):
         load_network("exported", "n", spec={"kind": "metric"})
     assert {"exported", "fastdepth", "monodepth2", "onnx", "torchscript"} <= set(network_names())
 

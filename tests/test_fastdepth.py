@@ -241,21 +241,24 @@ def second_input(model: onnx.ModelProto) -> None:
     model.graph.input.append(helper.make_tensor_value_info("pose", onnx.TensorProto.FLOAT, [4, 4]))
 
 
+OTHER_FUNCTION = r"edited.onnx is not a FastDepth: its graph computes another depth from the same weights"
+
+
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (other_stride, "convolution for encoder.0 has stride 1, expected 2"),
-        (other_activation, r"\(Sigmoid\) does not fit"),
-        (relu_for_relu6, "activation relu, expected relu6"),
-        (other_clip, r"expected a clip to \[0, 6\].*got \[0.0, 5.0\]"),
-        (swapped_skips, "decoder.2.pointwise has skip 4, expected 6"),
-        (no_skip, "decoder.1.pointwise has skip None, expected 10"),
-        (linear_upsampling, "expected every pixel repeated twice"),
-        (threefold_upsampling, r"repeated twice, got scales \[1.0, 1.0, 3.0, 3.0\]"),
+        (other_stride, r"edited.onnx is not a FastDepth: output 'head' has \(128, 128\) px"),
+        (other_activation, OTHER_FUNCTION),
+        (relu_for_relu6, OTHER_FUNCTION),
+        (other_clip, OTHER_FUNCTION),
+        (swapped_skips, "Incompatible dimensions"),
+        (no_skip, OTHER_FUNCTION),
+        (linear_upsampling, OTHER_FUNCTION),
+        (threefold_upsampling, "Incompatible dimensions"),
         (leftover_weight, r"initialiser 'left_over' \(5,\) is used by no layer"),
-        (truncated_chain, "not in the graph's output"),
+        (truncated_chain, OTHER_FUNCTION),
         (norm_after_some, "batch norm after some convolutions only"),
-        (second_input, "must have one input"),
+        (second_input, "must be the graph's only input"),
     ],
 )
 def test_other_graphs_are_refused(tmp_path: Path, edit: Edit, message: str) -> None:

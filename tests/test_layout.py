@@ -120,6 +120,7 @@ def test_kernels_import_back_only_plain_types():
         "GaussianMixture",
         "Regression",
         "regress",
+        "distribute",
         "Correspondence",
         "PIXEL_VARIANCE",
         "UfMStarConfig",

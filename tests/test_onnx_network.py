@@ -157,11 +157,11 @@ def test_depth_that_is_not_metric_is_refused(kind: str) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({}, "must declare its outputs"),
-        ({"outputs": {}}, "must declare their 'kind'"),
+        ({}, r"OnnxSpec needs \['outputs'\]"),
+        ({"outputs": {}}, r"OutputSpec needs \['kind'\]"),
         ({"outputs": {"kind": "meters"}}, "kind must be 'metric'"),
         ({"outputs": {"kind": "metric", "unit": "mm"}}, r"no \['unit'\]"),
-        ({"outputs": {"kind": "metric", "scale": 0}}, "scale must be positive"),
+        ({"outputs": {"kind": "metric", "scale": 0}}, r"scale must lie in \(0.0, inf\)"),
         ({"outputs": {"kind": "metric", "aleatoric_kind": "sigma"}}, "aleatoric_kind must be one of"),
         ({"outputs": {"kind": "metric"}, "inputs": "x"}, r"no \['inputs'\]"),
         ({"outputs": {"kind": "metric"}, "layout": "CHW"}, "layout must be"),
@@ -213,9 +213,9 @@ def test_images_that_do_not_fit(tmp_path: Path, image: Tensor) -> None:
     network = OnnxNetwork(write(tmp_path / "n.onnx", [2, 3, 6, 8]), OnnxSpec(METRIC))
     with pytest.raises(ValueError, match="fixed batch of 2, which must divide the number of images, got 3"):
         network(image)
-    with pytest.raises(ValueError, match=r"input 'image' must be floating-point \[B, 3, 6, 8\]"):
+    with pytest.raises(ValueError, match="input 'image' has a fixed size of 6 x 8, got 8 x 6"):
         network(torch.zeros(2, 3, 8, 6))
-    with pytest.raises(ValueError, match=r"input 'image' must be floating-point \[B, 3, 6, 8\], got torch.uint8"):
+    with pytest.raises(ValueError, match=r"image must be floating-point \[B, 3, H, W\].*, got torch.uint8"):
         network(torch.zeros(2, 3, 6, 8, dtype=torch.uint8))
 
 

@@ -15,7 +15,7 @@ import scenes
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
-from ufmstar_torch.regress import regress, regress_image, sample_pixels, shares, smooth
+from ufmstar_torch.regress import distribute, regress, regress_image, sample_pixels, shares, smooth
 
 K = torch.tensor(scenes.intrinsics(40, 56))[None]
 EXACT = UfMStarConfig(prior_mean=0.3, prior_weight=2.0)
@@ -65,6 +65,9 @@ def test_shares_make_up_the_regression(config):
     value = (share * m.disagreement[:, None]).sum(-1) + (1 - share.sum(-1)) * config.prior_mean
     torch.testing.assert_close(value, result.disagreement, rtol=1e-11, atol=0)
     torch.testing.assert_close(share @ m.features, result.features, rtol=1e-11, atol=1e-300)
+    values = torch.randn(2, 20, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    for kernel in (distribute, regress_cpu.distribute):
+        torch.testing.assert_close(kernel(m, points, values, config), share.mT @ values, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])

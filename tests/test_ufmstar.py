@@ -6,10 +6,12 @@ import numpy as np
 import oracle_spgf
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import oracle
 import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors.given import Anchors
 
 HEIGHT, WIDTH = 30, 40
 SPGF = SPGFConfig(
@@ -117,26 +119,90 @@ def run(config, depths, poses, K, dtype=torch.float64):
     return ufm, outputs
 
 
+VARIANTS = {
+    "plain": {"initial_capacity": 2},
+    "overlap": {"disagreement": "overlap", "overlap_weighted": True},
+    "neighbourhood": {"regression": "neighbourhood", "features": 1},
+    "anchored": {"anchored": True, "features": 1},
+}
+
+
+def walks(streams, frames=8):
+    """Rendered sequences of ``streams`` cameras with anchors: the arguments of every frame, batched over streams."""
+    rng = np.random.default_rng(0)
+    data = [scenes.sequence(frames, HEIGHT, WIDTH, 0.03 * (s + 1), seed=s) for s in range(streams)]
+    K = torch.tensor(np.stack([scenes.intrinsics(HEIGHT, WIDTH, 60 + 5 * s) for s in range(streams)]))
+    for i in range(frames):
+        depth = torch.tensor(np.stack([d[i] for d, _, _ in data]))
+        pose = torch.tensor(np.stack([p[i] for _, p, _ in data]))
+        pixel = torch.tensor(rng.uniform(0, 1, (streams, 40, 2))) * torch.tensor([WIDTH - 1.0, HEIGHT - 1.0])
+        at = (pixel[..., 1].round() * WIDTH + pixel[..., 0].round()).long()
+        sparse = depth.flatten(1).gather(1, at) * torch.tensor(rng.normal(1.1, 0.02, (streams, 40)))
+        yield depth, pose, K, Anchors(pixel, sparse, torch.full_like(sparse, 1e-3))
+
+
+def walk(config, frames, streams=slice(None)):
+    """The outputs for some of the streams, and the module."""
+    ufm, outputs = UfMStar(config), []
+    for depth, pose, K, anchors in frames:
+        parts = [anchors.pixel, anchors.depth, anchors.variance]
+        options = {"anchors": Anchors(*(x[streams] for x in parts))} if config.anchored else {}
+        if config.features:
+            options["features"] = (depth / 10).nan_to_num()[streams, None]
+        aleatoric = (depth / 100).nan_to_num()[streams]
+        outputs.append(ufm(depth[streams], pose[streams], K[streams], aleatoric, **options))
+    return outputs, ufm
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_streams_are_independent(backend):
-    """Four different streams together equal four single runs: to the last bit by the compiled kernels;
-    the torch reference sums over padded slots, which moves the last digits."""
-    config = UfMStarConfig(segment=SPGF, backend=backend, initial_capacity=16)
-    data = [scenes.sequence(8, HEIGHT, WIDTH, 0.03 * (s + 1), seed=s) for s in range(4)]
-    K = np.stack([scenes.intrinsics(HEIGHT, WIDTH, 60 + 5 * s) for s in range(4)])
-    singles = [run(config, d, p, K[s])[1] for s, (d, p, _) in enumerate(data)]
-    together = run(
-        config,
-        [np.stack([data[s][0][i] for s in range(4)]) for i in range(8)],
-        [np.stack([data[s][1][i] for s in range(4)]) for i in range(8)],
-        K,
-    )[1]
-    for i in range(8):
-        for s in range(4):
-            mine, alone = together[i].variance[s], singles[s][i].variance[0]
-            tolerance = 0.0 if backend == "numba" else 1e-12
-            torch.testing.assert_close(mine, alone, rtol=0, atol=tolerance, equal_nan=True)
-            assert together[i].statistics.components[s] == singles[s][i].statistics.components[0]
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_streams_together_equal_streams_alone_to_the_last_bit(backend, variant):
+    """Four streams in one batch give what each gives alone, however many slots the others need."""
+    config = UfMStarConfig(segment=SPGF, backend=backend, **VARIANTS[variant])
+    frames = list(walks(4))
+    together, all_four = walk(config, frames)
+    for s in range(4):
+        alone, single = walk(config, frames, slice(s, s + 1))
+        for a, b in zip(together, alone, strict=True):
+            for name in ("variance", "disagreement", "labels", "bias", "features"):
+                x, y = getattr(a, name), getattr(b, name)
+                assert x is y is None or same_bits(x[s], y[0]), name
+            assert a.statistics.components[s] == b.statistics.components[0]
+        k = int(single.mixture.components)
+        for name, value in single.mixture.tensors().items():
+            assert same_bits(all_four.mixture.tensors()[name][s, :k], value[0, :k]), name
+
+
+def same_bits(a, b):
+    return torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) and torch.equal(a.isnan(), b.isnan())
+
+
+class Products(TorchDispatchMode):
+    """The matrix products that run: BLAS chooses their order of summation by shape and processor."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.name().removeprefix("aten::").split(".")[0]
+        if name.lstrip("_").removeprefix("foreach_") in BLAS or name.startswith(("linalg_", "_linalg_")):
+            self.seen.add(name)
+        return func(*args, **(kwargs or {}))
+
+
+BLAS = {"mm", "bmm", "addmm", "baddbmm", "addbmm", "addmv", "addr", "mv", "dot", "vdot", "matmul", "einsum", "int_mm"}
+ELEMENTWISE = {"linalg_vector_norm", "linalg_cross"}
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_no_matrix_product_in_a_step(backend, variant):
+    config = UfMStarConfig(segment=SPGF, backend=backend, **VARIANTS[variant])
+    with Products() as products:
+        _, ufm = walk(config, list(walks(2, 2)))
+        ufm.query(torch.ones(2, 5, 3))
+    assert products.seen <= ELEMENTWISE
 
 
 def test_rigid_motion_of_the_world_changes_nothing():

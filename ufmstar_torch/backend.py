@@ -27,6 +27,7 @@ class Backend:
     regress: Callable[..., Any]
     regress_image: Callable[..., Any]
     smooth: Callable[..., Any]
+    distribute: Callable[..., Any]
 
 
 TORCH = Backend(
@@ -38,6 +39,7 @@ TORCH = Backend(
     _regress.regress,
     _regress.regress_image,
     _regress.smooth,
+    _regress.distribute,
 )
 
 
@@ -81,6 +83,7 @@ def _numba_backend() -> Backend:
         regress_cpu.regress,
         regress_cpu.regress_image,
         regress_cpu.smooth,
+        regress_cpu.distribute,
     )
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ufmstar_torch.fixed_order import apply, congruence, product
+
 # Newton-Schulz contracts a deviation e of R^T R from I to about 0.75 e^2: from the tolerated 0.1 five
 # steps reach float64 rounding with two to spare.
 _POLAR_STEPS = 6
@@ -42,22 +44,21 @@ def nearest_rotation(R: Tensor) -> Tensor:
     """
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     for _ in range(_POLAR_STEPS):
-        R = R @ (1.5 * eye - 0.5 * R.mT @ R)
+        R = product(R, 1.5 * eye - 0.5 * product(R.mT, R))
     return R
 
 
 def rotation_deviation(R: Tensor) -> Tensor:
     """[...] max |R^T R - I| of R [..., 3, 3]: how far R is from a rotation or reflection."""
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    return (R.mT @ R - eye).abs().amax((-2, -1))
+    return (product(R.mT, R) - eye).abs().amax((-2, -1))
 
 
 def invert_rigid(T: Tensor) -> Tensor:
     """The inverse of rigid transforms [..., 4, 4]."""
     R_inv = T[..., :3, :3].mT
-    t_inv = -(R_inv @ T[..., :3, 3:])
-    bottom = T[..., 3:, :]
-    return torch.cat([torch.cat([R_inv, t_inv], dim=-1), bottom], dim=-2)
+    t_inv = -apply(R_inv, T[..., :3, 3])
+    return torch.cat([torch.cat([R_inv, t_inv[..., None]], dim=-1), T[..., 3:, :]], dim=-2)
 
 
 def relative_pose(T_world_a: Tensor, T_world_b: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,9 +67,8 @@ def relative_pose(T_world_a: Tensor, T_world_b: Tensor) -> tuple[Tensor, Tensor]
     The translations are subtracted first, so that large world coordinates cancel before they are rotated.
     """
     R_b_world = T_world_b[..., :3, :3].mT
-    R_rel = R_b_world @ T_world_a[..., :3, :3]
-    t_rel = (R_b_world @ (T_world_a[..., :3, 3:] - T_world_b[..., :3, 3:]))[..., 0]
-    return R_rel, t_rel
+    R_rel = product(R_b_world, T_world_a[..., :3, :3])
+    return R_rel, apply(R_b_world, T_world_a[..., :3, 3] - T_world_b[..., :3, 3])
 
 
 def project_gaussian(mean_cam: Tensor, covariance_cam: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
@@ -87,7 +87,7 @@ def project_gaussian(mean_cam: Tensor, covariance_cam: Tensor, intrinsics: Tenso
     mean = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
     zero = torch.zeros_like(z)
     A = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], dim=-1).unflatten(-1, (2, 3))
-    return mean, A @ covariance_cam @ A.mT
+    return mean, congruence(A, covariance_cam)
 
 
 def resize_intrinsics(intrinsics: Tensor, old: tuple[int, int], new: tuple[int, int]) -> Tensor:

@@ -1,62 +1,16 @@
-"""Settings of UfM*: frozen, checked, each with its symbol, unit, default and range.
-
-The metadata of a field carries what a reader of the paper wants to know: ``symbol`` (the paper's
-letter), ``unit`` and ``range``. Every value is checked when the config is made; an unknown name is a
-``TypeError`` as for any dataclass, an impossible value a ``ValueError`` that names the field.
-"""
+"""Settings of UfM*: frozen, checked (``checked``), each with its symbol, unit, default and range."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-
-def _number(
-    default: float, symbol: str, unit: str, low: float, high: float = math.inf, *, open_low: bool = False
-) -> Any:
-    """A numeric field with its allowed range [low, high] (or (low, high] with ``open_low``)."""
-    range_ = (low, high, open_low)
-    return field(default=default, metadata={"symbol": symbol, "unit": unit, "range": range_})
-
-
-def _choice(default: str, *others: str) -> Any:
-    """A field that takes one of a few words."""
-    return field(default=default, metadata={"choices": (default, *others)})
-
-
-def _check_number(owner: str, name: str, value: object, range_: tuple[float, float, bool]) -> None:
-    low, high, open_low = range_
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
-        raise ValueError(f"{owner}.{name} must be a number, got {value!r}")
-    if value < low or value > high or (open_low and value == low):
-        raise ValueError(f"{owner}.{name} must lie in {'(' if open_low else '['}{low}, {high}], got {value!r}")
-
-
-class _Checked:
-    """What every config shares: value checks, and a dict form that refuses unknown keys."""
-
-    def __post_init__(self) -> None:
-        owner = type(self).__name__
-        for f in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, f.name)
-            if "range" in f.metadata and not (value is None and f.metadata.get("optional")):
-                _check_number(owner, f.name, value, f.metadata["range"])
-                if isinstance(f.default, int) and not isinstance(value, int):
-                    raise ValueError(f"{owner}.{f.name} must be a whole number, got {value!r}")
-            if "choices" in f.metadata and value not in f.metadata["choices"]:
-                raise ValueError(f"{owner}.{f.name} must be one of {f.metadata['choices']}, got {value!r}")
-            if isinstance(f.default, bool) and not isinstance(value, bool):
-                raise ValueError(f"{owner}.{f.name} must be True or False, got {value!r}")
-
-    def to_dict(self) -> dict[str, Any]:
-        """The config as plain nested values, ready for JSON."""
-        return asdict(self)  # type: ignore[call-overload]
+from ufmstar_torch.checked import Checked, choice, number
 
 
 @dataclass(frozen=True)
-class SPGFConfig(_Checked):
+class SPGFConfig(Checked):
     """Single Pass Gaussian Fitting (section "3D Gaussian segmentation"; Li et al., ICRA 2022).
 
     Upstream's constants (:meth:`preset` has all of its configurations), stated as the paper applies them:
@@ -67,27 +21,27 @@ class SPGFConfig(_Checked):
     ``scale_with_image`` they follow the image they are applied to (see :meth:`scaled_to`).
     """
 
-    adaptive_thresh_scale: float = _number(2.4, "a", "px/m", 0.0, open_low=True)
-    noise_floor: float = _number(0.08, "noise_floor", "m", 0.0, open_low=True)
-    noise_thresh: float = _number(0.2, "noise_thresh", "m", 0.0, open_low=True)
-    line_thresh: float = _number(0.3, "line_t", "m", 0.0, open_low=True)
-    occlusion_gap: int = _number(10, "occ_x", "px", 1)
-    n_check: int = _number(16, "n_check", "px", 1)
-    max_open: int = _number(2, "max_open", "segments", 1, 8)
-    angle_cosine: float = _number(0.5, "angle", "1", 0.0, 1.0)
-    sparse: int = _number(5, "sparse", "px", 0)
-    min_gaussian_length: float = _number(0.5, "L0", "m", 0.0, open_low=True)
-    frame_max_scale: float = _number(4.0, "frame_max_scale", "1", 1.0)
-    max_depth: float = _number(20.0, "max_depth", "m", 0.0, open_low=True)
+    adaptive_thresh_scale: float = number(2.4, "a", "px/m", 0.0, open_low=True)
+    noise_floor: float = number(0.08, "noise_floor", "m", 0.0, open_low=True)
+    noise_thresh: float = number(0.2, "noise_thresh", "m", 0.0, open_low=True)
+    line_thresh: float = number(0.3, "line_t", "m", 0.0, open_low=True)
+    occlusion_gap: int = number(10, "occ_x", "px", 1)
+    n_check: int = number(16, "n_check", "px", 1)
+    max_open: int = number(2, "max_open", "segments", 1, 8)
+    angle_cosine: float = number(0.5, "angle", "1", 0.0, 1.0)
+    sparse: int = number(5, "sparse", "px", 0)
+    min_gaussian_length: float = number(0.5, "L0", "m", 0.0, open_low=True)
+    frame_max_scale: float = number(4.0, "frame_max_scale", "1", 1.0)
+    max_depth: float = number(20.0, "max_depth", "m", 0.0, open_low=True)
 
-    min_pixels: int = _number(200, "min_pixels", "px", 1)
-    min_rows: int = _number(16, "min_rows", "segments", 1)
-    prune: str = _choice("both", "either", "none")
+    min_pixels: int = number(200, "min_pixels", "px", 1)
+    min_rows: int = number(16, "min_rows", "segments", 1)
+    prune: str = choice("both", "either", "none")
 
     scale_with_image: bool = True
-    reference_focal: float = _number(200.0, "f_ref", "px", 0.0, open_low=True)
-    reference_height: int = _number(224, "H_ref", "px", 1)
-    reference_width: int = _number(224, "W_ref", "px", 1)
+    reference_focal: float = number(200.0, "f_ref", "px", 0.0, open_low=True)
+    reference_height: int = number(224, "H_ref", "px", 1)
+    reference_width: int = number(224, "W_ref", "px", 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -152,7 +106,7 @@ class SPGFConfig(_Checked):
 
 
 @dataclass(frozen=True)
-class UfMStarConfig(_Checked):
+class UfMStarConfig(Checked):
     """Everything UfM* can be told. The defaults are the paper's, with two exceptions, each explained where it
     stands: the pruning rule (``segment.prune``, docs/segmentation.md) and ``regression``.
     """
@@ -161,46 +115,43 @@ class UfMStarConfig(_Checked):
     aleatoric_in_moments: bool = False  # SPGF's optional per-pixel variance: A r r^T added to J
 
     # Correspondence (section "Multiview Gaussian Correspondence")
-    eta: float = _number(0.5, "eta", "1", 0.0, 1.0, open_low=True)
-    eta_occlusion: float = _number(0.7, "eta_occl", "1", 0.0, 1.0, open_low=True)
-    near_plane: float = _number(0.05, "z_near", "m", 0.0, open_low=True)
+    eta: float = number(0.5, "eta", "1", 0.0, 1.0, open_low=True)
+    eta_occlusion: float = number(0.7, "eta_occl", "1", 0.0, 1.0, open_low=True)
+    near_plane: float = number(0.05, "z_near", "m", 0.0, open_low=True)
 
     # Fusion (section "Multiview Fusion")
     overlap_weighted: bool = False
     # What m averages: the paper's squared 2-Wasserstein distance, or the squared depth difference where both
     # Gaussians are seen (``disagree``).
-    disagreement: str = _choice("w2", "overlap")
+    disagreement: str = choice("w2", "overlap")
 
     # Regression (section "Uncertainty Regression")
-    prior_weight: float = _number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
-    prior_mean: float = _number(0.0, "mu_0", "m^2", 0.0)
+    prior_weight: float = number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
+    prior_mean: float = number(0.0, "mu_0", "m^2", 0.0)
     # The paper's neighbourhood approximates the exact sum to save time, which our kernel does not need.
-    regression: str = _choice("exact", "neighbourhood")
-    near_radius: float = _number(0.1, "r", "m", 0.0, open_low=True)
-    far_radius: float = _number(0.5, "R", "m", 0.0, open_low=True)
-    neighbourhood_sigmas: float = _number(2.0, "s", "1", 0.0, open_low=True)
-    ema_alpha: float = _number(0.5, "alpha", "1", 0.0, 1.0, open_low=True)
-    variance_floor: float = _number(0.0, "v_min", "m^2", 0.0)
+    regression: str = choice("exact", "neighbourhood")
+    near_radius: float = number(0.1, "r", "m", 0.0, open_low=True)
+    far_radius: float = number(0.5, "R", "m", 0.0, open_low=True)
+    neighbourhood_sigmas: float = number(2.0, "s", "1", 0.0, open_low=True)
+    ema_alpha: float = number(0.5, "alpha", "1", 0.0, 1.0, open_low=True)
+    variance_floor: float = number(0.0, "v_min", "m^2", 0.0)
     add_aleatoric: bool = True
     add_epistemic: bool = True
 
     # Anchors (an extension, not in the paper: ``anchors``, ``evidence``)
     anchored: bool = False
-    anchor_half_life: float = _number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
-    anchor_shrinkage: float = _number(2.0, "kappa", "anchors", 0.0, open_low=True)
+    anchor_half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
+    anchor_shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
 
     # State
-    features: int = _number(0, "dim H - 1", "1", 0)
-    initial_capacity: int = _number(256, "K_0", "components", 1)
-    max_components: int | None = field(
-        default=None,
-        metadata={"symbol": "K_max", "unit": "components", "range": (1, math.inf, False), "optional": True},
-    )
+    features: int = number(0, "dim H - 1", "1", 0)
+    initial_capacity: int = number(256, "K_0", "components", 1)
+    max_components: int | None = number(None, "K_max", "components", 1)
 
     # Input checks and speed
-    rotation_tolerance: float = _number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
-    on_bad_frame: str = _choice("raise", "skip")
-    backend: str = _choice("auto", "torch", "numba")
+    rotation_tolerance: float = number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
+    on_bad_frame: str = choice("raise", "skip")
+    backend: str = choice("auto", "torch", "numba")
 
     def __post_init__(self) -> None:
         super().__post_init__()

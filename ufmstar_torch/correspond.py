@@ -16,8 +16,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.gaussian import PIXEL_VARIANCE, bhattacharyya
 from ufmstar_torch.mixture import GaussianMixture
 
-# Pairs (k, k') compared at a time: bounds the temporary memory to some 200 MB.
-_CHUNK = 2**21
+# Triples (c, k, k') compared at a time: bounds the temporary memory to some 100 MB.
+_CHUNK = 2**24
 
 
 @dataclass(frozen=True)
@@ -69,14 +69,13 @@ def correspond(
 def _hidden(match: Tensor, mean: Tensor, covariance: Tensor, depth: Tensor, config: UfMStarConfig) -> Tensor:
     """[B, C, K] True where a nearer member of the same set covers k."""
     streams, capacity = depth.shape
-    rows = max(1, _CHUNK // max(1, streams * capacity))
+    rows = max(1, _CHUNK // max(1, streams * capacity * match.shape[1]))
     hidden = []
     for k in range(0, capacity, rows):
         part = slice(k, k + rows)
         mutual = bhattacharyya(mean[:, part, None], covariance[:, part, None], mean[:, None], covariance[:, None])
         hides = (mutual > config.eta_occlusion) & (depth[:, None, :] < depth[:, part, None])  # k' hides k
-        # Counts of hiding members, as a product of 0/1 matrices: not 0 where there is one, in any precision.
-        hidden.append(match.float() @ hides.float().mT > 0.5)
+        hidden.append((match[:, :, None] & hides[:, None]).any(3))
     return torch.cat(hidden, dim=2)
 
 

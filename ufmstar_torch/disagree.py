@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.correspond import Correspondence
+from ufmstar_torch.fixed_order import apply, congruence
 from ufmstar_torch.mixture import GaussianMixture
 
 # A continued plane's depth stays within this factor of the depth at its own mean. Matched Gaussians overlap, so u* lies
@@ -73,10 +74,10 @@ def _in_image(mean: Tensor, covariance: Tensor) -> list[Tensor]:
     x, y, z = mean.unbind(-1)
     zero, one = torch.zeros_like(z), torch.ones_like(z)
     J = torch.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2, zero, zero, one], dim=-1).unflatten(-1, (3, 3))
-    S = J @ covariance @ J.mT
+    S = congruence(J, covariance)
     precision = _inverse2(S[..., :2, :2])
     S_uz = S[..., :2, 2]
-    b = (precision @ S_uz[..., None])[..., 0]
+    b = apply(precision, S_uz)
     thickness = (S[..., 2, 2] - (S_uz * b).sum(-1)).clamp_min(0).sqrt()
     return [torch.stack([x / z, y / z], dim=-1), z, precision, b, thickness]
 
@@ -85,11 +86,11 @@ def _squared_difference(one: list[Tensor], other: list[Tensor]) -> Tensor:
     """d^2 of broadcast profiles."""
     (u_1, _, P_1, _, tau_1), (u_2, _, P_2, _, tau_2) = one, other
     shared = _inverse2(P_1 + P_2)
-    u = (shared @ (P_1 @ u_1[..., None] + P_2 @ u_2[..., None]))[..., 0]
+    u = apply(shared, apply(P_1, u_1) + apply(P_2, u_2))
     z_1, b_1 = _continued(one, u)
     z_2, b_2 = _continued(other, u)
-    slope = (b_1 - b_2)[..., None]
-    tilt = (slope.mT @ shared @ slope)[..., 0, 0]
+    slope = b_1 - b_2
+    tilt = (slope * apply(shared, slope)).sum(-1)
     return (z_1 - z_2).square() + tilt + (tau_1 - tau_2).square()
 
 

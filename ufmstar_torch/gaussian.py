@@ -16,6 +16,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ufmstar_torch.fixed_order import congruence, product
+
 # Cyclic Jacobi on 3x3 converges quadratically: after 4 sweeps float64 rounding is reached on random
 # spectra from 1 to 1e-14, repeated ones included (tests/test_gaussian.py); one more for safety.
 _SWEEPS = 5
@@ -76,7 +78,7 @@ def symmetric_eigh(S: Tensor) -> tuple[Tensor, Tensor]:
             c, s = _rotation(S[..., p, p], S[..., q, q], S[..., p, q])
             G = torch.eye(3, dtype=S.dtype, device=S.device).expand_as(S).clone()
             G[..., p, p], G[..., q, q], G[..., p, q], G[..., q, p] = c, c, s, -s
-            S, V = symmetrize(G.mT @ S @ G), V @ G
+            S, V = symmetrize(congruence(G.mT, S)), product(V, G)
     values, order = torch.diagonal(S, dim1=-2, dim2=-1).sort(dim=-1)
     return values, torch.gather(V, -1, order[..., None, :].expand_as(V))
 
@@ -84,7 +86,7 @@ def symmetric_eigh(S: Tensor) -> tuple[Tensor, Tensor]:
 def sqrt_psd(S: Tensor) -> Tensor:
     """The symmetric square root S^(1/2) of positive semidefinite S [..., 3, 3]; rounding below 0 counts as 0."""
     values, V = symmetric_eigh(S)
-    return (V * values.clamp_min(0).sqrt()[..., None, :]) @ V.mT
+    return product(V * values.clamp_min(0).sqrt()[..., None, :], V.mT)
 
 
 def cholesky3(S: Tensor) -> Tensor:
@@ -131,7 +133,7 @@ def wasserstein_squared(mean_a: Tensor, cov_a: Tensor, mean_b: Tensor, cov_b: Te
     """
     dtype = mean_a.dtype
     mean_a, cov_a, mean_b, cov_b = _double(mean_a, cov_a, mean_b, cov_b)
-    singular, _ = right_singular(cholesky3(cov_b).mT @ cholesky3(cov_a))
+    singular, _ = right_singular(product(cholesky3(cov_b).mT, cholesky3(cov_a)))
     shape = _trace(cov_a) + _trace(cov_b) - 2 * singular.sum(-1)
     return (((mean_a - mean_b) ** 2).sum(-1) + shape.clamp_min(0)).to(dtype)
 
@@ -152,10 +154,10 @@ def transport_map(cov_a: Tensor, cov_b: Tensor) -> Tensor:
 def _transport(cov_a: Tensor, cov_b: Tensor) -> tuple[Tensor, Tensor]:
     """Z and tr Q^(1/2)."""
     L = cholesky3(cov_a)
-    singular, V = right_singular(cholesky3(cov_b).mT @ L)
+    singular, V = right_singular(product(cholesky3(cov_b).mT, L))
     L_inv = inverse_lower3(L)
-    half = L_inv.mT @ V
-    return symmetrize((half * singular[..., None, :]) @ half.mT), singular.sum(-1)
+    half = product(L_inv.mT, V)
+    return symmetrize(product(half * singular[..., None, :], half.mT)), singular.sum(-1)
 
 
 def geodesic(
@@ -181,7 +183,7 @@ def geodesic(
     eye = torch.eye(3, dtype=Z.dtype, device=Z.device)
     l = lam[..., None]
     T = (1 - l[..., None]) * eye + l[..., None] * Z
-    moved = (1 - l) * mean_a + l * mean_b, symmetrize(T @ cov_a @ T.mT), distance
+    moved = (1 - l) * mean_a + l * mean_b, symmetrize(congruence(T, cov_a)), distance
     return moved[0].to(dtype), moved[1].to(dtype), moved[2].to(dtype)
 
 
@@ -235,7 +237,7 @@ def barycenter(
     S = (w[..., None] * covariance).sum(-3)
     for _ in range(iterations):
         T = (w[..., None] * transport_map(S[..., None, :, :].expand_as(covariance), covariance)).sum(-3)
-        updated = symmetrize(T @ S @ T.mT)
+        updated = symmetrize(congruence(T, S))
         moved = ((updated - S).abs().amax((-2, -1)) / _trace(updated)).max()
         S = updated
         if float(moved) <= max(tolerance, 8 * torch.finfo(S.dtype).eps):
@@ -269,7 +271,7 @@ def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
     """
     values, V = symmetric_eigh(covariance)
     low = values[..., 0] < floor
-    lifted = symmetrize((V * torch.maximum(values, floor[..., None])[..., None, :]) @ V.mT)
+    lifted = symmetrize(product(V * torch.maximum(values, floor[..., None])[..., None, :], V.mT))
     return torch.where(low[..., None, None], lifted, covariance)
 
 

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.fixed_order import apply, congruence
+
 
 @dataclass(frozen=True)
 class GaussianMixture:
@@ -89,8 +91,8 @@ class GaussianMixture:
             R: [B, 3, 3] rotation from the present frame into the new one.
             t: [B, 3] translation [m].
         """
-        mean = torch.einsum("bij,bkj->bki", R, self.mean) + t[:, None]
-        covariance = torch.einsum("bij,bkjl,bml->bkim", R, self.covariance, R)
+        mean = apply(R[:, None], self.mean) + t[:, None]
+        covariance = congruence(R[:, None], self.covariance)
         return self.replace(
             mean=torch.where(self.valid[..., None], mean, torch.zeros_like(mean)), covariance=covariance
         )

@@ -14,7 +14,7 @@ from ufmstar_torch.camera import focal_and_centre, unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression, shares
+from ufmstar_torch.regress import Regression
 
 
 def learn(
@@ -23,6 +23,7 @@ def learn(
     frame: FrameInput,
     anchors: AnchorInput | None,
     config: UfMStarConfig,
+    backend: Backend,
 ) -> tuple[Evidence | None, Tensor]:
     """What anchors have taught, this frame's included, and how many of it were used [B]."""
     none = torch.zeros_like(frame.fault)
@@ -31,9 +32,13 @@ def learn(
     evidence = evidence.padded(mixture_cam.capacity)
     if anchors is None:
         return evidence, none
-    share = shares(mixture_cam, _predicted_points(anchors, frame), config)
+    points = _predicted_points(anchors, frame)
+
+    def distribute(rows: Tensor) -> Tensor:
+        return backend.distribute(mixture_cam, points, rows, config)
+
     gamma = 0.5 ** (1 / config.anchor_half_life)
-    evidence, used = observe(evidence, anchors, share, gamma)  # a faulty frame's anchors are not valid
+    evidence, used = observe(evidence, anchors, distribute, gamma)  # a faulty frame's anchors are not valid
     return evidence, used.sum(1)
 
 

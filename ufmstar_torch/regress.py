@@ -14,13 +14,12 @@ from torch import Tensor
 
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.fixed_order import total
 from ufmstar_torch.gaussian import cholesky3, inverse_lower3
 from ufmstar_torch.mixture import GaussianMixture
 
 # Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32.
 _CHUNK = 2**22
-# An exponent below which a density is as good as none beside any prior's; exp is many times slower where it underflows.
-_LEAST_EXPONENT = -700.0
 
 
 @dataclass(frozen=True)
@@ -87,18 +86,23 @@ def shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> T
     Returns:
         [B, P, K] in [0, 1]; 1 less their sum is the prior's.
     """
-    x, mean = points.double(), mixture.mean.double()
-    whitening, exponent = _densities(mixture, torch.float64)
-    exponent = exponent[:, None].repeat(1, points.shape[1], 1)
-    for row in range(3):  # matrix products: in double precision they are exact enough, and all in a fifth of the time
-        L = whitening[:, :, row].contiguous()  # strided, the product takes eight times as long
-        y = (x @ L.mT).sub_((L * mean).sum(-1)[:, None])
-        exponent.addcmul_(y, y, value=-0.5)
-    density = exponent.clamp_min_(_LEAST_EXPONENT).exp_().mul_(mixture.valid[:, None])
-    if config.regression == "neighbourhood":
-        density = density * _near(mixture, x[:, :, None] - mean[:, None], config)
-    evidence = density.sum(-1, keepdim=True) + config.prior_weight
-    return density.div_(evidence).to(points.dtype)
+    density = _density(mixture, *_densities(mixture, torch.float64), points.double(), config)
+    evidence = total(density, -1)[..., None] + config.prior_weight
+    return (density / evidence).to(points.dtype)
+
+
+def distribute(mixture: GaussianMixture, points: Tensor, values: Tensor, config: UfMStarConfig) -> Tensor:
+    """Values at points, summed by component: sum_n w_k(x_n) y_n, with the :func:`shares` w_k.
+
+    Args:
+        mixture, points, config: as :func:`shares`.
+        values: [B, P, C], float64.
+
+    Returns:
+        [B, K, C] float64; 0 for empty slots.
+    """
+    share = shares(mixture, points.double(), config)
+    return torch.stack([total(share * y[..., None], 1) for y in values.unbind(-1)], -1)
 
 
 def _densities(mixture: GaussianMixture, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -134,11 +138,10 @@ def _chunk(
 ) -> Regression:
     dtype = points.dtype
     density = _density(mixture, whitening, log_peak, points, config)
-    evidence = density.sum(-1) + config.prior_weight
-    # Products and sums, not matrix products: those may run in TF32 where the caller allows it.
-    weighted = (density * mixture.disagreement.to(dtype)[:, None]).sum(-1)
+    evidence = total(density, -1) + config.prior_weight
+    weighted = total(density * mixture.disagreement.to(dtype)[:, None], -1)
     disagreement = (weighted + config.prior_weight * config.prior_mean) / evidence
-    each = [(density * feature[:, None]).sum(-1) / evidence for feature in mixture.features.to(dtype).unbind(-1)]
+    each = [total(density * feature[:, None], -1) / evidence for feature in mixture.features.to(dtype).unbind(-1)]
     features = torch.stack(each, dim=-1) if each else density.new_zeros(*evidence.shape, 0)
     return Regression(disagreement, features)
 

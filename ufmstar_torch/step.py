@@ -165,7 +165,7 @@ def step(
     mixture, dropped = _remember(state.mixture, current_first, pairs, new, frame.fault, config, backend)
 
     mixture_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
-    evidence, used = learn(state.evidence, mixture_cam, frame, anchors, config)
+    evidence, used = learn(state.evidence, mixture_cam, frame, anchors, config, backend)
     result, residual = read_out(mixture_cam, evidence, frame, config, backend, pixels)
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:

@@ -12,6 +12,7 @@ from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.backend import select
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
@@ -189,8 +190,8 @@ class UfMStar(StatefulModule):
         variance = self._total(out.disagreement, chosen(frame.aleatoric), chosen(frame.epistemic), anchored)
         count = used.sum(1)
         value = torch.where(used, variance, torch.zeros_like(variance))
-        mean = value.sum(1) / count  # 0/0 = NaN where no pixel is valid
-        squares = torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)).sum(1)
+        mean = total(value, 1) / count  # 0/0 = NaN where no pixel is valid
+        squares = total(torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)), 1)
         left = 1 - count / frame.valid.sum((1, 2)).clamp_min(1)  # without replacement: all pixels, no error
         error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
         return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, out.statistics)
@@ -222,7 +223,7 @@ class UfMStar(StatefulModule):
             local = points.detach()
             if frame == "world":
                 T = invert_rigid(self.T_world_first)
-                local = torch.einsum("bij,bnj->bni", T[:, :3, :3], local.double()) + T[:, None, :3, 3]
+                local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
             return regress(self.mixture, local.to(dtype), self.config)
 

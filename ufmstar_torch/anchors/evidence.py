@@ -25,12 +25,14 @@ network has been getting wrong lately, not nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.given import AnchorInput
+from ufmstar_torch.fixed_order import total
 
 # Entries of a row of sums.
 COUNT, BIAS, EXCESS = 0, 1, 2
@@ -105,13 +107,16 @@ def _take(value: Tensor, index: Tensor) -> Tensor:
     return torch.gather(value, 1, index.flatten(1)).view(index.shape)
 
 
-def observe(evidence: Evidence, anchors: AnchorInput, share: Tensor, memory: float) -> tuple[Evidence, Tensor]:
+def observe(
+    evidence: Evidence, anchors: AnchorInput, distribute: Callable[[Tensor], Tensor], memory: float
+) -> tuple[Evidence, Tensor]:
     """Let old evidence fade and add a frame's.
 
     Args:
         evidence: up to the frame before.
         anchors: of the frame.
-        share: [B, N, K] how much of each anchor's point a component explains, in [0, 1].
+        distribute: sums rows [B, N, 3] at the anchors' points by component, [B, K, 3], each row by the component's
+            share in explaining the point.
         memory: in (0, 1], by which the old evidence of a stream is multiplied when there is new.
 
     Returns:
@@ -126,8 +131,8 @@ def observe(evidence: Evidence, anchors: AnchorInput, share: Tensor, memory: flo
     dtype = evidence.overall.dtype
     fresh = used.any(1, keepdim=True).double()
     fade = memory * fresh + (1 - fresh)
-    component = fade[..., None] * evidence.component.double() + (rows.mT @ share.double()).mT
-    overall = fade * evidence.overall.double() + rows.sum(1)
+    component = fade[..., None] * evidence.component.double() + distribute(rows)
+    overall = fade * evidence.overall.double() + total(rows, 1)
     return Evidence(component.to(dtype), overall.to(dtype)), used
 
 

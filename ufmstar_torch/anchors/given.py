@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ufmstar_torch.fixed_order import apply, product
 from ufmstar_torch.frame import FrameInput
 
 # An anchor whose standard deviation is as large as its depth, or that is off from the prediction by a factor like this,
@@ -73,7 +74,7 @@ class Anchors:
         if valid is not None:
             fine = fine & _like(_mask("valid", valid), "valid", points.shape[:2], "points_cam")
         safe = torch.where(fine[..., None], points, torch.ones_like(points))
-        pixel = (safe @ K.mT)[..., :2] / safe[..., 2:]
+        pixel = apply(K.expand(len(points), 3, 3)[:, None], safe)[..., :2] / safe[..., 2:]
         fine = fine & _inside(pixel, size)
         zero = torch.zeros_like(z)
         return cls(
@@ -98,9 +99,9 @@ class Anchors:
         if pixel.dim() != 3 or pixel.shape[2] != 2:
             raise ValueError(f"anchors.pixel must be [B, N, 2], got {tuple(pixel.shape)}")
         # inv_ex does not wait for a device; of intrinsics that make no sense, what comes out is not finite.
-        mapping = K_to.detach().double() @ torch.linalg.inv_ex(K_from.detach().double().to(K_to.device)).inverse
+        mapping = product(K_to.detach().double(), torch.linalg.inv_ex(K_from.detach().double().to(K_to.device)).inverse)
         mapping = mapping.to(pixel.device)
-        return replace(self, pixel=pixel @ mapping[..., :2, :2].mT + mapping[..., None, :2, 2])
+        return replace(self, pixel=apply(mapping[..., None, :2, :2], pixel) + mapping[..., None, :2, 2])
 
     def to(self, device: torch.device | str) -> Anchors:
         """The same on another device."""

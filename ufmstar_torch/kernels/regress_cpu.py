@@ -27,9 +27,10 @@ from numba.extending import overload
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.kernels.regress_points_cpu import at_points, compiled, prepare
+from ufmstar_torch.kernels.regress_points_cpu import at_points, compiled, distribute_points, prepare
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
+from ufmstar_torch.regress import distribute as distribute_reference
 from ufmstar_torch.regress import regress as regress_reference
 
 # The innermost loop, with multiply and add joined where the processor can: one rounding less, not one more.
@@ -81,6 +82,19 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
         config.prior_weight, config.prior_mean, EPSILON[points.dtype], out.numpy(), out_f.numpy(),
     )  # fmt: skip
     return Regression(out, out_f)
+
+
+def distribute(mixture: GaussianMixture, points: Tensor, values: Tensor, config: UfMStarConfig) -> Tensor:
+    """As :func:`ufmstar_torch.regress.distribute`, for CPU tensors; shares are right to 1e-14."""
+    if config.regression != "exact":
+        return distribute_reference(mixture, points, values, config)
+    out = torch.zeros(*mixture.weight.shape, values.shape[2], dtype=torch.float64)
+    fields = (points, values, mixture.mean, mixture.covariance, mixture.weight)
+    distribute_points(
+        *(value.detach().double().contiguous().numpy() for value in fields),
+        config.prior_weight, EPSILON[torch.float64], out.numpy(),
+    )  # fmt: skip
+    return out
 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:

@@ -78,6 +78,31 @@ def at_points(points, mean, covariance, weight, m, features, prior_weight, prior
 
 
 @compiled
+def distribute_points(points, values, mean, covariance, weight, prior_weight, epsilon, out):
+    """Add values [B, P, C] at points [B, P, 3] to the components [B, K, C] that explain them, by their shares."""
+    for b in range(points.shape[0]):
+        index, whitening, log_peak = prepare(mean[b], covariance[b], weight[b])
+        limit = math.log(epsilon * prior_weight / max(index.size, 1))
+        chosen, density = np.empty(index.size, np.int64), np.empty(index.size)
+        for p in range(points.shape[1]):
+            x, y, z = points[b, p, 0], points[b, p, 1], points[b, p, 2]
+            evidence, n = prior_weight, 0
+            for j in range(index.size):
+                k, W = index[j], whitening[j]
+                dx, dy, dz = x - mean[b, k, 0], y - mean[b, k, 1], z - mean[b, k, 2]
+                y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
+                exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
+                if exponent < limit:
+                    continue
+                chosen[n], density[n] = k, math.exp(exponent)
+                evidence += density[n]
+                n += 1
+            for j in range(n):
+                for c in range(values.shape[2]):
+                    out[b, chosen[j], c] += density[j] / evidence * values[b, p, c]
+
+
+@compiled
 def _boxes(mean, covariance, index, log_peak, limit):
     """Per component the box [2, 3] (least and greatest corner) outside of which it adds less than ``limit``.
 

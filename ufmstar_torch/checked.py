@@ -1,0 +1,121 @@
+"""Frozen settings whose values are checked when they are made, and their plain form for JSON.
+
+The metadata of a field carries what a reader wants to know: ``symbol`` (the paper's letter), ``unit`` and ``range``, or
+``choices``. An unknown name is a ``TypeError`` as for any dataclass, an impossible value a ``ValueError`` that names
+the field.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, asdict, field, fields
+from pathlib import Path
+from typing import Any, ClassVar, Self, get_args, get_type_hints
+
+
+def number(
+    default: float | None,
+    symbol: str,
+    unit: str,
+    low: float,
+    high: float = math.inf,
+    *,
+    open_low: bool = False,
+    open_high: bool = False,
+) -> Any:
+    """A numeric field with its allowed range [low, high], open at an end with ``open_low`` or ``open_high``. An
+    integer default asks for whole numbers; with the default None, None is allowed."""
+    metadata = {"symbol": symbol, "unit": unit, "range": (low, high, open_low), "open_high": open_high}
+    return field(default=default, metadata=metadata | {"optional": default is None})
+
+
+def choice(default: str | int, *others: str | int) -> Any:
+    """A field that takes one of a few values."""
+    return field(default=default, metadata={"choices": (default, *others)})
+
+
+class Checked:
+    """Base of a frozen dataclass: checks of the values, and a plain form that refuses unknown keys."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __post_init__(self) -> None:
+        owner = type(self).__name__
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if "range" in f.metadata and not (value is None and f.metadata["optional"]):
+                _check_number(f"{owner}.{f.name}", value, f.metadata)
+                if isinstance(f.default, int) and not isinstance(value, int):
+                    raise ValueError(f"{owner}.{f.name} must be a whole number, got {value!r}")
+            if "choices" in f.metadata and value not in f.metadata["choices"]:
+                raise ValueError(f"{owner}.{f.name} must be one of {f.metadata['choices']}, got {value!r}")
+            if isinstance(f.default, bool) and not isinstance(value, bool):
+                raise ValueError(f"{owner}.{f.name} must be True or False, got {value!r}")
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """From plain values, as JSON has them: lists become tuples, mappings the settings that a field's type names.
+
+        Raises:
+            ValueError: an unknown key, a field without default that is missing, or an impossible value.
+        """
+        known = {f.name: f for f in fields(cls)}
+        if unknown := sorted(set(values) - set(known)):
+            raise ValueError(f"{cls.__name__} has no {unknown}; it has {list(known)}")
+        needed = [n for n, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
+        if missing := [name for name in needed if name not in values]:
+            raise ValueError(f"{cls.__name__} needs {missing}")
+        return cls(**{name: _rich(cls, name, value) for name, value in values.items()})
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> Self:
+        """From a JSON file.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it holds no JSON object, or as :meth:`from_dict`; the message names the file.
+        """
+        try:
+            values = json.loads(Path(path).read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path} is not JSON: {error}") from error
+        if not isinstance(values, dict):
+            raise ValueError(f"{path} must hold a JSON object, got {type(values).__name__}")
+        try:
+            return cls.from_dict(values)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    @classmethod
+    def read(cls, spec: Self | Mapping[str, Any] | str | Path) -> Self:
+        """From settings, plain values or a JSON file; errors as :meth:`from_json`."""
+        if isinstance(spec, str | Path):
+            return cls.from_json(spec)
+        return cls.from_dict(spec) if isinstance(spec, Mapping) else spec
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as plain nested values, ready for JSON."""
+        return asdict(self)
+
+
+def _rich(owner: type, name: str, value: Any) -> Any:
+    """A JSON value as what the field holds."""
+    if isinstance(value, list):
+        return tuple(value)
+    if not isinstance(value, Mapping):
+        return value
+    hint = get_type_hints(owner)[name]
+    nested = [kind for kind in (hint, *get_args(hint)) if isinstance(kind, type) and issubclass(kind, Checked)]
+    return nested[0].from_dict(value) if nested else value
+
+
+def _check_number(name: str, value: object, metadata: Mapping[str, Any]) -> None:
+    low, high, open_low = metadata["range"]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise ValueError(f"{name} must be a number, got {value!r}")
+    outside = value < low or value > high or (open_low and value == low) or (metadata["open_high"] and value == high)
+    if outside:
+        interval = f"{'(' if open_low else '['}{low}, {high}{')' if metadata['open_high'] else ']'}"
+        raise ValueError(f"{name} must lie in {interval}, got {value!r}")
