@@ -289,7 +289,8 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
     return replace(sequence, entries=tuple(entries))
 
 
-def _same(array: np.ndarray) -> np.ndarray:
+def _same(array: np.ndarray | None) -> np.ndarray:
+    assert array is not None
     return array
 
 

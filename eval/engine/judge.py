@@ -66,7 +66,7 @@ class RunMetrics(FrameSink):
         sums: of an earlier part of the run, from ``figures.state``.
     """
 
-    stage = "metrics"
+    stage: str | None = "metrics"
 
     def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
         self._key = key

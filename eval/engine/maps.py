@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
 
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.predictions import Prediction
@@ -19,6 +18,7 @@ from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
+from ufmstar_torch.models.network import DepthNetwork
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class MapSource:
     """
 
     needs_image, cacheable, passes = False, False, 1
-    networks: tuple[nn.Module, ...] = ()
+    networks: tuple[DepthNetwork, ...] = ()
 
     def __init__(
         self,

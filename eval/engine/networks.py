@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,7 @@ from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import NetworksInTurn
 
 # Sample n of frame i is seeded by i + 1,000,003 n: another seed for every pair as long as a sequence has fewer
@@ -48,6 +49,7 @@ class NetworkSource:
         digest: str = "",
     ) -> None:
         self._turns = networks.to(device)
+        self._members = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
         self._device, self._seeding = device, seeding
         self.identity, self.label, self.digest = dict(identity), label, digest
         self._timer = StageTimer(device)
@@ -57,9 +59,9 @@ class NetworkSource:
             set_sampling(network, True, self._generator)
 
     @property
-    def networks(self) -> tuple[nn.Module, ...]:
+    def networks(self) -> tuple[DepthNetwork, ...]:
         """The members, on the device and in eval mode."""
-        return tuple(self._turns.networks)
+        return self._members
 
     @property
     def passes(self) -> int:

@@ -10,9 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -53,7 +54,8 @@ class Prediction:
 
     def to(self, to: torch.device | torch.dtype) -> Prediction:
         """With its maps on a device, or of a type."""
-        return replace(self, **{name: value.to(to) for name, value in self.maps().items()})
+        maps: dict[str, Any] = {name: value.to(to) for name, value in self.maps().items()}
+        return replace(self, **maps)
 
     def maps(self) -> dict[str, Tensor]:
         """Those of depth, aleatoric and epistemic that are not None."""
@@ -64,8 +66,8 @@ class Prediction:
     def of(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> Prediction:
         """What a network returned for one image, [1, h, w]; ``intrinsics`` [3, 3]."""
         a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-        maps = (None if value is None else value[0].detach() for value in (prediction.depth, a, e))
-        return cls(*maps, intrinsics.cpu().double(), ms)  # type: ignore[arg-type]
+        a, e = (None if value is None else value[0].detach() for value in (a, e))
+        return cls(prediction.depth[0].detach(), a, e, intrinsics.cpu().double(), ms)
 
 
 def combined(predictions: Sequence[Prediction]) -> Prediction:
@@ -100,7 +102,7 @@ class DepthSource(Protocol):
     @property
     def label(self) -> str: ...
     @property
-    def networks(self) -> tuple[nn.Module, ...]: ...
+    def networks(self) -> tuple[DepthNetwork, ...]: ...
     @property
     def identity(self) -> Mapping[str, Any]: ...
     @property

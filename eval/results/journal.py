@@ -32,7 +32,7 @@ class MapWriter(FrameSink):
         written: what became of the last frame.
     """
 
-    stage = "write"
+    stage: str | None = "write"
 
     def __init__(self, key: str, writer: FrameWriter) -> None:
         self._key, self._writer = key, writer
