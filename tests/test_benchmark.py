@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from layouts import write_tum
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import UfMStar, UfMStarConfig, cli
 from ufmstar_torch.backend import TORCH, Backend
 from ufmstar_torch.eval.bench import benchmark
 from ufmstar_torch.eval.bench.benchmark_frames import PosedDepth, RecordedSequence, RenderedRoom
@@ -22,6 +22,7 @@ from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
 from ufmstar_torch.eval.bench.benchmark_report import format_report
 from ufmstar_torch.eval.bench.benchmark_step import build_up, components_in_view, memory
 from ufmstar_torch.eval.bench.benchmark_timing import STAGES, StageClock, pinned_threads
+from ufmstar_torch.eval.commands import bench_command
 from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
 from ufmstar_torch.eval.results.machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.tour import box_room as synthetic
@@ -321,7 +322,7 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     path = tmp_path / "bench.json"
     words = "--sizes 64 --frames 3 --history 4 --in-view 5 --backends numba torch --skip-compile --threads 1"
     before = torch.get_num_threads(), numba.get_num_threads()
-    assert benchmark.main([*words.split(), "--json", str(path)]) == 0
+    assert bench_command.main(bench_command.read([*words.split(), "--json", str(path)])) == 0
     assert (torch.get_num_threads(), numba.get_num_threads()) == before
     report = json.loads(path.read_text())
     assert report["settings"]["threads"] == 1
@@ -359,7 +360,9 @@ def check_result(result):
 
 
 def test_backends_see_the_same_mixture():
-    options = benchmark.parse(["--sizes", "48", "--frames", "2", "--history", "3", "--skip-compile", "--threads", "1"])
+    options = bench_command.read(
+        ["--sizes", "48", "--frames", "2", "--history", "3", "--skip-compile", "--threads", "1"]
+    )
     numba_run, torch_run = benchmark.run_benchmark(options)["results"]
     assert numba_run["counts"]["segments"]["max"] > 3
     assert abs(numba_run["memory"]["components"] - torch_run["memory"]["components"]) < 20
@@ -418,7 +421,7 @@ def test_targets_are_told_as_met_or_missed():
     ],
 )
 def test_arguments_that_do_not_fit(words, told, capsys):
-    assert benchmark.main([*words, "--skip-compile"]) == 2
+    assert cli.main(["bench", *words, "--skip-compile"]) == 2
     assert told in capsys.readouterr().err
 
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch import UfMStarConfig
+from ufmstar_torch import UfMStarConfig, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench import benchmark
 from ufmstar_torch.eval.bench.benchmark_anchors import PARTS, TrackedTour, measure_anchors, measure_tracker, one_thread
 from ufmstar_torch.eval.bench.benchmark_frames import RenderedRoom
 from ufmstar_torch.eval.bench.benchmark_report import format_report
 from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
+from ufmstar_torch.eval.commands import bench_command
 
 TIMES = {f"{clock}{name}_ms" for clock in ("", "cpu_") for name in ("median", "p90", "mean", "min")}
 SMALL = TrackedTour(size=(120, 160), path_frames=400)
@@ -44,7 +45,7 @@ def rendered():
 def report(one_core):
     """What ``ufmstar bench --anchors 60`` measures, in small."""
     words = "--sizes 48 --frames 6 --history 4 --in-view 5 --backends numba --skip-compile --threads 1"
-    options = benchmark.parse([*words.split(), "--anchors", "60"])
+    options = bench_command.read([*words.split(), "--anchors", "60"])
     before, seen = threads(), rendered()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackedTour, "frames", lambda _, count: seen[:count])
@@ -136,7 +137,7 @@ def test_the_report_in_words(report):
 
 
 def test_impossible_numbers(capsys):
-    assert benchmark.main(["--anchors", "0", "--skip-compile"]) == 2
+    assert cli.main(["bench", "--anchors", "0", "--skip-compile"]) == 2
     assert "--anchors must be at least 1" in capsys.readouterr().err
     with pytest.raises(ValueError, match="points must be at least 1"):
         measure_anchors(
@@ -147,6 +148,6 @@ def test_impossible_numbers(capsys):
 
 
 def test_without_a_number_it_is_300():
-    assert benchmark.parse(["--anchors"]).anchors == 300
-    assert benchmark.parse([]).anchors is None
+    assert bench_command.read(["--anchors"]).anchors == 300
+    assert bench_command.read([]).anchors is None
     assert np.isclose(dict(benchmark._TARGETS)["tracker_cpu_ms"], 3.0)

@@ -275,14 +275,17 @@ def test_layouts_are_found(ufmstar, tmp_path, write):
     assert read_summary(tmp_path / "out")["frames"]["done"] == 2
 
 
-def test_bench_is_handed_on(monkeypatch, ufmstar):
-    seen = []
-    module = types.ModuleType("ufmstar_torch.eval.bench.benchmark")
-    module.main = lambda words: seen.append(words)
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr("ufmstar_torch.eval.bench.benchmark", module, raising=False)
-    assert ufmstar("bench", "--frames", "3")[0] == 0
-    assert seen == [["--frames", "3"]]
+def test_options_of_every_command_are_read_before_anything_starts(ufmstar):
+    for words in (
+        ["bench", "--frames", "x"],
+        ["demo", "--seed", "x"],
+        ["report"],
+        ["data", "check"],
+        ["eval", "--sed"],
+    ):
+        code, out, err = ufmstar(*words)
+        assert (code, out, err.count("\n")) == (2, "", 1), err
+        assert err.startswith(f"ufmstar {words[0]}: ")
 
 
 # ---- runs ----

@@ -11,7 +11,7 @@ import torch
 
 import scenes
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.commands.run_options import run_parser
+from ufmstar_torch.eval.commands.run_command import read
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "anchors.md"
 H, W = 48, 64
@@ -97,6 +97,6 @@ def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
 
 def test_the_flag_on_the_page_is_one():
     (command,) = [block for block in blocks("bash") if block.startswith("ufmstar run")]
-    options = run_parser().parse_args(command.split()[2:])
-    assert options.anchors is True
-    assert options.model == "fastdepth"
+    options = read(command.split()[2:])
+    assert options.uncertainty.anchors is True
+    assert options.network.model == "fastdepth"

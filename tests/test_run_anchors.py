@@ -13,8 +13,8 @@ from runs import Brightness, job_of, networks, outputs, read_summary
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.commands.run import run
+from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.commands.run_job import job_from
-from ufmstar_torch.eval.commands.run_options import parse_run, run_parser
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.report.plots import fit_scales, map_columns
 from ufmstar_torch.eval.report.run_pictures import Finished
@@ -268,7 +268,7 @@ def test_anchored_without_anchors_is_a_mistake(tmp_path, capfd):
 
 def test_images_and_opencv_are_needed(tour, monkeypatch, tmp_path):
     words = [TOUR, "--depth", "self", "--anchors", "--out", str(tmp_path / "out")]
-    options = parse_run(run_parser(), words)
+    options = read(words)
     blind = with_entries(tour, lambda _, e: dataclasses.replace(e, load_image=None))
     monkeypatch.setattr("ufmstar_torch.eval.commands.run_job.open_sequence", lambda *_, **__: blind)
     with pytest.raises(ValueError, match=r"--anchors tracks corners of images, of which the sequence .* has none"):

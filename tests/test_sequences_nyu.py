@@ -9,8 +9,8 @@ from layouts import truncate
 from layouts_more import write_h5, write_nyu
 
 from ufmstar_torch.eval.check.check import check_sequence
+from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.commands.run_job import job_from
-from ufmstar_torch.eval.commands.run_options import parse_run, run_parser
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
@@ -122,7 +122,7 @@ def test_a_trajectory_or_another_convention_is_refused(written):
 def test_a_run_that_compares_views_refuses_it(written, tmp_path):
     words = [str(written[0]), "--depth", "ground-truth", "--out", str(tmp_path / "out")]
     with pytest.raises(ValueError, match="single images without poses, which UfM\\* needs"):
-        job_from(parse_run(run_parser(), words))
+        job_from(read(words))
 
 
 def test_an_evaluation_refuses_rows_that_compare_views(written):

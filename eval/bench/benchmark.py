@@ -6,9 +6,8 @@ docs/benchmark.md for what each figure means.
 
 from __future__ import annotations
 
-import argparse
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -29,65 +28,57 @@ _TARGET_SIZE, _TARGET_CORNERS = 224, 300
 _WARM_UP, _TORCH_ROUNDS = 3, 3
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the benchmark to a parser."""
-    parser.add_argument("--sequence", type=Path, help="recorded sequence (default: a rendered room)")
-    parser.add_argument(
-        "--weights", type=Path, help="FastDepth's weights (default: random); with --sequence it then predicts the depth"
-    )
-    parser.add_argument("--sizes", type=int, nargs="+", default=[224, 518], help="image sizes [px]")
-    parser.add_argument(
-        "--backends", nargs="+", choices=["numba", "torch"], default=["numba", "torch"], help="kernels to time"
-    )
-    parser.add_argument("--frames", type=int, default=40, help="timed frames (the torch backend: at most 3)")
-    parser.add_argument("--in-view", type=int, default=100, help="components in view from which on frames are timed")
-    parser.add_argument("--history", type=int, default=400, help="frames that may pass before that at most")
-    parser.add_argument("--boxes", type=int, default=40, help="things in the rendered room")
-    parser.add_argument("--threads", type=int, help="of torch and numba (default: the cores of this process)")
-    parser.add_argument("--seed", type=int, default=0, help="of the rendered room")
-    parser.add_argument(
-        "--long", type=int, nargs="?", const=1000, help="also time this many frames in one room (1000 without a number)"
-    )
-    parser.add_argument(
-        "--anchors", type=int, nargs="?", const=_TARGET_CORNERS, metavar="CORNERS",
-        help="also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one "
-        f"thread ({_TARGET_CORNERS} without a number; needs OpenCV)",
-    )  # fmt: skip
-    parser.add_argument("--skip-compile", action="store_true", help="do not time compilation (some tens of seconds)")
-    parser.add_argument("--json", type=Path, help="write the report here")
+@dataclass(frozen=True, kw_only=True)
+class BenchSettings:
+    """Times of the stages and of the whole UfM* step beside the forward passes of two networks.
 
+    Nothing passes or fails: absolute times depend on the machine and on its other load. docs/benchmark.md explains
+    each figure.
 
-def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options of the benchmark from arguments without the program's name; None = the process's."""
-    parser = argparse.ArgumentParser(prog="ufmstar bench", description=__doc__)
-    add_arguments(parser)
-    return parser.parse_args(argv)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark, print its table and write its JSON; returns 0, or 2 for arguments that do not fit.
-
-    Args:
-        argv: arguments without the program's name; None = those of the process.
+    Attributes:
+        sequence: recorded sequence instead of a rendered room
+        weights: FastDepth's weights instead of random ones; with --sequence it then predicts the depth
+        sizes: sizes of the square images [px]
+        backends: kernels that are timed
+        frames: number of timed frames (the torch backend: at most 3)
+        in_view: number of components in view from which on frames are timed
+        history: number of frames before that at most
+        boxes: number of boxes in the rendered room
+        threads: number of threads of torch and numba; default: the cores of this process
+        seed: of the rendered room
+        long: also time this many frames in one room (1000 without a number)
+        anchors: also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one
+            thread (300 without a number; needs OpenCV)
+        skip_compile: do not time compilation (some tens of seconds)
+        json: file for the report
     """
-    options = parse(argv)
-    try:
-        report = run_benchmark(options, progress=lambda text: print(text, file=sys.stderr, flush=True))
-    except (ValueError, FileNotFoundError, ModuleNotFoundError) as error:
-        print(f"ufmstar bench: {error}", file=sys.stderr)
-        return 2
-    from ufmstar_torch.eval.bench.benchmark_report import format_report
 
-    print(format_report(report))
-    if options.json is not None:
-        from ufmstar_torch.eval.results.files import write_json_atomic
+    sequence: Path | None = None
+    weights: Path | None = None
+    sizes: tuple[int, ...] = (224, 518)
+    backends: tuple[str, ...] = field(default=("numba", "torch"), metadata={"choices": ("numba", "torch")})
+    frames: int = 40
+    in_view: int = 100
+    history: int = 400
+    boxes: int = 40
+    threads: int | None = None
+    seed: int = 0
+    long: int | None = field(default=None, metadata={"const": 1000})
+    anchors: int | None = field(default=None, metadata={"const": _TARGET_CORNERS})
+    skip_compile: bool = False
+    json: Path | None = None
 
-        write_json_atomic(options.json, report)
-    return 0
+    def __post_init__(self) -> None:
+        for name in ("frames", "boxes", "history", "in_view", "anchors", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+        if min(self.sizes) < 16:
+            raise ValueError(f"--sizes must be at least 16 pixels, got {list(self.sizes)}")
 
 
-def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
-    """Measure what the options (see :func:`add_arguments`) ask for.
+def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = lambda text: None) -> dict[str, Any]:
+    """Measure what the options ask for.
 
     Args:
         progress: is told what is measured next.
@@ -105,7 +96,6 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
     from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
     from ufmstar_torch.eval.results import machine
 
-    _check(options)
     config = UfMStarConfig()
     threads = machine.available_cores() if options.threads is None else options.threads
     report: dict[str, Any] = {
@@ -137,16 +127,7 @@ def run_benchmark(options: argparse.Namespace, progress: Callable[[str], object]
     return report
 
 
-def _check(options: argparse.Namespace) -> None:
-    for name in ("frames", "boxes", "history", "in_view", "anchors"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
-    if min(options.sizes) < 16:
-        raise ValueError(f"--sizes must be at least 16 pixels, got {options.sizes}")
-
-
-def _inputs(options: argparse.Namespace) -> tuple[Any, Any]:
+def _inputs(options: BenchSettings) -> tuple[Any, Any]:
     """FastDepth, with random weights of the pruned network's shape if none are given, and the frames' source."""
     from ufmstar_torch.eval.bench.benchmark_frames import RecordedSequence, RenderedRoom
     from ufmstar_torch.models import FastDepth, FastDepthWidths, load_network
@@ -165,7 +146,7 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, Any]:
 
 
 def _results(
-    options: argparse.Namespace, config: Any, fastdepth: Any, source: Any, progress: Callable[[str], object]
+    options: BenchSettings, config: Any, fastdepth: Any, source: Any, progress: Callable[[str], object]
 ) -> list[dict[str, Any]]:
     from ufmstar_torch.eval.bench.benchmark_step import Plan, build_up, measure_step, reference_networks
 
@@ -186,11 +167,10 @@ def _results(
     return results
 
 
-def _anchors(
-    options: argparse.Namespace, config: Any, source: Any, progress: Callable[[str], object]
-) -> dict[str, Any]:
+def _anchors(options: BenchSettings, config: Any, source: Any, progress: Callable[[str], object]) -> dict[str, Any]:
     from ufmstar_torch.eval.bench.benchmark_anchors import measure_anchors
 
+    assert options.anchors is not None
     progress(f"{options.anchors} corners and anchors")
     return measure_anchors(
         source, config.replace(backend=options.backends[0]), points=options.anchors, frames=options.frames,
@@ -218,7 +198,3 @@ def targets(report: dict[str, Any]) -> list[dict[str, Any]]:
         {"name": name, "value": value, "target": target, "met": None if value is None else value <= target}
         for (name, value), target in zip(values.items(), _TARGETS.values(), strict=True)
     ]
-
-
-if __name__ == "__main__":
-    sys.exit(main())

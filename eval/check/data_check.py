@@ -184,7 +184,7 @@ def _scale_remedy(factor: float, sequence: FrameSequence, path: str | Path, opti
         scale = near
     if scale > 1 or near == unit:
         return positions
-    return f"--depth-scale {scale:.4g}"
+    return f"--truth-scale {scale:.4g}"
 
 
 def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> float | None:

@@ -1,64 +1,99 @@
-"""The work of ``ufmstar data check``: one sequence, or all below a folder, as text or JSON."""
+"""``ufmstar data check``: its options, and one sequence, or all below a folder, as text or JSON."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-from ufmstar_torch.eval.check.data_check import check_data
-from ufmstar_torch.eval.commands.data_report import lines, page
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
-from ufmstar_torch.eval.sequences.find import find_sequences
-from ufmstar_torch.eval.sequences.layout import LAYOUTS, layouts_of, parts_of
-from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.commands.opening import SequenceOptions
+from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
 
 # With one of these the user means one sequence, whatever lies below its folder.
 _OF_ONE = ("trajectory", "images", "drive")
 
 
-def check(path: str, pairs: int, as_json: bool, options: Mapping[str, Any]) -> tuple[str, bool]:
-    """What to print, and whether all is fine.
+@dataclass(frozen=True, kw_only=True)
+class CheckedSequenceOptions(SequenceOptions):
+    """How the sequence is opened."""
 
-    Args:
-        path: a sequence, or a folder below which there are some.
-        pairs: of frames that are compared.
-        as_json: a list of reports instead of text.
-        options: of ``open_sequence``.
+    truth: str | None = option(None, also=("--depth",))
+    truth_scale: float | None = option(None, also=("--depth-scale",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckOptions:
+    """What a sequence holds, and whether its poses, depth and images fit together.
+
+    Depth is warped between neighbouring frames with the poses as given, inverted, with other axes and at other depth
+    scales; if something else fits, the option that corrects it is printed. Exit code: 0 fine, 1 problems, 2 wrong
+    usage.
+
+    Attributes:
+        command: there is one
+        path: a sequence, or a folder below which there are sequences
+        pairs: number of pairs of frames that are compared
+        json: print JSON instead of text
+    """
+
+    USAGE: ClassVar[str] = "ufmstar data check PATH [options]"
+
+    command: str = option(choices=("check",), positional=True)
+    path: str = positional()
+    pairs: int = 8
+    json: bool = False
+    opening: CheckedSequenceOptions
+
+
+def read(words: Sequence[str]) -> CheckOptions:
+    """The options of a command line; errors as :func:`parse`."""
+    return parse(CheckOptions, words, "ufmstar data")
+
+
+def main(options: CheckOptions) -> int:
+    """Check, and print what was found; the exit code."""
+    from ufmstar_torch.eval.check.report import lines, page
+
+    try:
+        reports, several = _check(options)
+    except (OSError, ValueError) as error:
+        raise UsageError(error) from error
+    if options.json:
+        print(json.dumps([report.to_dict() for report in reports], indent=2))
+    else:
+        print(lines(reports) if several else page(reports[0]))
+    return 0 if all(report.ok for report in reports) else 1
+
+
+def _check(options: CheckOptions) -> tuple[list, bool]:
+    """The reports, and whether they are of a folder of sequences.
 
     Raises:
-        FileNotFoundError: no such path.
+        OSError: no such path.
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
-    layout = options.get("layout", "auto")
-    _check_options(options)
-    one = path.startswith("tour:") or any(name in options for name in _OF_ONE) or _is_one(Path(path))
-    found = [] if one else find_sequences(path, layout=layout)
-    if not one and not found and layout == "auto":
+    from ufmstar_torch.eval.check.data_check import check_data
+    from ufmstar_torch.eval.sequences.find import find_sequences
+    from ufmstar_torch.eval.sequences.options import Options
+
+    path, opening = options.path, options.opening.given()
+    Options(**{name: value for name, value in opening.items() if name not in ("layout", "poses")})
+    one = path.startswith("tour:") or any(name in opening for name in _OF_ONE) or _is_one(Path(path))
+    found = [] if one else find_sequences(path, layout=options.opening.layout)
+    if not one and not found and options.opening.layout == "auto":
         raise ValueError(f"{path} has no known layout, and nothing below it has; see docs/data.md, or --layout")
-    if one or not found:  # that nothing has the layout asked for is told with what was looked for
-        reports = [check_data(path, pairs=pairs, **options)]
-    else:
-        reports = [check_data(item.path, item.name, pairs, **{**options, "layout": item.layout}) for item in found]
-    if as_json:
-        text = json.dumps([report.to_dict() for report in reports], indent=2)
-    else:
-        text = lines(reports) if found else page(reports[0])
-    return text, all(report.ok for report in reports)
+    if one or not found:  # check_data names what a layout looks for
+        return [check_data(path, pairs=options.pairs, **opening)], False
+    return [
+        check_data(item.path, item.name, options.pairs, **{**opening, "layout": item.layout}) for item in found
+    ], True
 
 
 def _is_one(path: Path) -> bool:
     """Whether the folder is a single sequence (or fits several layouts, of which one must be named)."""
+    from ufmstar_torch.eval.sequences.layout import layouts_of, parts_of
+
     fitting = layouts_of(path)
     return len(fitting) > 1 or (len(fitting) == 1 and len(parts_of(path, fitting[0])) == 1)
-
-
-def _check_options(options: Mapping[str, Any]) -> None:
-    """Raises ValueError for what is wrong with any data."""
-    layout, poses = options.get("layout", "auto"), options.get("poses", OURS)
-    if layout not in LAYOUTS:
-        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
-    if poses not in CONVENTIONS:
-        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
-    Options(**{name: value for name, value in options.items() if name not in ("layout", "poses")})

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.commands.demo_options import FRAMES, OUT, SEED
+from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.commands.run import Progress
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, Pointwise
 from ufmstar_torch.eval.engine.judge import RegionMetrics
@@ -62,36 +62,6 @@ class DemoError(ValueError):
     """An option is out of range, or cannot be met on this machine."""
 
 
-@dataclass(frozen=True)
-class DemoOptions:
-    """What to show.
-
-    Attributes:
-        out: folder for everything that is written.
-        frames: of the tour.
-        seed: of the rooms; the networks were trained on others.
-        weights: trained networks (``save_trained``); None = those of the package.
-        device: "cpu", "cuda", ...
-        overwrite: replace an earlier demo in ``out``.
-
-    Raises:
-        DemoError: a number is out of range.
-    """
-
-    out: Path = OUT
-    frames: int = FRAMES
-    seed: int = SEED
-    weights: Path | None = None
-    device: str = "cpu"
-    overwrite: bool = False
-
-    def __post_init__(self) -> None:
-        if self.frames < 2:
-            raise DemoError(f"--frames must be at least 2, got {self.frames}: one view has nothing to disagree with")
-        if self.seed < 0:
-            raise DemoError(f"--seed must be at least 0, got {self.seed}")
-
-
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
     """Walk through the tour and leave pictures, mixture and summary in a folder.
 
@@ -123,7 +93,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     summary = {
         "program": DEMO.program,
         "out": str(options.out),
-        "settings": asdict(options),
+        "settings": options.settings(),
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
         "network": _network(info, digest, len(members)),
         "methods": _methods(rows, metrics, walk),

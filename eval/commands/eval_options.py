@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ufmstar_torch.eval.commands.run_options import parse_slice
+from ufmstar_torch.eval.sequences.frame import parse_slice
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser

@@ -44,6 +44,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+class UsageError(Exception):
+    """What the user asked for cannot be done; the message is one line that says why."""
+
+
 def positional() -> Any:
     """A field that is an argument without a name."""
     return field(metadata={"positional": True})
@@ -164,6 +168,7 @@ def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
     """The names of an option and the arguments of ``add_argument``."""
     name = f"--{f.name.replace('_', '-')}"
     default = _default(f)
+    how: dict[str, Any]
     if hint is bool:
         how = {"action": "store_false" if default else "store_true", "dest": f.name}
         return [f"--no-{name[2:]}" if default else name], how
@@ -223,7 +228,8 @@ def _default(f: Field[Any]) -> Any:
 
 def _build(options: type[T], values: Mapping[str, Any]) -> T:
     """The dataclass of parsed values, groups and settings included."""
-    hints, built = get_type_hints(options), {}
+    hints = get_type_hints(options)
+    built: dict[str, Any] = {}
     for f in fields(options):  # type: ignore[arg-type]
         hint = hints[f.name]
         if "fields_of" in f.metadata:
@@ -249,12 +255,12 @@ def _settings(wanted: _Fields, values: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def _documentation(options: type) -> tuple[str | None, dict[str, str]]:
-    """The description in a class's docstring, and its attributes' texts, "beta1, beta2: ..." for both."""
+    """The description in a class's docstring, and the texts of its attributes and of those that it inherits."""
     from docstring_parser.google import parse as parse_docstring
 
-    found = parse_docstring(options.__doc__ or "")
-    texts = {}
-    for attribute in found.params:
-        for name in attribute.arg_name.split(","):
-            texts[name.strip()] = " ".join((attribute.description or "").split())
-    return found.description, texts
+    texts: dict[str, str] = {}
+    for owner in reversed(options.__mro__[:-1]):
+        for attribute in parse_docstring(owner.__doc__ or "").params:
+            text = " ".join((attribute.description or "").split())
+            texts |= dict.fromkeys((name.strip() for name in attribute.arg_name.split(",")), text)
+    return parse_docstring(options.__doc__ or "").description, texts

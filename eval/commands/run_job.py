@@ -8,35 +8,31 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.run import RunJob
-from ufmstar_torch.eval.commands.run_options import OWN_DEPTH, check_options, parse_intrinsics, parse_size, parse_slice
+from ufmstar_torch.eval.commands.run_command import OWN_DEPTH, RunOptions
 from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
+from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 
-# How a run is carried out; the rest of the options says what is run.
-_CONDUCT = ("resume", "overwrite", "debug", "config")
 
-
-def job_from(options: Mapping[str, Any]) -> RunJob:
-    """The job that the options (``parse_run``) describe.
+def job_from(chosen: RunOptions) -> RunJob:
+    """The job that the options describe.
 
     Raises:
         ValueError: options that do not go together, files that do not fit, no frame selected.
         FileNotFoundError, NotADirectoryError: something that was named does not exist.
         ModuleNotFoundError: an optional package is missing.
     """
-    check_options(options)
-    config = UfMStarConfig.from_dict(options["ufm"])
+    options, config = chosen.settings(), chosen.config
     device = require_device(options["device"])
-    chosen = parse_slice(options["frames"])
-    sequence = _sequence(options)
+    sequence = _sequence(chosen)
     if config.anchored:
         _require_images(sequence)
-    indices = range(len(sequence))[chosen]
+    indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
     return RunJob(
@@ -45,27 +41,15 @@ def job_from(options: Mapping[str, Any]) -> RunJob:
         source=_source(options, sequence, device),
         config=config,
         device=torch.device(device),
-        settings={name: value for name, value in options.items() if name not in _CONDUCT},
+        settings=options,
         every=options["model"] is not None and options["mode"] == "full",
         video=not options["no_video"],
         sheet=not options["no_sheet"],
     )
 
 
-def _sequence(options: Mapping[str, Any]) -> FrameSequence:
-    sequence = open_sequence(
-        options["sequence"],
-        options["layout"],
-        intrinsics=parse_intrinsics(options["intrinsics"], "--intrinsics"),
-        depth_intrinsics=parse_intrinsics(options["depth_intrinsics"], "--depth-intrinsics"),
-        trajectory=options["trajectory"],
-        images=options["images"],
-        depth=options["truth"],
-        depth_scale=options["truth_scale"],
-        max_pose_gap=options["max_pose_gap"],
-        fps=options["fps"],
-        time_offset=options["time_offset"],
-    )
+def _sequence(chosen: RunOptions) -> FrameSequence:
+    sequence = open_sequence(chosen.sequence, **chosen.opening.given())
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
     return sequence

@@ -70,7 +70,7 @@ def require_device(name: str) -> str:
     import torch
 
     try:
-        torch.zeros((), device=name)
+        torch.zeros((), device=name).item()  # a device without data, "meta", fails here
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
     return name

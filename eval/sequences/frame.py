@@ -214,6 +214,22 @@ def make_sequence(
     )
 
 
+def parse_slice(text: str | None) -> slice:
+    """START:STOP:STEP as a slice of frames, any part of it left out.
+
+    Raises:
+        ValueError: another form, or a step below 1.
+    """
+    parts = (text or ":").split(":")
+    try:
+        numbers = [int(part) if part.strip() else None for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3) or (len(numbers) == 3 and numbers[2] is not None and numbers[2] < 1):
+        raise ValueError(f"--frames must be START:STOP or START:STOP:STEP with STEP at least 1, got {text!r}")
+    return slice(*numbers)
+
+
 def check_intrinsics(argument: str, K: np.ndarray, size: Size | None) -> None:
     """Raises ValueError unless K [3, 3] is a pinhole matrix whose centre lies well inside ``size`` (H, W)."""
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:

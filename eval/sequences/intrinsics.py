@@ -38,6 +38,23 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
     return np.ascontiguousarray(values[:3, :3])
 
 
+def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:
+    """Words of a command line as :func:`read_intrinsics` takes them: a file, or fx, fy, cx, cy [px]; None for no words.
+
+    Raises:
+        ValueError: neither; the message names ``option``.
+    """
+    if len(words) <= 1:
+        return words[0] if words else None
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 4:
+        raise ValueError(f"{option} must be a file, or the four numbers fx fy cx cy, got {' '.join(words)!r}")
+    return numbers
+
+
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """The matrix [3, 3] of a pinhole camera [px]."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

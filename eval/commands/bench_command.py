@@ -1,0 +1,30 @@
+"""``ufmstar bench``: its options are ``BenchSettings``; prints the table and writes the JSON."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from ufmstar_torch.eval.bench.benchmark import BenchSettings
+from ufmstar_torch.eval.commands.options import UsageError, parse
+
+
+def read(words: Sequence[str]) -> BenchSettings:
+    """The options of a command line; errors as :func:`parse`."""
+    return parse(BenchSettings, words, "ufmstar bench")
+
+
+def main(options: BenchSettings) -> int:
+    """Run the benchmark, print its table and write its JSON; the exit code."""
+    from ufmstar_torch.eval.bench.benchmark import run_benchmark
+    from ufmstar_torch.eval.bench.benchmark_report import format_report
+    from ufmstar_torch.eval.results.files import write_json_atomic
+
+    try:
+        report = run_benchmark(options, progress=lambda text: print(text, file=sys.stderr, flush=True))
+    except (ValueError, FileNotFoundError, ModuleNotFoundError) as error:
+        raise UsageError(error) from error
+    print(format_report(report))
+    if options.json is not None:
+        write_json_atomic(options.json, report)
+    return 0

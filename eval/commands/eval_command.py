@@ -1,0 +1,214 @@
+"""``ufmstar eval``: its options, and what is printed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from ufmstar_torch.eval.commands.opening import OpeningOptions
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
+from ufmstar_torch.eval.sequences.frame import parse_slice
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.results.launch import Ended
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteOptions:
+    """What is evaluated.
+
+    Attributes:
+        suite: name of a suite (see --list), or a TOML file of your own
+        base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
+        network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
+        samples: passes of MC-Dropout where a row asks for all; default: 10
+        list: show the suites and stop
+    """
+
+    suite: str | None = None
+    base: str | None = None
+    network: tuple[str, ...] = option((), repeat=True)
+    samples: int | None = None
+    list: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataOptions:
+    """On which sequences.
+
+    Attributes:
+        root: [DATASET=]DIR with sequences at or below it, or tour:SEED; without DATASET, the layout's name; repeatable
+        sequences: number of sequences of each data set that are drawn at random (the paper: 100); default: all
+        seed: of the draw
+        sequence_list: file with the names of the sequences to take, one a line
+        frames: START:STOP:STEP, which frames of a sequence, counted from 0 as Python does
+    """
+
+    root: tuple[str, ...] = option((), repeat=True)
+    sequences: int | None = None
+    seed: int = 0
+    sequence_list: str | None = None
+    frames: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalOpeningOptions(OpeningOptions):
+    """How the sequences are opened, all of them alike.
+
+    Attributes:
+        depth_scale: metres per unit of the sequences' own depth maps, instead of the layout's
+    """
+
+    depth_scale: float | None = option(None, also=("--truth-scale",))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalOutputOptions:
+    """Output.
+
+    Attributes:
+        out: folder for everything that is written
+        resume: continue the evaluation in --out: compute what is missing, rows and sequences added since
+        overwrite: replace the evaluation in --out; predictions in its cache are kept
+        cache: folder of the networks' predictions; default: OUT/cache
+        examples: number of sequences of each data set of which some frames are kept for pictures
+        confident: share of a frame's pixels of which a method counts as confident
+        no_report: no tables and figures at the end; ufmstar report OUT makes them
+    """
+
+    out: str | None = None
+    resume: bool = False
+    overwrite: bool = False
+    cache: str | None = None
+    examples: int = 3
+    confident: float = 0.5
+    no_report: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalOptions:
+    """The rows of a table or figure of the paper, on sequences of your own.
+
+    Every sequence is finished for itself: whatever ends the program, --resume computes what is missing. Several
+    processes may share the work: --processes on one computer, torchrun or --slurm on several, --shard by hand.
+
+    Attributes:
+        device: cpu or cuda; of several processes, each takes the next GPU in turn
+        threads: number of CPU threads of each process; default: all cores, divided among --processes
+        processes: number of processes on this computer
+        shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n
+        slurm: KEY=VALUE for submitit, as partition=gpu; jobs=N is the number of jobs; repeatable
+        dry_run: show rows, sequences and the size of the cache, and stop
+        debug: show tracebacks
+    """
+
+    USAGE: ClassVar[str] = (
+        "ufmstar eval --suite NAME --root [DATASET=]DIR ... --network BASE=MODEL:FILE[,FILE...] ... --out OUT [options]"
+    )
+
+    device: str = "cpu"
+    threads: int | None = None
+    processes: int = 1
+    shard: str | None = None
+    slurm: tuple[str, ...] = option((), repeat=True)
+    dry_run: bool = False
+    debug: bool = False
+    what: SuiteOptions
+    data: DataOptions
+    opening: EvalOpeningOptions
+    output: EvalOutputOptions
+
+    def __post_init__(self) -> None:
+        if self.what.list:
+            return
+        values = as_dict(self)
+        for name in ("suite", "root", "network", "out"):
+            if not values[name]:
+                raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
+        parse_slice(self.data.frames)
+        for name, least in (("processes", 1), ("examples", 0), ("threads", 1), ("seed", 0), ("samples", 2)):
+            if values[name] is not None and values[name] < least:
+                raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
+        if not 0 < self.output.confident <= 1:
+            raise ValueError(f"--confident must be a share in (0, 1], got {self.output.confident}")
+        if self.output.resume and self.output.overwrite:
+            raise ValueError("--resume and --overwrite contradict each other")
+        several = [n for n in ("shard", "slurm") if values[n]] + (["processes"] if self.processes > 1 else [])
+        if len(several) > 1:
+            raise ValueError(f"--{several[0]} and --{several[1]} contradict each other")
+        if self.shard and self.output.overwrite:
+            raise ValueError("--overwrite goes without --shard: another part may have begun")
+
+
+def read(words: Sequence[str]) -> EvalOptions:
+    """The options of a command line; errors as :func:`parse`."""
+    return parse(EvalOptions, words, "ufmstar eval")
+
+
+def main(options: EvalOptions) -> int:
+    """Evaluate, print the results, and draw them; the exit code."""
+    if options.what.list:
+        from ufmstar_torch.eval.methods.suites import listing
+
+        print(listing())
+        return 0
+    from ufmstar_torch.eval.results.cache import CacheError
+
+    try:
+        return _dry_run(options) if options.dry_run else _evaluate(options)
+    except CacheError:
+        raise
+    except (FileNotFoundError, ValueError) as error:
+        raise UsageError(error) from error
+
+
+def _plain(options: EvalOptions) -> dict[str, Any]:
+    return as_dict(options) | {f.name: None for f in fields(options.opening)} | options.opening.given()
+
+
+def _evaluate(options: EvalOptions) -> int:
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.results.launch import evaluate_suite
+
+    with Bars() as bars, stop_signals(bars.say) as stop:
+        ended = evaluate_suite(_plain(options), stop=stop, tell=bars.say, progress=bars.frames)
+    if ended.tells:
+        return _report(ended, options.threads, draws=not options.output.no_report)
+    return 0 if ended.finished else 130
+
+
+def _report(ended: Ended, threads: int | None, *, draws: bool) -> int:
+    """Print the table, make the measurements and pictures that belong to it, name what failed; the exit code."""
+    from ufmstar_torch.eval.commands.outcome import draw, measure, table
+
+    print(table(ended), flush=True)
+    if ended.finished:
+        if ended.job.suite.efficiency:
+            print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
+        for line in (measure(ended, threads), draw(ended) if draws else None):
+            if line is not None:
+                print(line)
+    for label, reason in ended.failed.items():
+        print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
+    if ended.stopped:
+        print("ufmstar eval: stopped; --resume goes on", file=sys.stderr)
+        return 130
+    if ended.failed or not ended.finished:
+        print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _dry_run(options: EvalOptions) -> int:
+    """Print what would be evaluated."""
+    import torch
+
+    from ufmstar_torch.eval.commands.dry_run import dry_run
+    from ufmstar_torch.eval.commands.eval_options import job_from
+    from ufmstar_torch.eval.results.worklist import Shard
+
+    job = job_from(_plain(options))
+    print(dry_run(job, job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1")))
+    return 0

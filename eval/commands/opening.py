@@ -1,0 +1,88 @@
+"""The options of opening sequences: one vocabulary for ``data check``, ``run`` and ``eval``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from ufmstar_torch.eval.commands.options import option
+from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+
+LAYOUTS = ("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "generic")
+# What `open_sequence` calls the options whose names on the command line say that they are about ground truth.
+_TRUTH = {"truth": "depth", "truth_scale": "depth_scale"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningOptions:
+    """How sequences are opened.
+
+    Attributes:
+        trajectory: file with poses in TUM or KITTI format instead of the layout's own, in the sequence's folder or
+            else in the working folder
+        poses: how the poses are written; world-to-camera is inverted, ned has x forward, y right, z down, opengl
+            x right, y up, z backward
+        fps: frames per second of images without timestamps
+        time_offset: added to the images' times [s]
+        max_pose_gap: poses are interpolated between samples at most this far apart [s]
+        scans: KITTI-360: laser scans of so many frames before and after a frame that are added to its own
+    """
+
+    trajectory: str | None = None
+    poses: str = option(OURS, choices=tuple(CONVENTIONS))
+    fps: float | None = None
+    time_offset: float = 0.0
+    max_pose_gap: float = 0.1
+    scans: int | None = None
+
+    def given(self) -> dict[str, Any]:
+        """The arguments of ``open_sequence`` that differ from its defaults."""
+        changed = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        for name in ("intrinsics", "depth_intrinsics"):
+            if name in changed:
+                changed[name] = parse_intrinsics(changed[name], f"--{name.replace('_', '-')}")
+        return {_TRUTH.get(name, name): value for name, value in changed.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceOptions(OpeningOptions):
+    """How the sequence is opened.
+
+    Attributes:
+        layout: of the sequence's folder; auto: by the files in it
+        intrinsics: of the images, instead of the layout's own: a file, or fx fy cx cy [px]
+        depth_intrinsics: of the sequence's own depth maps: a file, or fx fy cx cy [px]
+        images: folder of images, or video file, of a generic sequence
+        truth: folder of the ground-truth depth maps of a generic sequence
+        truth_scale: metres per unit of the sequence's own depth maps, instead of the layout's
+        max_time_difference: largest difference between the times of a colour image and its depth map [s]
+        register: leave 7-Scenes' depth in its own camera
+        T_color_depth: 7-Scenes: file with the 4x4 matrix from the depth camera into the colour camera [m]
+        drive: KITTI-360: name or number of a drive below the root
+    """
+
+    layout: str = option("auto", choices=LAYOUTS)
+    intrinsics: tuple[str, ...] = ()
+    depth_intrinsics: tuple[str, ...] = ()
+    images: str | None = None
+    truth: str | None = None
+    truth_scale: float | None = None
+    max_time_difference: float = 0.02
+    register: bool = True
+    T_color_depth: str | None = None
+    drive: str | None = None
+
+    def given(self) -> dict[str, Any]:
+        """The arguments of ``open_sequence`` that differ from its defaults.
+
+        Raises:
+            OSError, ValueError: intrinsics are neither a file nor four numbers, or a matrix file is missing or no
+                4x4 matrix.
+        """
+        from ufmstar_torch.eval.sequences.poses import read_pose
+
+        changed = super().given()
+        if self.T_color_depth is not None:
+            changed["T_color_depth"] = read_pose(self.T_color_depth)
+        return changed

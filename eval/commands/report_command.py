@@ -1,0 +1,48 @@
+"""``ufmstar report``: its options, and what is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions:
+    """Tables, figures and a page from the results of an evaluation.
+
+    Draws tables (Markdown and LaTeX), figures, one page (report.html) and tidy results (JSON and CSV) from what
+    `ufmstar eval` has left in a folder, finished or not, and prints the main table.
+
+    Attributes:
+        out: folder of `ufmstar eval`
+        no_figures: tables and results alone (needs no matplotlib)
+        format: file format of the figures
+        debug: show tracebacks
+    """
+
+    out: Path = positional()
+    no_figures: bool = False
+    format: str = option("svg", choices=("svg", "png"))
+    debug: bool = False
+
+
+def read(words: Sequence[str]) -> ReportOptions:
+    """The options of a command line; errors as :func:`parse`."""
+    return parse(ReportOptions, words, "ufmstar report")
+
+
+def main(options: ReportOptions) -> int:
+    """Draw the report, and print the main table; the exit code."""
+    from ufmstar_torch.eval.report.load import ResultsError, load_results
+    from ufmstar_torch.eval.report.write import summary, write_report, written
+
+    try:
+        print(summary(load_results(options.out, with_sums=False)))
+        files = write_report(options.out, figures=not options.no_figures, pictures=options.format)
+    except ResultsError as error:
+        raise UsageError(error) from error
+    print(written(options.out, files))
+    return 0

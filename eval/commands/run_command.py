@@ -1,0 +1,226 @@
+"""``ufmstar run``: its options, and what is printed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.eval.commands.opening import SequenceOptions
+from ufmstar_torch.eval.commands.options import UsageError, as_dict, fields_of, option, parse, positional
+from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
+from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+
+PRESETS = ("tum", "tartanair_indoor", "tartanair_outdoor")
+OWN_DEPTH = ("self", "ground-truth")
+_OF_FOLDER = ("variance", "depth_scale", "map_intrinsics")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkOptions:
+    """Depth from networks.
+
+    Attributes:
+        model: kind of network: fastdepth, monodepth2, trained, depth_anything, huggingface, onnx, torchscript or
+            exported
+        weights: file (depth_anything, huggingface: directory); several are the members of an ensemble
+        mode: of an ensemble: one member per image in turn, or all on every image
+        samples: passes per image of an mc_dropout network in mode full; default: 10
+        offload: trained: keep the weights in host memory, only the member in turn on the device
+        spec: JSON file that declares what the weights do not say: inputs, outputs, an alignment
+    """
+
+    model: str | None = None
+    weights: tuple[str, ...] = ()
+    mode: str = option("alternate", choices=("alternate", "full"))
+    samples: int | None = None
+    offload: bool = False
+    spec: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """Depth from files, instead of a network.
+
+    Attributes:
+        depth: folder of predicted maps (16-bit PNG, EXR, npy); 'self': the sequence's own depth
+        variance: folder of variance maps [m^2] that belong to them
+        depth_scale: metres per unit of the maps in the folder
+        map_intrinsics: of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]
+        size: HxW [px], to which the maps are brought
+    """
+
+    depth: str | None = None
+    variance: str | None = None
+    depth_scale: float | None = None
+    map_intrinsics: tuple[str, ...] = ()
+    size: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class UfMOptions:
+    """UfM*.
+
+    Attributes:
+        preset: segmentation thresholds of the authors' code for a kind of recording; single --ufm.segment.* take
+            precedence
+        anchors: track corners of the images: their depths show the error on which all views agree (docs/anchors.md)
+    """
+
+    preset: str | None = option(None, choices=PRESETS)
+    anchors: bool = False
+    ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Depth with a variance for every pixel of a sequence of posed images.
+
+    The depth comes from a network (--model, --weights), from maps that another program predicted (--depth DIR), or
+    from the sequence itself (--depth self).
+
+    Attributes:
+        sequence: folder of the sequence, or a video file, or tour:SEED for rendered rooms
+        out: folder for everything that is written
+        frames: START:STOP:STEP, which frames, counted from 0 as Python does
+        resume: continue the run in --out
+        overwrite: replace the run in --out
+        no_video: leave preview.mp4 out
+        no_sheet: leave contact_sheet.png out
+        device: cpu, cuda or cuda:N
+        threads: number of CPU threads; default: all cores
+        debug: show tracebacks
+    """
+
+    USAGE: ClassVar[str] = "ufmstar run SEQUENCE (--model NAME --weights FILE... | --depth DIR) --out OUT [options]"
+
+    sequence: str = positional()
+    out: str
+    frames: str | None = None
+    resume: bool = False
+    overwrite: bool = False
+    no_video: bool = False
+    no_sheet: bool = False
+    device: str = "cpu"
+    threads: int | None = None
+    debug: bool = False
+    opening: SequenceOptions
+    network: NetworkOptions
+    maps: MapOptions
+    uncertainty: UfMOptions
+
+    def __post_init__(self) -> None:
+        UfMStarConfig.from_dict(self.uncertainty.ufm)
+        parse_slice(self.frames)
+        parse_size(self.maps.size)
+        for words, name in (
+            (self.opening.intrinsics, "--intrinsics"),
+            (self.opening.depth_intrinsics, "--depth-intrinsics"),
+            (self.maps.map_intrinsics, "--map-intrinsics"),
+        ):
+            parse_intrinsics(words, name)
+        _check_depth(as_dict(self.network) | as_dict(self.maps))
+        if self.uncertainty.ufm["anchored"] and not self.uncertainty.anchors:
+            raise ValueError("--ufm.anchored needs anchors: give --anchors instead")
+        if self.resume and self.overwrite:
+            raise ValueError("--resume and --overwrite contradict each other")
+
+    @property
+    def config(self) -> UfMStarConfig:
+        """The configuration of UfM*."""
+        return UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": self.uncertainty.anchors})
+
+    def settings(self) -> dict[str, Any]:
+        """What is run, as plain values that a configuration file may hold: not how it is started."""
+        started = ("resume", "overwrite", "debug")
+        plain = {name: value for name, value in as_dict(self).items() if name not in started}
+        return plain | {"ufm": self.config.to_dict()}
+
+
+def read(words: Sequence[str]) -> RunOptions:
+    """The options of a command line.
+
+    Raises:
+        ValueError: an unknown option, or values that are impossible or contradict each other.
+        SystemExit: help was asked for.
+    """
+    prog = "ufmstar run"
+    options = parse(RunOptions, words, prog)
+    if options.uncertainty.preset is None:
+        return options
+    preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
+    return parse(RunOptions, words, prog, {f"ufm.segment.{name}": value for name, value in preset.items()})
+
+
+def main(options: RunOptions) -> int:
+    """Run, and print the results' table; the exit code."""
+    from ufmstar_torch.eval.commands.run import run as run_job
+    from ufmstar_torch.eval.commands.run_job import job_from
+    from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.results.folder import FolderError
+
+    try:
+        job = job_from(options)
+    except (ImportError, OSError, ValueError) as error:
+        raise UsageError(error) from error
+    try:
+        with Bars() as bars, stop_signals(bars.say) as stop:
+            summary = run_job(
+                job,
+                options.out,
+                resume=options.resume,
+                overwrite=options.overwrite,
+                progress=bars.show,
+                stop=stop,
+            )
+    except FolderError as error:
+        raise UsageError(error) from error
+    return _report(summary, options.out)
+
+
+def _check_depth(options: Mapping[str, Any]) -> None:
+    """Whether the options name one source of depth, and nothing that belongs to another one.
+
+    Raises:
+        ValueError: they do not.
+    """
+    model, depth = options["model"], options["depth"]
+    if (model is None) == (depth is None):
+        wanted = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"
+        raise ValueError(f"the depth must come from one place: give {wanted}" + (", not both" if model else ""))
+    if model is not None and not options["weights"]:
+        raise ValueError(f"--model {model} needs --weights FILE")
+    of_folder = [name for name in _OF_FOLDER if options[name] not in (None, [])]
+    needs_model = [name for name in ("weights", "spec", "samples", "offload") if options[name] and model is None]
+    needs_trained = [name for name in ("samples", "offload") if options[name] and model != "trained"]
+    needs_depth = [*of_folder, *(["size"] if options["size"] is not None else [])] if depth is None else []
+    needs_folder = of_folder if depth in OWN_DEPTH else []
+    wrong = ((needs_model, "--model"), (needs_trained, "--model trained"))
+    for names, missing in (*wrong, (needs_depth, "--depth"), (needs_folder, "--depth DIR")):
+        if names:
+            raise ValueError(f"--{names[0].replace('_', '-')} goes with {missing} only")
+    if options["mode"] == "full" and len(options["weights"]) < 2 and model != "trained":
+        raise ValueError("--mode full needs several --weights")
+    if options["samples"] is not None and (options["samples"] < 2 or options["mode"] != "full"):
+        raise ValueError(f"--samples must be at least 2 and goes with --mode full, got {options['samples']}")
+
+
+def _report(summary: Mapping[str, Any], out: str) -> int:
+    """Print the table and where the outputs are; the exit code."""
+    from ufmstar_torch.eval.results.summary import FINISHED, INTERRUPTED, table
+
+    if summary["frames"]["done"]:
+        print(table(summary))
+    made = [name for name, reason in summary["outputs"].items() if reason is None]
+    for name, reason in summary["outputs"].items():
+        if reason is not None:
+            print(f"no {name}: {reason}")
+    print(f"{out}: {', '.join(['summary.json', 'frames.jsonl', 'frames/', 'depth/', 'sigma/', *made])}")
+    state = f"ufmstar run: {summary['state']}: {summary['reason']}"
+    if summary["state"] == FINISHED:
+        print(state)
+        return 0
+    print(state, file=sys.stderr)
+    return 130 if summary["state"] == INTERRUPTED else 1
