@@ -13,10 +13,10 @@ from layouts import write_generic
 from ufmstar_torch.eval.engine.evaluate import RowResult
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.stream import Stopped
-from ufmstar_torch.eval.methods.suites import suite_named
+from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.run_suite import Conduct, EvalJob, run_job
+from ufmstar_torch.eval.results.work import EvalJob, WorkerContext, run_job
 from ufmstar_torch.eval.results.worklist import find_work
 
 TRUTH = "depth_only=ground-truth:24x32"
@@ -76,13 +76,13 @@ def _drawn(sequence, row):
     return RowResult(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
 
 
-def go(job, evaluate=None, *, resume=False, overwrite=False, **conduct):
-    """Open the folder and go through the sequences: (came to the end, lines that were told)."""
-    told: list[str] = []
+def go(job, evaluate=None, *, resume=False, overwrite=False, **context):
+    """Open the folder and go through the sequences: (came to the end, lines that were reported)."""
+    lines: list[str] = []
     networks = job.load(torch.device("cpu"))
     folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
-    ended = run_job(job, folder, networks, Conduct(tell=told.append, **conduct), evaluate or Stub())
-    return ended, told
+    context = WorkerContext(report=lines.append, evaluate=evaluate or Stub(), **context)
+    return run_job(job, folder, networks, context), lines
 
 
 def kept(out):

@@ -80,8 +80,6 @@ EVAL_VIOLATIONS: frozenset[str] = frozenset(
         "gaussians -> results.files",
         "report.page_parts -> bench.efficiency_table",
         "report.write -> bench.efficiency_table",
-        "results.launch -> commands.eval_options",
-        "results.worker -> commands.eval_options",
         "sequences.layout -> tour.name",
     }
 )

@@ -17,7 +17,7 @@ from ufmstar_torch import cli
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.methods.suites import names, suite_named
+from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.aggregate import better, difference, has_variance, mean_of, references
 from ufmstar_torch.eval.report.latex import escape, latex

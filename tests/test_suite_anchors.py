@@ -18,10 +18,8 @@ from ufmstar_torch.eval.engine.estimators import make_estimator, ufm_star_config
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.perturb import perturbed
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
-from ufmstar_torch.eval.methods.suite import configured, default_of, rows_of, setting_from
-from ufmstar_torch.eval.methods.suite_file import suite_from_file
-from ufmstar_torch.eval.methods.suites import suite_named
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
+from ufmstar_torch.eval.methods.suite import rows_of, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.load import setting_of
 from ufmstar_torch.eval.report.names import row_label
@@ -172,7 +170,7 @@ def test_suites_and_words(tmp_path):
     (tmp_path / "mine.toml").write_text(
         f'[[rows]]\nmethods = ["{NAME}"]\nsetting = {{ anchors = "tracked" }}\neach = {{ anchor_count = [0, 5] }}\n'
     )
-    rows = suite_from_file(tmp_path / "mine.toml").rows
+    rows = suite_named(str(tmp_path / "mine.toml")).rows
     assert [r.setting for r in rows] == [Setting(anchors="tracked", anchor_count=n) for n in (0, 5)]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-from dataclasses import replace
 
 import pytest
 from suite_runs import TRUTH, Stub, write_rooms
@@ -12,10 +11,9 @@ from suite_runs import TRUTH, Stub, write_rooms
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import efficiency_step
 from ufmstar_torch.eval.commands import dry_run as dry
-from ufmstar_torch.eval.commands.eval_options import eval_parser, job_from, parse_eval
+from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.methods.suite import rows_of
-from ufmstar_torch.eval.methods.suites import names
+from ufmstar_torch.eval.methods.suite import names, rows_of
 from ufmstar_torch.eval.results import launch
 
 
@@ -45,7 +43,7 @@ def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""
     stub = Stub()
     own = launch.evaluate_suite
-    monkeypatch.setattr(launch, "evaluate_suite", lambda options, **how: own(options, evaluate=stub, **how))
+    monkeypatch.setattr(launch, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
     return stub
 
 
@@ -204,12 +202,12 @@ def test_predictions_are_counted_once_however_many_rows_share_them():
 
 def test_several_roots_and_networks_and_a_file_of_options(rooms, tmp_path):
     words = words_for(rooms, "out", "--root", "tour:1?frames=2&size=32x48", "a=tour:2?frames=2", "--sequences", "1")
-    job = job_from(parse_eval(eval_parser(), list(map(str, words[1:]))))
+    job = job_from(read(list(map(str, words[1:]))))
     assert [item.dataset for item in job.items] == ["a", "rooms", "tour"]
     given = {"suite": "depth-only", "root": [f"rooms={rooms}"], "network": [TRUTH], "out": "out", "seed": 3}
     (tmp_path / "eval.yaml").write_text(json.dumps(given))
-    options = parse_eval(eval_parser(), ["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
-    assert (options["root"], options["seed"]) == (given["root"], 4)
+    options = read(["--config", str(tmp_path / "eval.yaml"), "--seed", "4"])
+    assert (list(options.data.root), options.data.seed) == (given["root"], 4)
     assert len(job_from(options).items) == 3
 
 
@@ -223,18 +221,14 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 
     monkeypatch.setattr(efficiency_step, "measure", measure)
     monkeypatch.setattr(efficiency_step, "contenders", lambda networks: networks)
-    monkeypatch.setattr(launch, "job_from", lambda options: _about_efficiency(own(options)))
-    own = job_from
-    words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1")
+    rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
+    (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
+    words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")
     assert "measured when all sequences are evaluated" in ufmstar(*words, "--shard", "1/2")[1]
     assert measured == [], "another part may still be running"
     code, _, err = ufmstar(*words, "--shard", "2/2")
     assert (code, "measuring time, energy and memory" in err) == (0, True)
     assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
-    assert measured == [(["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"], "ash", 1, 1)]
+    assert measured == [(rows, "ash", 1, 1)]
     assert ufmstar(*words, "--resume")[0] == 0
     assert len(measured) == 1
-
-
-def _about_efficiency(job):
-    return replace(job, suite=replace(job.suite, efficiency=True))

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-import io
 import json
 import multiprocessing
 import os
-import signal
+import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 from trainings import SPEC
 
-from ufmstar_torch.eval.commands.eval_options import eval_parser, parse_eval
+from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.report.load import load_results
-from ufmstar_torch.eval.results import pool, slurm, worker
+from ufmstar_torch.eval.results import launch, worker
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError
-from ufmstar_torch.eval.results.launch import Place, evaluate_suite
-from ufmstar_torch.eval.results.slurm import Job, Slurm
-from ufmstar_torch.eval.results.worker import Share
+from ufmstar_torch.eval.results.launch import (
+    ClusterTask,
+    LaunchOptions,
+    Rank,
+    Slurm,
+    evaluate_suite,
+    run_processes,
+    run_slurm,
+    tasks_of,
+)
+from ufmstar_torch.eval.results.work import EvalJob
+from ufmstar_torch.eval.results.worker import WorkerTask
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
 
@@ -45,20 +55,22 @@ def no_torchrun(monkeypatch):
 def options_for(rooms, out, *words, network=TRUTH, suite="depth-only"):
     """Parsed options of an evaluation of the rooms."""
     fixed = ["--suite", suite, "--network", network, "--root", f"rooms={rooms}", "--out", str(out), "--examples", "0"]
-    return parse_eval(eval_parser(), [*fixed, *words])
+    return read([*fixed, *words])
 
 
 def quiet(options, evaluate=None, stop=lambda: False):
-    """Carry the options out, in silence: how it ended and what was told."""
-    told: list[str] = []
-    judge = {} if evaluate is None else {"evaluate": evaluate}
-    ended = evaluate_suite(options, stop=stop, tell=told.append, progress=lambda *_: None, **judge)
-    return ended, told
+    """Carry the options out, in silence: the outcome and the lines that were reported."""
+    lines: list[str] = []
+    own = {} if evaluate is None else {"evaluate": evaluate}
+    job, how = job_from(options), launch_from(options)
+    outcome = evaluate_suite(job, how, stop=stop, report=lines.append, progress=lambda *_: None, **own)
+    return outcome, lines
 
 
-# ---- a pool ----
+# ---- processes on this computer ----
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_torchrun")
 def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     torch.manual_seed(3)
@@ -87,24 +99,24 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
 
 SCRIPT = """
 import json, os, signal, sys, time
-share = json.loads(sys.stdin.read())
-folder = share["options"]["out"]
-signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{share['index']}", "w").close(), sys.exit(130)))
-open(f"{folder}/started{share['index']}", "w").write(str(os.getpid()))
-os.rename(f"{folder}/started{share['index']}", f"{folder}/pid{share['index']}")
+task = json.loads(sys.stdin.read())
+folder = task["job"]["out"]
+signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{task['index']}", "w").close(), sys.exit(130)))
+open(f"{folder}/started{task['index']}", "w").write(str(os.getpid()))
+os.rename(f"{folder}/started{task['index']}", f"{folder}/pid{task['index']}")
 while True:
     time.sleep(0.02)
 """
 
 
 def scripted(tmp_path, text, stop, count=3):
-    """A pool of processes that run a script: whether it ended well, and what was told."""
-    told: list[str] = []
-    options = {"processes": count, "threads": 1, "out": str(tmp_path)}
-    command = (sys.executable, "-c", text)
-    return pool.run_pool(options, stop=stop, tell=told.append, command=command), told
+    """Processes that run a script: whether all came to their end, and the lines that were reported."""
+    lines: list[str] = []
+    tasks = [WorkerTask({"out": str(tmp_path)}, n + 1, count, n, "abc", 1) for n in range(count)]
+    return run_processes(tasks, stop=stop, report=lines.append, command=(sys.executable, "-c", text)), lines
 
 
+@pytest.mark.slow
 def test_a_pool_that_is_stopped_tells_all_its_processes(tmp_path):
     ended, told = scripted(tmp_path, SCRIPT, lambda: len(list(tmp_path.glob("pid*"))) == 3)
     assert not ended
@@ -112,6 +124,7 @@ def test_a_pool_that_is_stopped_tells_all_its_processes(tmp_path):
     assert {path.name for path in tmp_path.glob("ended*")} == {"ended1", "ended2", "ended3"}
 
 
+@pytest.mark.slow
 def test_a_pool_whose_starter_fails_leaves_no_process(tmp_path):
     def interrupted():
         if len(list(tmp_path.glob("pid*"))) == 3:
@@ -125,27 +138,31 @@ def test_a_pool_whose_starter_fails_leaves_no_process(tmp_path):
             os.kill(int(file.read_text()), 0)
 
 
+@pytest.mark.slow
 def test_a_pool_tells_of_a_process_that_was_killed_and_lets_the_others_finish(tmp_path):
     text = "import json, os, sys\nif json.loads(sys.stdin.read())['index'] == 2: os.kill(os.getpid(), 9)"
     assert scripted(tmp_path, text, lambda: False) == (False, ["process 2/3 ended early (signal 9)"])
     assert scripted(tmp_path, "import sys; sys.stdin.read()", lambda: False) == (True, [])
 
 
-def test_threads_are_divided_and_devices_go_round(tmp_path, monkeypatch):
-    text = "import sys; s = sys.stdin.read(); import json; v = json.loads(s)"
-    text += "; open(f\"{v['options']['out']}/{v['index']}.json\", 'w').write(s)"
-    monkeypatch.setattr(pool, "available_cores", lambda: 7)
-    told: list[str] = []
-    options = {"processes": 3, "threads": None, "out": str(tmp_path)}
-    assert pool.run_pool(options, stop=lambda: False, tell=told.append, command=(sys.executable, "-c", text))
-    shares = [Share(**json.loads((tmp_path / f"{n}.json").read_text())) for n in (1, 2, 3)]
-    assert [(s.index, s.count, s.local, s.threads) for s in shares] == [(1, 3, 0, 2), (2, 3, 1, 2), (3, 3, 2, 2)]
-    assert len({s.launch for s in shares}) == 1
+def test_threads_are_divided_and_devices_go_round(rooms, tmp_path, monkeypatch):
+    monkeypatch.setattr(launch, "available_cores", lambda: 7)
+    tasks = tasks_of(job_on(rooms, tmp_path), LaunchOptions(processes=3))
+    assert [(t.index, t.count, t.local, t.threads) for t in tasks] == [(1, 3, 0, 2), (2, 3, 1, 2), (3, 3, 2, 2)]
+    assert len({t.launch for t in tasks}) == 1
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(torch, "zeros", lambda *_, device: None)
-    assert [worker.device_of("cuda", s.local) for s in shares] == ["cuda:0", "cuda:1", "cuda:0"]
+    monkeypatch.setattr(worker, "require_device", lambda name: name)
+    assert [worker.device_of("cuda", t.local) for t in tasks] == ["cuda:0", "cuda:1", "cuda:0"]
     assert worker.device_of("cuda:1", 0) == "cuda:1"
+
+
+def test_a_job_is_the_same_after_a_way_through_json(rooms, tmp_path):
+    words = ["--frames", "1::2", "--cache", str(tmp_path / "cache"), "--depth-scale", "0.5", "--samples", "3"]
+    job = job_from(options_for(rooms, tmp_path / "out", *words, suite="ablation-anchors"))
+    again = EvalJob.from_dict(json.loads(json.dumps(job.to_dict())))
+    assert again == job
+    assert [item.opening for item in again.items] == [item.opening for item in job.items]
 
 
 def test_a_device_that_is_not_there():
@@ -161,9 +178,10 @@ def as_rank(rank, world, options, result):
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(world), "LOCAL_RANK": str(rank)}
     stub = Stub(lambda *_: time.sleep(0.02))
     ended, _ = quiet(options, stub)
-    result.put((rank, ended.finished, ended.left, ended.tells, [name for name, _ in stub.asked]))
+    result.put((rank, ended.finished, ended.left, ended.reports, [name for name, _ in stub.asked]))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of forks, from Python 3.12 on
 def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(rooms, tmp_path):
     options = options_for(rooms, tmp_path / "out")
@@ -183,16 +201,16 @@ def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(roo
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
 
-def test_torchruns_word():
-    said = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
-    assert Place.of(said) == Place(3, 4, 1)
-    assert Place.of({}) is None
-    assert Place.of({"WORLD_SIZE": "4"}) is None
-    assert Place.of({**said, "RANK": "0", "WORLD_SIZE": "1"}) is None
+def test_ranks_of_torchrun():
+    variables = {"RANK": "3", "WORLD_SIZE": "4", "LOCAL_RANK": "1"}
+    assert Rank.of(variables) == Rank(3, 4, 1)
+    assert Rank.of({}) is None
+    assert Rank.of({"WORLD_SIZE": "4"}) is None
+    assert Rank.of({**variables, "RANK": "0", "WORLD_SIZE": "1"}) is None
     with pytest.raises(ValueError, match="must be numbers"):
-        Place.of({**said, "RANK": "first"})
+        Rank.of({**variables, "RANK": "first"})
     with pytest.raises(ValueError, match="RANK 4 must be in"):
-        Place.of({**said, "RANK": "4"})
+        Rank.of({**variables, "RANK": "4"})
 
 
 @pytest.mark.parametrize("words", [["--shard", "1/2"], ["--processes", "2"], ["--overwrite"], ["--slurm", "jobs=2"]])
@@ -237,6 +255,7 @@ def test_parts_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path):
 # ---- SLURM ----
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # submitit's debug executor leaves its logs open
 @pytest.mark.usefixtures("no_torchrun")
 def test_jobs_through_submitit(rooms, tmp_path):
@@ -269,72 +288,90 @@ def test_what_slurm_is_told():
             Slurm.parse(words)
 
 
-def test_a_job_is_queued_again_with_the_same_share():
-    job = Job(Share({"out": "x"}, 1, 2, 0, "abc"))
+def test_a_job_is_queued_again_with_the_same_task():
+    job = ClusterTask(WorkerTask({"out": "x"}, 1, 2, 0, "abc"))
     again = job.checkpoint()
     assert again.function == job
 
 
 class Submitted:
-    """A job of a cluster."""
+    """submitit with a cluster on which jobs end as they are meant to, in their order; None = never."""
 
-    def __init__(self, error=None, result=True):
-        self.job_id, self.error, self.value, self.cancelled = "7", error, result, False
+    def __init__(self, *ends):
+        self.ends, self.cancelled = list(ends), []
 
-    def done(self):
-        return self.error is not None or self.value is not None
+    def AutoExecutor(self, folder, cluster):
+        return self
 
-    def exception(self):
-        return self.error
+    def update_parameters(self, **_):
+        pass
 
-    def result(self):
-        return self.value
+    def batch(self):
+        return nullcontext()
 
-    def cancel(self):
-        self.cancelled = True
-
-
-def test_jobs_that_fail_are_told_and_stopping_cancels_the_rest():
-    told: list[str] = []
-    assert slurm._wait([Submitted(), Submitted()], lambda: False, told.append)
-    assert not slurm._wait([Submitted(), Submitted(result=False)], lambda: False, told.append)
-    assert told == []
-    assert not slurm._wait([Submitted(RuntimeError("node died")), Submitted()], lambda: False, told.append)
-    assert told == ["job 7 failed: node died"]
-    waiting = Submitted(result=None)
-    assert not slurm._wait([waiting], lambda: True, told.append)
-    assert waiting.cancelled
+    def submit(self, task):
+        end, number = self.ends.pop(0), task.task.index
+        return SimpleNamespace(
+            job_id=str(number),
+            done=lambda: end is not None,
+            exception=lambda: end if isinstance(end, Exception) else None,
+            result=lambda: end,
+            cancel=lambda: self.cancelled.append(number),
+        )
 
 
-def test_without_submitit_it_says_what_to_install(rooms, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("ends", "stops", "finished", "failed", "cancelled"),
+    [
+        ([True, True], False, True, [], []),
+        ([True, False], False, False, [], []),
+        ([RuntimeError("node died"), True], False, False, ["job 1 failed: node died"], []),
+        ([None, None], True, False, [], [1, 2]),
+    ],
+)
+def test_jobs_that_fail_are_reported_and_stopping_cancels_all(
+    tmp_path, monkeypatch, ends, stops, finished, failed, cancelled
+):
+    cluster, lines = Submitted(*ends), []
+    monkeypatch.setitem(sys.modules, "submitit", cluster)
+    tasks = [WorkerTask({"out": str(tmp_path)}, n + 1, 2, 0, "abc") for n in range(2)]
+    assert run_slurm(Slurm.parse(["jobs=2"]), tasks, stop=lambda: stops, report=lines.append) == finished
+    assert lines == [f"jobs 1, 2; their output is in {tmp_path}/slurm", *failed]
+    assert cluster.cancelled == cancelled
+
+
+@pytest.mark.usefixtures("no_torchrun")
+def test_without_submitit_the_error_names_what_to_install(rooms, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "submitit", None)
     with pytest.raises(ImportError, match=r"pip install 'ufmstar-torch\[cluster\]'"):
-        slurm.run_slurm(options_for(rooms, tmp_path, "--slurm", "jobs=2"), stop=lambda: False, tell=print)
+        quiet(options_for(rooms, tmp_path / "out", "--slurm", "jobs=2"))
 
 
 # ---- one process of several ----
 
 
-def test_a_worker_reads_its_share_and_says_how_it_ended(rooms, tmp_path, monkeypatch, capsys):
-    def run(share, work=None):
-        monkeypatch.setattr(sys, "stdin", io.StringIO(worker.as_json(share)))
-        monkeypatch.setattr(signal, "signal", lambda *_: None)
-        if work is not None:
-            monkeypatch.setattr(worker, "work", work)
-        return worker.main()
+@pytest.mark.slow
+def test_a_worker_reads_its_task_and_its_code_is_how_it_ended(rooms, tmp_path):
+    def run(out, debug=False, **changes):
+        task = WorkerTask(job_on(rooms, out, **changes).to_dict(), 1, 2, 0, "abc", 1, debug)
+        command = (sys.executable, "-P", "-m", "ufmstar_torch.eval.results.worker")
+        return subprocess.run(command, input=task.to_json(), capture_output=True, text=True, check=False)
 
-    def refuse(*_, **__):
-        raise OSError("disk full")
+    done = run(tmp_path / "out")
+    assert done.returncode == worker.DONE, done.stderr
+    assert "[1/2] rooms/ash: 4 rows, 4 frames" in done.stderr
+    assert len(kept(tmp_path / "out")) == 12
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("x")
+    refused = run(tmp_path / "home")
+    assert refused.returncode == worker.FAILED
+    assert refused.stderr.startswith("[1/2] failed: --out")
+    assert "Traceback" in run(tmp_path / "home", debug=True).stderr
 
-    share = Share(options_for(rooms, tmp_path / "out"), 1, 2, 0, "abc", None)
-    assert run(share, lambda given, **_: given == share) == worker.DONE
-    assert run(share, lambda *_, **__: False) == worker.STOPPED
-    assert run(share, refuse) == worker.FAILED
-    assert capsys.readouterr().err == "[1/2] failed: disk full\n"
 
-
-def test_the_parent_prepares_the_folder_before_any_process_starts(rooms, tmp_path, no_torchrun, monkeypatch):
-    monkeypatch.setattr(pool, "run_pool", lambda *_, **__: pytest.fail("no process may start"))
+@pytest.mark.usefixtures("no_torchrun")
+def test_the_folder_is_prepared_before_any_process_starts(rooms, tmp_path, monkeypatch):
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("no process may start"))
     out = tmp_path / "out"
     out.mkdir()
     (out / "thesis.tex").write_text("x")

@@ -15,7 +15,7 @@ import torch
 from layouts_more import write_nyu
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 
-from ufmstar_torch.eval.commands.eval_options import eval_parser, job_from, parse_eval
+from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.methods.suite import rows_of
 from ufmstar_torch.eval.report.load import load_results
@@ -23,7 +23,7 @@ from ufmstar_torch.eval.results.cache import CacheError
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.run_suite import DIED, failures, with_references
+from ufmstar_torch.eval.results.work import DIED, failures, with_references
 from ufmstar_torch.eval.results.worklist import Shard, content_digest
 
 
@@ -53,12 +53,10 @@ def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
 
 
 def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
-    from ufmstar_torch.eval.results.cache import PredictionCache
-
     job = replace(job_on(rooms, tmp_path / "out"), frames=slice(1, None, 2), examples=1)
     go(job, evaluate_sequence)
     networks = job.load(torch.device("cpu"))
-    how = {"cache": PredictionCache(None), "device": torch.device("cpu"), "limit": job.frames}
+    how = {"device": torch.device("cpu"), "limit": job.frames}
     for item in job.items:
         for result in evaluate_sequence(item.open(), job.suite.rows, networks, **how):
             record = folder_of(job).records(item)[result.row.slug]
@@ -176,7 +174,7 @@ def test_poses_of_another_program(tmp_path):
         shutil.copy(root / name / "poses.txt", root / name / "slam.txt")
         (root / name / "poses.txt").write_text("not a pose\n")
     words = ["--suite", "depth-only", "--network", TRUTH, "--root", f"rooms={root}", "--out", str(tmp_path / "out")]
-    job = job_from(parse_eval(eval_parser(), [*words, "--trajectory", "slam.txt"]))
+    job = job_from(read([*words, "--trajectory", "slam.txt"]))
     go(job)
     write_rooms(tmp_path / "plain", ["ash", "birch"], frames=3)
     go(job_on(tmp_path / "plain", tmp_path / "expected"))
@@ -184,10 +182,10 @@ def test_poses_of_another_program(tmp_path):
     assert kept(job.out) == kept(tmp_path / "expected")
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):
-        go(job_from(parse_eval(eval_parser(), words)), resume=True)
+        go(job_from(read(words)), resume=True)
     for wrong, told in (("--poses sideways", "--poses must be one of"), ("--fps 0", "fps must be positive")):
         with pytest.raises(ValueError, match=told):
-            job_from(parse_eval(eval_parser(), [*words, *wrong.split()]))
+            job_from(read([*words, *wrong.split()]))
 
 
 def test_another_sequence_of_the_name_is_refused(tmp_path):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.methods.method import BASES, MANY
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
-from ufmstar_torch.eval.methods.suite import Suite, configured, default_of, rows_of, setting_from, value_of
-from ufmstar_torch.eval.methods.suite_file import suite_from_file
-from ufmstar_torch.eval.methods.suites import ROTATIONS, SKIPS, TRANSLATIONS, names, suite_named
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from, value_of
+from ufmstar_torch.eval.methods.suite import Suite, names, rows_of, suite_named
 
 # The rows of the paper's tables, written off.
 TABLE_1 = """
@@ -50,7 +50,7 @@ def test_every_suite_can_be_made_for_every_base():
         if name == "anchors" or name.startswith(("ablation", "paper-figure")):
             for base in BASES:
                 if name == "ablation-no-alternating" and base not in MANY:
-                    with pytest.raises(ValueError, match="take turns"):
+                    with pytest.raises(ValueError, match="no rows of"):
                         suite_named(name, base)
                 else:
                     assert suite_named(name, base).bases == (base,)
@@ -69,15 +69,14 @@ def test_no_such_suite_and_no_such_base():
 def test_figures_vary_what_the_paper_varies():
     noise = suite_named("paper-figure-pose-noise")
     assert [row.method.name for row in noise.rows] == ["Ensemble"] + ["UfM*-Ensemble"] * 11
-    assert tuple(r.setting.rotation_noise for r in noise.rows[1:7]) == ROTATIONS
-    assert (0.0, *(r.setting.translation_noise for r in noise.rows[7:])) == TRANSLATIONS
+    assert [r.setting.rotation_noise for r in noise.rows[1:7]] == [0.0, 0.5, 1.0, 2.0, 5.0, 10.0]
+    assert [r.setting.translation_noise for r in noise.rows[7:]] == [0.01, 0.02, 0.05, 0.1, 0.2]
     assert noise.sweep == ("rotation_noise", "translation_noise")
     overlap = suite_named("paper-figure-overlap")
     # Both are judged on the same frames: the figure shows their difference.
     assert [(r.setting.skip, r.method.name) for r in overlap.rows] == [
-        (skip, name) for skip in SKIPS for name in ("Aleatoric", "UfM*-Aleatoric")
+        (skip, name) for skip in (0, 1, 2, 4, 8, 16, 32) for name in ("Aleatoric", "UfM*-Aleatoric")
     ]
-    assert SKIPS == (0, 1, 2, 4, 8, 16, 32)
     assert suite_named("paper-figure-entropy").datasets == ("scannet", "tartanair", "kitti360")
 
 
@@ -178,7 +177,7 @@ each = { ema_alpha = [0.1, 1.0], skip = [0, 2] }
 
 def test_a_suite_from_a_file(tmp_path):
     (tmp_path / "my-own.toml").write_text(TOML)
-    suite = suite_from_file(tmp_path / "my-own.toml")
+    suite = suite_named(str(tmp_path / "my-own.toml"))
     assert (suite.name, suite.title, suite.sweep, suite.datasets) == (
         "my-own",
         "Smoothing",
@@ -193,6 +192,36 @@ def test_a_suite_from_a_file(tmp_path):
     ]
 
 
+def test_a_file_names_bases_multiples_and_other_suites(tmp_path):
+    (tmp_path / "mine.toml").write_text("""
+base = "ensemble"
+include = ["ablation-eta", "ablation-no-alternating"]
+sweep = ["segment.line_thresh"]
+[[rows]]
+bases = ["aleatoric"]
+methods = ["{alone}", "UfM*-{behind}"]
+[[rows]]
+methods = ["UfM*-{behind}", "UfM*-{behind}"]
+multiples = { "segment.line_thresh" = [1.0, 2.0] }
+""")
+    suite = suite_named(str(tmp_path / "mine.toml"), "aleatoric")
+    twice = Setting({"segment.line_thresh": 2 * UfMStarConfig().segment.line_thresh})
+    assert suite.rows[:3] == (*rows_of(["Aleatoric", "UfM*-Aleatoric"]), *rows_of(["UfM*-Aleatoric"], twice))
+    assert set(suite.rows[3:]) == set(suite_named("ablation-eta", "aleatoric").rows[2:])
+    assert suite.sweep == ("segment.line_thresh", "eta")
+    own = suite_named(str(tmp_path / "mine.toml"))
+    assert [row.method.name for row in own.rows[:2]] == ["UfM*-Ensemble"] * 2
+    assert "UfM*-FullEnsemble" in {row.method.name for row in own.rows}
+
+
+@pytest.mark.parametrize("name", ["paper-table-2", "paper-table-3", "ablation-anchors", "ablation-segmentation"])
+def test_a_suite_is_the_same_after_a_way_through_json(name):
+    suite = suite_named(name)
+    again = Suite.from_dict(json.loads(json.dumps(suite.to_dict())))
+    assert again.to_dict() == suite.to_dict()
+    assert again.rows == suite.rows
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -205,6 +234,9 @@ def test_a_suite_from_a_file(tmp_path):
         ("[[rows]]\nmethods = ['UfM*-MCD']\nsetting = {alpha = 1}", "rows 1: no setting is called 'alpha'"),
         ("[[rows]]\nmethods = ['UfM*-MCD']\neach = {eta = 0.5}", "each.eta must be a list of values"),
         ("rows = [1]", "rows 1 must be a table"),
+        ("base = 'resnet'", "base must be one of ensemble"),
+        ("bases = [1]", "bases must be a list of words"),
+        ("include = ['eta']", "no suite is called 'eta'"),
         ("title = 'x'", "needs at least one row"),
         ("name = ", "Invalid value"),
     ],
@@ -212,5 +244,5 @@ def test_a_suite_from_a_file(tmp_path):
 def test_mistakes_in_a_file_are_told_with_its_name(tmp_path, text, told):
     (tmp_path / "bad.toml").write_text(text)
     with pytest.raises(ValueError, match=told) as raised:
-        suite_from_file(tmp_path / "bad.toml")
+        suite_named(str(tmp_path / "bad.toml"))
     assert "bad.toml" in str(raised.value)

@@ -9,7 +9,7 @@ import torch
 from ufmstar_torch.eval.bench.contender import contenders
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.results.files import write_json_atomic
-from ufmstar_torch.eval.results.run_suite import EvalJob
+from ufmstar_torch.eval.results.work import EvalJob
 from ufmstar_torch.eval.results.worker import device_of
 
 EFFICIENCY = "efficiency.json"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.results.run_suite import EvalJob
+from ufmstar_torch.eval.results.work import EvalJob
 from ufmstar_torch.eval.results.worklist import Shard
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 

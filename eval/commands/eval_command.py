@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.results.launch import Ended
+    from ufmstar_torch.eval.results.launch import EvalOutcome, LaunchOptions
+    from ufmstar_torch.eval.results.work import EvalJob
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +152,7 @@ def read(words: Sequence[str]) -> EvalOptions:
 def main(options: EvalOptions) -> int:
     """Evaluate, print the results, and draw them; the exit code."""
     if options.what.list:
-        from ufmstar_torch.eval.methods.suites import listing
+        from ufmstar_torch.eval.methods.suite import listing
 
         print(listing())
         return 0
@@ -164,8 +166,50 @@ def main(options: EvalOptions) -> int:
         raise UsageError(error) from error
 
 
-def _plain(options: EvalOptions) -> dict[str, Any]:
-    return as_dict(options) | {f.name: None for f in fields(options.opening)} | options.opening.given()
+def job_from(options: EvalOptions) -> EvalJob:
+    """The job that the options describe; nothing is opened but folders.
+
+    Raises:
+        FileNotFoundError: something that was named does not exist.
+        ValueError: options that do not go together, a base given twice, no row with a network, no sequence.
+    """
+    from ufmstar_torch.eval.engine.load import NetworkChoice
+    from ufmstar_torch.eval.methods.suite import suite_named
+    from ufmstar_torch.eval.results.work import EvalJob
+    from ufmstar_torch.eval.results.worklist import find_work, read_names
+    from ufmstar_torch.eval.sequences.options import Options
+
+    what, data, output = options.what, options.data, options.output
+    suite = suite_named(str(what.suite), what.base)
+    choices = [NetworkChoice.parse(text) for text in what.network]
+    networks = {choice.base: choice for choice in choices}
+    if len(networks) < len(choices):
+        raise ValueError(f"--network: every base once, got {', '.join(choice.base for choice in choices)}")
+    opening = options.opening.given()
+    Options(**{name: value for name, value in opening.items() if name != "poses"})  # raises for impossible values
+    only = None if data.sequence_list is None else read_names(Path(data.sequence_list))
+    items = find_work(data.root, sample=data.sequences, seed=data.seed, only=only)
+    return EvalJob(
+        suite=suite.with_bases(networks),
+        networks=networks,
+        items=tuple(replace(item, opening=tuple(opening.items())) for item in items),
+        out=Path(str(output.out)),
+        missing_bases=tuple(base for base in suite.bases if base not in networks),
+        frames=parse_slice(data.frames),
+        cache=None if output.cache is None else Path(output.cache),
+        device=options.device,
+        confident=output.confident,
+        examples=output.examples,
+        samples=what.samples,
+    )
+
+
+def launch_from(options: EvalOptions) -> LaunchOptions:
+    """Who carries the evaluation out."""
+    from ufmstar_torch.eval.results.launch import LaunchOptions
+
+    values = as_dict(options)
+    return LaunchOptions(**{f.name: values[f.name] for f in fields(LaunchOptions)})
 
 
 def _evaluate(options: EvalOptions) -> int:
@@ -173,29 +217,30 @@ def _evaluate(options: EvalOptions) -> int:
     from ufmstar_torch.eval.results.launch import evaluate_suite
 
     with Bars() as bars, stop_signals(bars.say) as stop:
-        ended = evaluate_suite(_plain(options), stop=stop, tell=bars.say, progress=bars.frames)
-    if ended.tells:
-        return _report(ended, options.threads, draws=not options.output.no_report)
-    return 0 if ended.finished else 130
+        job, launch = job_from(options), launch_from(options)
+        outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
+    if outcome.reports:
+        return _report(outcome, options.threads, draws=not options.output.no_report)
+    return 0 if outcome.finished else 130
 
 
-def _report(ended: Ended, threads: int | None, *, draws: bool) -> int:
+def _report(outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
     """Print the table, make the measurements and pictures that belong to it, name what failed; the exit code."""
     from ufmstar_torch.eval.commands.outcome import draw, measure, table
 
-    print(table(ended), flush=True)
-    if ended.finished:
-        if ended.job.suite.efficiency:
+    print(table(outcome), flush=True)
+    if outcome.finished:
+        if outcome.job.suite.efficiency:
             print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
-        for line in (measure(ended, threads), draw(ended) if draws else None):
+        for line in (measure(outcome, threads), draw(outcome) if draws else None):
             if line is not None:
                 print(line)
-    for label, reason in ended.failed.items():
+    for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
-    if ended.stopped:
+    if outcome.stopped:
         print("ufmstar eval: stopped; --resume goes on", file=sys.stderr)
         return 130
-    if ended.failed or not ended.finished:
+    if outcome.failed or not outcome.finished:
         print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
         return 1
     return 0
@@ -206,9 +251,8 @@ def _dry_run(options: EvalOptions) -> int:
     import torch
 
     from ufmstar_torch.eval.commands.dry_run import dry_run
-    from ufmstar_torch.eval.commands.eval_options import job_from
     from ufmstar_torch.eval.results.worklist import Shard
 
-    job = job_from(_plain(options))
+    job = job_from(options)
     print(dry_run(job, job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1")))
     return 0

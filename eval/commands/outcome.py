@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from ufmstar_torch.eval.report.load import ResultsError, load_results
 from ufmstar_torch.eval.report.write import summary, write_report, written
-from ufmstar_torch.eval.results.launch import Ended
+from ufmstar_torch.eval.results.launch import EvalOutcome
 
 
-def table(ended: Ended) -> str:
+def table(outcome: EvalOutcome) -> str:
     """The suite's table (mean and 95 % confidence interval over sequences), what was left out, and the folder."""
-    job = ended.job
+    job = outcome.job
     try:
         lines = [summary(load_results(job.out, with_sums=False))]
     except ResultsError as error:
@@ -20,13 +20,13 @@ def table(ended: Ended) -> str:
     return "\n".join(lines)
 
 
-def measure(ended: Ended, threads: int | None = None) -> str | None:
+def measure(outcome: EvalOutcome, threads: int | None = None) -> str | None:
     """Measure what a suite about efficiency asks for, unless it is there; a line if it cannot be had.
 
     Not while sequences are still to be evaluated: other parts (``--shard``) are at them, and would be timed along.
 
     Args:
-        ended: the evaluation.
+        outcome: the evaluation.
         threads: of the CPU; None = all.
 
     Raises:
@@ -35,25 +35,25 @@ def measure(ended: Ended, threads: int | None = None) -> str | None:
     from ufmstar_torch.eval.bench.efficiency_step import EFFICIENCY, measure_job
     from ufmstar_torch.eval.bench.measure import Plan
 
-    if not ended.job.suite.efficiency or (ended.job.out / EFFICIENCY).exists():
+    if not outcome.job.suite.efficiency or (outcome.job.out / EFFICIENCY).exists():
         return None
     try:
-        if load_results(ended.job.out, with_sums=False).missing:
+        if load_results(outcome.job.out, with_sums=False).missing:
             return f"no {EFFICIENCY} yet: it is measured when all sequences are evaluated"
-        measure_job(ended.job, Plan(threads=threads))
+        measure_job(outcome.job, Plan(threads=threads))
     except (ResultsError, ValueError) as error:
         return f"no {EFFICIENCY}: {' '.join(str(error).split())}"
     return None
 
 
-def draw(ended: Ended) -> str:
+def draw(outcome: EvalOutcome) -> str:
     """Draw tables and figures; a line that says where, or why there are none.
 
     Raises:
         OSError: a file cannot be written.
     """
     try:
-        files = write_report(ended.job.out)
+        files = write_report(outcome.job.out)
     except (ImportError, ResultsError) as error:
         return f"no report: {' '.join(str(error).split())}"
-    return written(ended.job.out, files)
+    return written(outcome.job.out, files)

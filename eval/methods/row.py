@@ -44,3 +44,7 @@ class Row:
         """For people: "UfM*-Ensemble", "UfM*-Ensemble (ema_alpha 1.0)"."""
         changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
         return f"{self.name} ({changed})" if changed else self.name
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row as plain values, as eval.json has it."""
+        return {"method": self.method.name, "setting": self.setting.to_dict()}

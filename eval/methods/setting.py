@@ -1,4 +1,7 @@
-"""What an ablation changes about a row: settings of UfM*, noise on the poses, frames left out, anchors."""
+"""What an ablation changes about a row: settings of UfM*, noise on the poses, frames left out, anchors.
+
+A setting's values have flat names: ``Setting``'s own fields, and those of ``UfMStarConfig``, as "segment.min_pixels".
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,11 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from types import MappingProxyType
 from typing import Any
+
+from ufmstar_torch.config import UfMStarConfig
 
 TRACKED, TRUTH = "tracked", "truth"
 _ANCHORS = ("", TRACKED, TRUTH)
@@ -108,3 +113,68 @@ class Setting:
 
 
 DEFAULT = Setting()
+_OWN = tuple(f.name for f in fields(Setting) if f.name != "overrides")
+
+
+def setting_from(values: Mapping[str, Any]) -> Setting:
+    """A setting from the flat form of ``Setting.to_dict``.
+
+    Values that UfM* has anyway are left out, so that such a row is the default one.
+
+    Raises:
+        ValueError: an unknown name, or a value that it does not take.
+    """
+    own = {name: value for name, value in values.items() if name in _OWN}
+    overrides = {name: value for name, value in values.items() if name not in _OWN}
+    changed = {name: value for name, value in overrides.items() if value != default_of(name)}
+    setting = Setting(overrides=changed, **own)
+    configured(setting)
+    return setting
+
+
+def value_of(setting: Mapping[str, Any], name: str) -> Any:
+    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it says nothing.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    return setting[name] if name in setting else default_of(name)
+
+
+def default_of(name: str) -> Any:
+    """The value that a row has as the paper runs it.
+
+    Raises:
+        ValueError: there is no such setting.
+    """
+    if name in _OWN:
+        return getattr(DEFAULT, name)
+    value: Any = UfMStarConfig()
+    for part in name.split("."):
+        if not is_dataclass(value) or part not in {f.name for f in fields(value)}:
+            known = ", ".join(own for own in _OWN if own != "seed")
+            raise ValueError(f"no setting is called {name!r}: expected {known}, or UfM*'s own, as ema_alpha")
+        value = getattr(value, part)
+    if is_dataclass(value):
+        raise ValueError(f"setting {name!r} is a group: name one of its values, as {name}.min_pixels")
+    return value
+
+
+def configured(setting: Setting) -> UfMStarConfig:
+    """UfM*'s configuration under a setting.
+
+    Raises:
+        ValueError: an unknown name, or a value that it does not take.
+    """
+    nested: dict[str, Any] = {}
+    for name, value in setting.overrides.items():
+        default_of(name)
+        group, _, field = name.rpartition(".")
+        (nested.setdefault(group, {}) if group else nested)[field] = value
+    config = UfMStarConfig(anchored=bool(setting.anchors))
+    groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}
+    return config.replace(**{name: value for name, value in nested.items() if not _group(value)}, **groups)
+
+
+def _group(value: Any) -> bool:
+    return isinstance(value, dict)

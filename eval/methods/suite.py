@@ -1,19 +1,57 @@
-"""A suite: the rows that make a table or figure, and what it is drawn over."""
+"""Suites: the rows of a table or figure. Each is a TOML file, in ``suites/`` or of a user.
+
+```toml
+title = "Smoothing"                        # name: the file's, unless given
+base = "ensemble"                          # the network it is about, unless --base names another one; or
+bases = ["ensemble", "aleatoric"]          # several: the rows of each in turn
+datasets = ["scannet"]                     # a hint for readers, as sequences, network and size
+sweep = ["ema_alpha"]                      # settings that vary, for a figure
+include = ["ablation-eta"]                 # rows and sweeps of other suites as well
+
+[[rows]]
+methods = ["{alone}", "UfM*-{behind}"]     # as the paper names them: "Ensemble", "UfM*-Ensemble", or by the base
+
+[[rows]]
+bases = ["ensemble"]                       # of no other base
+methods = ["UfM*-{behind}"]
+setting = { "segment.min_pixels" = 2000 }  # of UfM*, or of ``Setting``: rotation_noise [deg], skip, anchors ...
+each = { ema_alpha = [0.1, 0.25, 1.0] }    # one row for every value
+multiples = { eta = [0.5, 2.0] }           # likewise, of UfM*'s own value
+```
+
+A row that occurs several times is taken once.
+"""
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.methods.method import UFM_STAR, Method
+from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
-_OWN = tuple(f.name for f in fields(Setting) if f.name != "overrides")
+_SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
+_HINTS = ("datasets", "sequences", "network", "size", "efficiency")
+_KEYS: dict[str, type] = {
+    "name": str,
+    "title": str,
+    "base": str,
+    "bases": list,
+    "include": list,
+    "sweep": list,
+    "rows": list,
+}
+_KEYS |= {"datasets": list, "sequences": int, "network": str, "size": list, "efficiency": bool}
+_ROW_KEYS: dict[str, type] = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict}
 
 
 @dataclass(frozen=True)
@@ -65,79 +103,74 @@ class Suite:
         return tuple(dict.fromkeys(row.method.base for row in self.rows))
 
     def with_bases(self, bases: Iterable[str]) -> Suite:
-        """The rows whose networks are there.
+        """The suite with the rows of some bases only.
 
         Raises:
             ValueError: none is left.
         """
-        there = set(bases)
-        kept = tuple(row for row in self.rows if row.method.base in there)
+        given = set(bases)
+        kept = tuple(row for row in self.rows if row.method.base in given)
         if not kept:
             raise ValueError(
                 f"suite {self.name} has rows of {', '.join(self.bases)}, but there are networks of "
-                f"{', '.join(sorted(there)) or 'none'} only: give --network BASE=MODEL:FILES for one of them"
+                f"{', '.join(sorted(given)) or 'none'} only: give --network BASE=MODEL:FILES for one of them"
             )
         return replace(self, rows=kept)
 
+    def to_dict(self) -> dict[str, Any]:
+        """The suite as plain values, for another process."""
+        return {**self.__dict__, "rows": [row.to_dict() for row in self.rows]}
 
-def setting_from(values: Mapping[str, Any]) -> Setting:
-    """A setting from the flat form of ``Setting.to_dict``.
-
-    Values that UfM* has anyway are left out, so that such a row is the default one.
-
-    Raises:
-        ValueError: an unknown name, or a value that it does not take.
-    """
-    own = {name: value for name, value in values.items() if name in _OWN}
-    overrides = {name: value for name, value in values.items() if name not in _OWN}
-    changed = {name: value for name, value in overrides.items() if value != default_of(name)}
-    setting = Setting(overrides=changed, **own)
-    configured(setting)
-    return setting
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Suite:
+        """The suite of :meth:`to_dict`, also after a way through JSON."""
+        rows = [Row(Method.parse(row["method"]), setting_from(row["setting"])) for row in values["rows"]]
+        plain = {name: _plain(value) for name, value in values.items()}
+        return cls(**{**plain, "rows": tuple(rows)})
 
 
-def value_of(setting: Mapping[str, Any], name: str) -> Any:
-    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it says nothing.
-
-    Raises:
-        ValueError: an unknown name.
-    """
-    return setting[name] if name in setting else default_of(name)
-
-
-def default_of(name: str) -> Any:
-    """The value that a row has as the paper runs it.
-
-    Raises:
-        ValueError: there is no such setting.
-    """
-    if name in _OWN:
-        return getattr(DEFAULT, name)
-    value: Any = UfMStarConfig()
-    for part in name.split("."):
-        if not is_dataclass(value) or part not in {f.name for f in fields(value)}:
-            known = ", ".join(own for own in _OWN if own != "seed")
-            raise ValueError(f"no setting is called {name!r}: expected {known}, or UfM*'s own, as ema_alpha")
-        value = getattr(value, part)
-    if is_dataclass(value):
-        raise ValueError(f"setting {name!r} is a group: name one of its values, as {name}.min_pixels")
-    return value
+def names() -> tuple[str, ...]:
+    """The names of the suites that come with the package, the paper's tables first."""
+    stems = [file.name.removesuffix(".toml") for file in _SHIPPED.iterdir() if file.name.endswith(".toml")]
+    return tuple(
+        sorted(stems, key=lambda name: (not name.startswith("paper-table"), not name.startswith("paper"), name))
+    )
 
 
-def configured(setting: Setting) -> UfMStarConfig:
-    """UfM*'s configuration under a setting.
+def listing() -> str:
+    """A line for each suite: name, number of rows, title."""
+    suites = [suite_named(name) for name in names()]
+    return "\n".join(f"{suite.name:26}{len(suite.rows):3} rows  {suite.title}" for suite in suites)
+
+
+def suite_named(name: str, base: str | None = None) -> Suite:
+    r"""Read a suite.
+
+    Args:
+        name: one of ``names()``, or a TOML file (\*.toml).
+        base: the network that a figure or ablation is about, instead of its own; a key of ``method.BASES``.
 
     Raises:
-        ValueError: an unknown name, or a value that it does not take.
+        FileNotFoundError: no such file.
+        ValueError: no suite is called so, no such base, or a suite that names its networks itself; a file that is not
+            TOML, an unknown key, a value of the wrong kind, or an impossible row; the message names the file.
     """
-    nested: dict[str, Any] = {}
-    for name, value in setting.overrides.items():
-        default_of(name)
-        group, _, field = name.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[field] = value
-    config = UfMStarConfig(anchored=bool(setting.anchors))
-    groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}
-    return config.replace(**{name: value for name, value in nested.items() if not _group(value)}, **groups)
+    _file(name)
+    if base is not None and base not in BASES:
+        raise ValueError(f"--base must be one of {', '.join(BASES)}, got {base!r}")
+    try:
+        values = _read(name)
+        if base is not None and "base" not in values:
+            raise ValueError("--base goes with figures and ablations of one network, the suite names its own")
+        rows = tuple(dict.fromkeys(_rows_of(values, base or values.get("base"))))
+        own = Path(name).stem
+        if base is not None and not rows:
+            raise ValueError(f"the suite has no rows of {base}")
+        named: dict[str, Any] = {"name": values.get("name", own), "title": values.get("title", own), "rows": rows}
+        hints: dict[str, Any] = {key: _plain(values[key]) for key in _HINTS if key in values}
+        return Suite(**named, sweep=tuple(dict.fromkeys(_sweep(values))), **hints)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def check_row(row: Row) -> None:
@@ -160,5 +193,88 @@ def rows_of(methods: Iterable[Method | str], setting: Setting = DEFAULT) -> tupl
     return tuple(Row(method, setting) for method in parsed)
 
 
-def _group(value: Any) -> bool:
-    return isinstance(value, dict)
+def _file(name: str) -> Traversable:
+    """The file of a suite.
+
+    Raises:
+        ValueError: no suite is called so.
+    """
+    if name.endswith(".toml"):
+        return Path(name)
+    if name not in names():
+        raise ValueError(f"no suite is called {name!r}: there are {', '.join(names())}, and TOML files (*.toml)")
+    return _SHIPPED / f"{name}.toml"
+
+
+def _read(name: str) -> dict[str, Any]:
+    """The content of a suite's file, its keys and bases checked."""
+    values = tomllib.loads(_file(name).read_text(encoding="utf-8"))
+    _check(values, _KEYS, "the suite")
+    for key in ("bases", "include", "sweep", "datasets"):
+        _words(values, key)
+    for base in (*values.get("bases", []), values.get("base", "ensemble")):
+        if base not in BASES:
+            raise ValueError(f"base must be one of {', '.join(BASES)}, got {base!r}")
+    return values
+
+
+def _rows_of(values: Mapping[str, Any], base: str | None) -> Iterator[Row]:
+    """The rows of a suite and of those that it includes, for a base or for the suite's own bases."""
+    for own in values.get("bases", [base]):
+        for n, part in enumerate(values.get("rows", [])):
+            _check(part, _ROW_KEYS, f"rows {n + 1}")
+            try:
+                yield from _expanded(part, own)
+            except ValueError as error:
+                raise ValueError(f"rows {n + 1}: {error}") from error
+    for name in values.get("include", []):
+        yield from _rows_of(_read(name), base)
+
+
+def _sweep(values: Mapping[str, Any]) -> Iterator[str]:
+    yield from values.get("sweep", [])
+    for name in values.get("include", []):
+        yield from _sweep(_read(name))
+
+
+def _expanded(part: Any, base: str | None) -> Iterator[Row]:
+    """The rows of one [[rows]]: every method at every point."""
+    methods = _words(part, "methods")
+    if not methods:
+        raise ValueError('methods must name at least one, as ["UfM*-Ensemble"]')
+    if base is not None:
+        alone, behind = BASES[base]
+        methods = tuple(name.replace("{alone}", alone).replace("{behind}", behind) for name in methods)
+    ranges: dict[str, list[Any]] = {}
+    for kind in ("each", "multiples"):
+        for name, points in part.get(kind, {}).items():
+            if not isinstance(points, list) or not points:
+                raise ValueError(f"{kind}.{name} must be a list of values, got {points!r}")
+            ranges[name] = points if kind == "each" else [factor * default_of(name) for factor in points]
+    if base is not None and base not in _words(part, "bases", (base,)):
+        return
+    for point in itertools.product(*ranges.values()):
+        yield from rows_of(methods, setting_from({**part.get("setting", {}), **dict(zip(ranges, point, strict=True))}))
+
+
+def _check(values: Any, kinds: Mapping[str, type], where: str) -> None:
+    """Raise ValueError for an unknown key, or a value of the wrong kind."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{where} must be a table, got {values!r}")
+    unknown = sorted(values.keys() - kinds.keys())
+    if unknown:
+        raise ValueError(f"{where}: unknown key {unknown[0]!r}, expected {', '.join(kinds)}")
+    for name, value in values.items():
+        if not isinstance(value, kinds[name]):
+            raise ValueError(f"{where}: {name} must be a {kinds[name].__name__}, got {value!r}")
+
+
+def _words(values: Mapping[str, Any], name: str, default: Iterable[str] = ()) -> tuple[str, ...]:
+    words = values.get(name, default)
+    if not all(isinstance(word, str) for word in words):
+        raise ValueError(f"{name} must be a list of words, got {words!r}")
+    return tuple(words)
+
+
+def _plain(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

@@ -11,8 +11,7 @@ from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH
-from ufmstar_torch.eval.methods.suite import default_of
+from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report.aggregate import Mean, mean_over, value_of
 from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.names import Quantity, setting_label

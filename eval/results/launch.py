@@ -1,35 +1,74 @@
-"""How an evaluation is carried out: here, by a pool of processes, by torchrun's, or by jobs of a cluster."""
+"""How an evaluation is carried out: in this process, by further ones, by torchrun's, or by jobs of a cluster.
+
+Processes on this computer are started and watched here rather than by submitit's local executor, whose jobs end after
+some minutes, are cancelled by SIGINT, outlive a killed starter and write to files instead of the terminal.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
-from ufmstar_torch.eval.commands.eval_options import job_from
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.run_suite import Conduct, EvalJob, Evaluate, failures, run_job
-from ufmstar_torch.eval.results.worker import Share, device_of, prepare, work
+from ufmstar_torch.eval.results.machine import available_cores
+from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerContext, failures, run_job
+from ufmstar_torch.eval.results.worker import DONE, STOPPED, WorkerTask, device_of, work
 from ufmstar_torch.eval.results.worklist import Shard
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
+_POLL_SECONDS = 0.05
+_PATIENCE_SECONDS = 10.0  # for a process that was killed
+_WORKER = (sys.executable, "-P", "-m", "ufmstar_torch.eval.results.worker")
+# submitit's own names of parameters; others are SLURM's, as partition, account, constraint.
+_SUBMITIT = ("name", "timeout_min", "mem_gb", "nodes", "cpus_per_task", "gpus_per_node", "tasks_per_node")
+
+Stop = Callable[[], bool]
+Report = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Ended:
-    """How it ended.
+class LaunchOptions:
+    """Who carries an evaluation out: options of ``ufmstar eval``, under their names.
+
+    Attributes:
+        processes: on this computer.
+        slurm: KEY=VALUE words; see ``Slurm``. () = no cluster.
+        shard: "i/n", the part of the sequences that this process does; None = all.
+        threads: of the CPU, for each process; None = all, divided among them.
+        resume, overwrite: see ``EvalFolder.open``.
+        debug: show tracebacks.
+    """
+
+    processes: int = 1
+    slurm: Sequence[str] = ()
+    shard: str | None = None
+    threads: int | None = None
+    resume: bool = False
+    overwrite: bool = False
+    debug: bool = False
+
+
+@dataclass(frozen=True)
+class EvalOutcome:
+    """How an evaluation ended.
 
     Attributes:
         job: what was evaluated.
         finished: False: it was stopped, or a process ended early.
         stopped: by the caller.
         failed: why a sequence is broken, by its label.
-        left: sequences without all of their rows, broken ones left out.
-        tells: whether this process is the one that tells the results; further ones of torchrun are silent.
+        left: number of sequences without all of their rows, broken ones left out.
+        reports: whether this process reports the results; further ones of torchrun are silent.
     """
 
     job: EvalJob
@@ -37,23 +76,23 @@ class Ended:
     stopped: bool
     failed: Mapping[str, str]
     left: int
-    tells: bool = True
+    reports: bool = True
 
 
 @dataclass(frozen=True)
-class Place:
-    """torchrun's word on a process: its number of how many, and its number on the computer, all from 0."""
+class Rank:
+    """Rank, world size and local rank of a process, as torchrun sets them."""
 
     rank: int
     world: int
     local: int
 
     @classmethod
-    def of(cls, environment: Mapping[str, str]) -> Place | None:
-        """The place; None where torchrun has not started several.
+    def of(cls, environment: Mapping[str, str]) -> Rank | None:
+        """The rank in an environment; None where torchrun has not started several processes.
 
         Raises:
-            ValueError: the variables hold no such numbers.
+            ValueError: the variables are not such numbers.
         """
         if any(name not in environment for name in _TORCHRUN):
             return None
@@ -66,74 +105,279 @@ class Place:
         return None if world == 1 else cls(rank, world, local)
 
 
+@dataclass(frozen=True)
+class Slurm:
+    """The words of ``--slurm``.
+
+    Attributes:
+        jobs: how many share the work.
+        cluster: of submitit: "slurm"; "local" and "debug" run on this computer.
+        parameters: of ``submitit.AutoExecutor``.
+    """
+
+    jobs: int
+    cluster: str
+    parameters: Mapping[str, Any]
+
+    @classmethod
+    def parse(cls, words: Iterable[str]) -> Slurm:
+        """From KEY=VALUE words.
+
+        Raises:
+            ValueError: another form, a key twice, or a number of jobs below 1.
+        """
+        values: dict[str, Any] = {}
+        for word in words:
+            key, equals, value = word.partition("=")
+            if not (key.isidentifier() and equals and value) or key in values:
+                raise ValueError(f"--slurm must be KEY=VALUE, each key once, got {word!r}")
+            values[key] = int(value) if value.isdecimal() else value
+        jobs, cluster = values.pop("jobs", 1), values.pop("cluster", "slurm")
+        if not isinstance(jobs, int) or jobs < 1:
+            raise ValueError(f"--slurm jobs must be at least 1, got {jobs}")
+        if cluster not in ("slurm", "local", "debug"):
+            raise ValueError(f"--slurm cluster must be slurm, local or debug, got {cluster!r}")
+        if {"nodes", "tasks_per_node"} & values.keys():
+            raise ValueError("--slurm: every job is one process; jobs=N says how many")
+        plain = {key for key in values if key in _SUBMITIT or key.startswith("slurm_")}
+        return cls(jobs, cluster, {key if key in plain else f"slurm_{key}": v for key, v in values.items()})
+
+
 def evaluate_suite(
-    options: Mapping[str, Any],
+    job: EvalJob,
+    options: LaunchOptions,
     *,
-    stop: Callable[[], bool],
-    tell: Callable[[str], None],
+    stop: Stop,
+    report: Report,
     progress: Callable[[str, int, int], None],
     evaluate: Evaluate = evaluate_sequence,
-) -> Ended:
-    """Do what the options (``parse_eval``) say.
+) -> EvalOutcome:
+    """Evaluate a job.
 
     Args:
-        options: checked or not.
+        job: what is evaluated.
+        options: by whom.
         stop: asked before every frame.
-        tell: gets a line when a sequence is finished.
-        progress: see ``Conduct``; of this process's own work.
+        report: receives a line when a sequence is finished.
+        progress: see ``WorkerContext``; of this process's own work.
         evaluate: of this process's own work; see ``evaluate_sequence``.
 
     Raises:
-        FolderError, FileNotFoundError, ValueError, ImportError: it cannot be begun.
+        FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
         CacheError, OSError: nothing can be written.
     """
-    job = job_from(options)
-    place = Place.of(os.environ)
-    if place is not None:
-        finished = _as_torchruns(options, place, stop, tell, evaluate)
-        return _ended(job, finished, stop(), tells=place.rank == 0)
-    if options["slurm"] or options["processes"] > 1:
-        from ufmstar_torch.eval.results.pool import run_pool
-        from ufmstar_torch.eval.results.slurm import Slurm, run_slurm
-
-        Slurm.parse(options["slurm"])
-        prepare(job, resume=options["resume"], overwrite=options["overwrite"])
-        run = run_slurm if options["slurm"] else run_pool
-        return _ended(job, run(options, stop=stop, tell=tell), stop())
+    rank = Rank.of(os.environ)
+    if rank is not None:
+        _require_plain(options, rank)
+        # No common launch: torchrun starts all processes again when one was killed, and the sequence is tried again.
+        task = WorkerTask(job.to_dict(), rank.rank + 1, rank.world, rank.local, "", options.threads)
+        finished = work(task, stop=stop, report=report, waits=rank.rank == 0, evaluate=evaluate)
+        return _outcome(job, finished, stop(), reports=rank.rank == 0)
+    if options.slurm or options.processes > 1:
+        slurm = Slurm.parse(options.slurm) if options.slurm else None
+        # Opened once before any process starts, which reports mistakes once.
+        about = job.about(job.load(torch.device("cpu")))
+        EvalFolder.open(job.out, about, resume=options.resume, overwrite=options.overwrite)
+        if slurm is None:
+            finished = run_processes(tasks_of(job, options), stop=stop, report=report)
+        else:
+            finished = run_slurm(slurm, tasks_of(job, options, slurm.jobs), stop=stop, report=report)
+        return _outcome(job, finished, stop())
     job = replace(job, device=device_of(job.device, 0))
-    shard = Shard.parse(options["shard"] or "1/1")
+    shard = Shard.parse(options.shard or "1/1")
     networks = job.load(torch.device(job.device))
-    # The parts of a divided evaluation begin in any order: whichever comes first makes the folder.
-    resume = options["resume"] or shard.count > 1
-    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=options["overwrite"])
-    conduct = Conduct(shard=shard, stop=stop, tell=tell, progress=progress)
-    return _ended(job, run_job(job, folder, networks, conduct, evaluate), stop())
+    # The parts of a divided evaluation begin in any order: whichever is first makes the folder.
+    resume = options.resume or shard.count > 1
+    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=options.overwrite)
+    context = WorkerContext(shard, stop=stop, report=report, progress=progress, evaluate=evaluate)
+    return _outcome(job, run_job(job, folder, networks, context), stop())
 
 
-def _as_torchruns(
-    options: Mapping[str, Any],
-    place: Place,
-    stop: Callable[[], bool],
-    tell: Callable[[str], None],
-    evaluate: Evaluate,
-) -> bool:
-    """Take part as one of torchrun's processes; the first one stays to the end.
+def tasks_of(job: EvalJob, options: LaunchOptions, jobs: int | None = None) -> list[WorkerTask]:
+    """The tasks of processes that share a job: ``options.processes`` on this computer, or ``jobs`` on a cluster."""
+    launch, count = secrets.token_hex(8), jobs or options.processes
+    threads = options.threads if jobs else options.threads or max(1, available_cores() // count)
+    return [
+        WorkerTask(job.to_dict(), n + 1, count, 0 if jobs else n, launch, threads, options.debug) for n in range(count)
+    ]
+
+
+def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = _WORKER) -> bool:
+    """Start a process for every task, and wait for all of them.
+
+    One that ends early loses only the sequence in hand: the others do the rest.
+
+    Args:
+        tasks: one for each process.
+        stop: True: all end after the frame in hand.
+        report: receives a line for each process that ends early.
+        command: that runs ``worker.main``.
+
+    Returns:
+        Whether every process came to its end.
+    """
+    started: list[_Process] = []
+    try:
+        for task in tasks:
+            # In a session of its own, so that Ctrl-C reaches this process alone, which passes it on.
+            child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
+            started.append(_Process(task.label, child))
+            assert child.stdin is not None
+            child.stdin.write(task.to_json())
+            child.stdin.close()
+        return _wait(started, stop, report)
+    finally:
+        for process in started:
+            process.kill()
+        for process in started:
+            process.child.wait(_PATIENCE_SECONDS)
+
+
+def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: Report) -> bool:
+    """Submit a job for every task, and wait for all of them; OUT/slurm has their output.
+
+    Args:
+        slurm: the words of ``--slurm``.
+        tasks: one for each job.
+        stop: True: the jobs are cancelled.
+        report: receives a line for the jobs that were submitted, and for each that failed.
+
+    Returns:
+        Whether every job came to its end.
 
     Raises:
-        ValueError: an option that contradicts it.
+        ImportError: submitit is missing.
+        ValueError: a parameter that submitit does not take, or no SLURM here.
     """
-    for name in ("shard", "slurm", "overwrite"):
-        if options[name]:
-            raise ValueError(f"--{name} goes without torchrun, which has started {place.world} processes")
-    if options["processes"] > 1:
-        raise ValueError(f"--processes goes without torchrun, which has started {place.world}")
-    # No launch in common: torchrun starts all again when one was killed, and then its sequence is tried again.
-    share = Share(options, place.rank + 1, place.world, place.local, "", options["threads"])
-    return work(share, stop=stop, tell=tell, waits=place.rank == 0, evaluate=evaluate)
+    try:
+        import submitit
+    except ImportError as error:
+        raise ImportError("--slurm needs submitit: pip install 'ufmstar-torch[cluster]'") from error
+    folder = f"{tasks[0].job['out']}/slurm"
+    try:
+        executor = submitit.AutoExecutor(folder=folder, cluster=slurm.cluster)
+        executor.update_parameters(**{"name": "ufmstar-eval", **slurm.parameters})
+    except (NameError, RuntimeError, TypeError) as error:  # NameError: an unknown parameter
+        raise ValueError(f"--slurm: {' '.join(str(error).split())}") from error
+    with executor.batch():
+        jobs = [executor.submit(ClusterTask(task)) for task in tasks]
+    report(f"jobs {', '.join(job.job_id for job in jobs)}; their output is in {folder}")
+    running = [_ClusterJob(job) for job in jobs]
+    try:
+        return _wait(running, stop, report)
+    finally:
+        for job in running:
+            job.kill()
 
 
-def _ended(job: EvalJob, finished: bool, stopped: bool, *, tells: bool = True) -> Ended:
+@dataclass(frozen=True)
+class ClusterTask:
+    """What a job runs; submitit calls ``checkpoint`` before its time is up or it makes room, and queues it again."""
+
+    task: WorkerTask
+
+    def __call__(self) -> bool:
+        return work(self.task, stop=lambda: False, report=print)
+
+    def checkpoint(self, *_: object) -> Any:
+        """The same again: what is finished by then is skipped."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
+
+
+class _Running(Protocol):
+    """A process or job that was started."""
+
+    def done(self) -> bool:
+        """Whether it has ended, or nobody waits for it any more."""
+
+    def result(self) -> tuple[bool, str]:
+        """Whether it came to its end, and a line about what went wrong, or ""; for one that is done."""
+
+    def stop(self) -> None:
+        """Ask it to end."""
+
+
+@dataclass
+class _Process:
+    """A process on this computer."""
+
+    label: str
+    child: subprocess.Popen[str]
+
+    def done(self) -> bool:
+        return self.child.poll() is not None
+
+    def result(self) -> tuple[bool, str]:
+        code = self.child.returncode
+        how = f"signal {-code}" if code < 0 else f"code {code}"
+        return code == DONE, "" if code in (DONE, STOPPED) else f"process {self.label} ended early ({how})"
+
+    def stop(self) -> None:
+        self.child.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        if not self.done():
+            self.child.kill()
+
+
+@dataclass
+class _ClusterJob:
+    """A job of submitit, which nobody waits for once it is cancelled."""
+
+    job: Any
+    cancelled: bool = False
+
+    def done(self) -> bool:
+        return self.cancelled or bool(self.job.done())
+
+    def result(self) -> tuple[bool, str]:
+        if self.cancelled:
+            return False, ""
+        error = self.job.exception()
+        if error is not None:
+            return False, f"job {self.job.job_id} failed: {' '.join(str(error).split())[-300:]}"
+        return bool(self.job.result()), ""
+
+    def stop(self) -> None:
+        self.cancelled = True
+        self.job.cancel()
+
+    def kill(self) -> None:
+        if not self.done():
+            self.stop()
+
+
+def _wait(started: Sequence[_Running], stop: Stop, report: Report) -> bool:
+    """Wait for all of them; whether every one came to its end."""
+    running, finished, stopping = list(started), True, False
+    while running:
+        if not stopping and stop():
+            stopping = True
+            for one in running:
+                one.stop()
+        for one in [one for one in running if one.done()]:
+            running.remove(one)
+            ended_well, line = one.result()
+            finished = finished and ended_well
+            if line:
+                report(line)
+        if running:
+            time.sleep(_POLL_SECONDS)
+    return finished
+
+
+def _require_plain(options: LaunchOptions, rank: Rank) -> None:
+    """Raise ValueError for an option that contradicts torchrun."""
+    several = {"shard": options.shard, "slurm": options.slurm, "overwrite": options.overwrite}
+    for name, given in {**several, "processes": options.processes > 1}.items():
+        if given:
+            raise ValueError(f"--{name} goes without torchrun, which has started {rank.world} processes")
+
+
+def _outcome(job: EvalJob, finished: bool, stopped: bool, *, reports: bool = True) -> EvalOutcome:
     folder = EvalFolder(job.out, {})
     failed = failures(folder, job.items)
     open_items = [item for item in job.items if item.label not in failed and folder.missing(item, job.suite.rows)]
-    return Ended(job, finished, stopped, failed, len(open_items), tells)
+    return EvalOutcome(job, finished, stopped, failed, len(open_items), reports)

@@ -1,0 +1,297 @@
+"""The work of an evaluation: for one sequence after another, the rows that are missing are computed and stored."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ufmstar_torch.eval.engine.confident import references
+from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.stream import Stopped
+from ufmstar_torch.eval.methods.method import ALONE
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.suite import Suite
+from ufmstar_torch.eval.results.cache import PredictionCache
+from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
+from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
+from ufmstar_torch.eval.results.machine import hardware, versions
+from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+
+Evaluate = Callable[..., list[RowResult]]
+# Errors of a sequence that cannot be used, raised when it is opened or evaluated. Any other error is a mistake in this
+# program, and ends it.
+_BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
+_POLL_SECONDS = 0.2
+DIED = "the process that evaluated it was killed (for want of memory?)"
+# Of a sequence of single images.
+_NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
+
+
+@dataclass(frozen=True)
+class EvalJob:
+    """What is evaluated.
+
+    Attributes:
+        suite: its rows, of the bases that have a network.
+        missing_bases: bases of rows that were left out.
+        networks: chosen, by base.
+        items: the sequences.
+        out: the folder for everything that is written.
+        frames: which of each sequence.
+        cache: folder of predictions; None = in ``out``.
+        device: "cpu", "cuda", "cuda:1".
+        confident: share of a frame's pixels of which a reference method counts as confident.
+        examples: of each data set, sequences of which a few frames are stored for pictures.
+        samples: passes of MC-Dropout.
+    """
+
+    suite: Suite
+    networks: Mapping[str, NetworkChoice]
+    items: tuple[WorkItem, ...]
+    out: Path
+    missing_bases: tuple[str, ...] = ()
+    frames: slice = field(default_factory=lambda: slice(None))
+    cache: Path | None = None
+    device: str = "cpu"
+    confident: float = 0.5
+    examples: int = 3
+    samples: int | None = None
+
+    def load(self, device: torch.device) -> dict[str, DepthSource]:
+        """The networks that the rows need.
+
+        Raises:
+            FileNotFoundError, ValueError, ImportError: see ``NetworkChoice.load``.
+        """
+        passes = {} if self.samples is None else {"samples": self.samples}
+        needed = [self.networks[base] for base in self.suite.bases]
+        return {choice.base: choice.load(device, **passes) for choice in needed}
+
+    def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
+        """eval.json."""
+        suite, f = self.suite, self.frames
+        opening = {name: value for item in self.items for name, value in item.opening}
+        return {
+            "suite": suite.name,
+            "title": suite.title,
+            "sweep": list(suite.sweep),
+            "networks": {base: network.identity for base, network in networks.items()},
+            "rows": [row.to_dict() for row in suite.rows],
+            "datasets": sorted({item.dataset for item in self.items}),
+            "sequences": [{"dataset": item.dataset, "sequence": item.sequence} for item in self.items],
+            "missing_bases": list(self.missing_bases),
+            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **opening},
+            "versions": versions(),
+            "machine": hardware(),
+        }
+
+    def keeps_examples(self, item: WorkItem) -> bool:
+        """Whether the sequence is one of the first of its data set, from which pictures are drawn."""
+        same = [other for other in self.items if other.dataset == item.dataset]
+        return item in same[: self.examples]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The job as plain values, for another process."""
+        own = {name: getattr(self, name) for name in ("missing_bases", "device", "confident", "examples", "samples")}
+        return own | {
+            "suite": self.suite.to_dict(),
+            "networks": [asdict(choice) for choice in self.networks.values()],
+            "items": [asdict(item) for item in self.items],
+            "out": str(self.out),
+            "frames": [self.frames.start, self.frames.stop, self.frames.step],
+            "cache": None if self.cache is None else str(self.cache),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> EvalJob:
+        """The job of :meth:`to_dict`, also after a way through JSON."""
+        networks = [NetworkChoice(**{**choice, "files": tuple(choice["files"])}) for choice in values["networks"]]
+        items = [WorkItem(**{**item, "opening": tuple(map(tuple, item["opening"]))}) for item in values["items"]]
+        made = {
+            "suite": Suite.from_dict(values["suite"]),
+            "networks": {choice.base: choice for choice in networks},
+            "items": tuple(items),
+            "out": Path(values["out"]),
+            "missing_bases": tuple(values["missing_bases"]),
+            "frames": slice(*values["frames"]),
+            "cache": None if values["cache"] is None else Path(values["cache"]),
+        }
+        return cls(**{**values, **made})
+
+
+@dataclass(frozen=True)
+class WorkerContext:
+    """How one process takes part in an evaluation.
+
+    Attributes:
+        shard: the part of the sequences that it begins with.
+        helps: take sequences of other parts afterwards; for processes that were started together.
+        waits: stay until the sequences that other processes work on are finished.
+        launch: the same for all processes that were started together; "" = one of its own.
+        stop: asked before every frame.
+        report: receives a line when a sequence is finished.
+        progress: called with a sequence's label, its number of finished frames, and the number of all of them.
+        evaluate: computes rows on a sequence; see ``evaluate_sequence``.
+    """
+
+    shard: Shard = field(default_factory=Shard)
+    helps: bool = False
+    waits: bool = False
+    launch: str = ""
+    stop: Callable[[], bool] = lambda: False
+    report: Callable[[str], None] = lambda line: None
+    progress: Callable[[str, int, int], None] = lambda label, done, total: None
+    evaluate: Evaluate = evaluate_sequence
+
+
+def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext) -> bool:
+    """Evaluate the sequences one after another.
+
+    Args:
+        job: what is evaluated.
+        folder: opened for the job.
+        networks: loaded for the job.
+        context: this process's part in it.
+
+    Returns:
+        Whether it came to the end; False = ``context.stop`` ended it. ``folder.failure`` reports broken sequences.
+
+    Raises:
+        FolderError: earlier results were computed from another sequence of that name.
+        CacheError, OSError: nothing can be written.
+    """
+    context = replace(context, launch=context.launch or f"{os.getpid()} {time.time_ns()}")
+    worker = _Worker(job, folder, networks, context, PredictionCache(job.cache or job.out / CACHE))
+    own = context.shard.of(job.items)
+    queue = [*own, *(item for item in job.items if context.helps and item not in own)]
+    while queue:
+        taken: list[WorkItem] = []
+        for item in queue:
+            if context.stop():
+                return False
+            claim = folder.claim(item, context.launch)
+            if claim is None:
+                taken.append(item)
+                continue
+            with claim:
+                try:
+                    worker.finish(item, died=claim.died)
+                except Stopped:
+                    return False
+        queue = taken if context.waits else []
+        if queue:
+            time.sleep(_POLL_SECONDS)
+        elif taken and not context.helps:
+            context.report(f"left to another process that is at it: {', '.join(item.label for item in taken)}")
+    return True
+
+
+@dataclass(frozen=True)
+class _Worker:
+    """One process at its work; see ``run_job``."""
+
+    job: EvalJob
+    folder: EvalFolder
+    networks: Mapping[str, DepthSource]
+    context: WorkerContext
+    cache: PredictionCache
+
+    def finish(self, item: WorkItem, *, died: bool) -> None:
+        """Compute and store the missing rows of a sequence, or the reason why they cannot be had."""
+        failure = self.folder.failure(item)
+        if failure is not None and failure.get("launch") == self.context.launch:
+            return  # of another process of this launch
+        missing = self.folder.missing(item, self.job.suite.rows)
+        if died and missing:
+            self._fail(item, DIED, missing)
+            return
+        try:
+            sequence = item.open()
+            digest = content_digest(sequence)
+        except (*_BROKEN, OSError) as error:
+            self._fail(item, error, missing)
+            return
+        self.folder.require_same_sequence(item, digest)
+        possible = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        left_out = [row for row in missing if row not in possible]
+        started = time.monotonic()
+        try:
+            results = self._compute(item, sequence, missing, possible) if missing else []
+        except _BROKEN as error:
+            self._fail(item, error, missing)
+            return
+        self._store(item, digest, [result for result in results if result.row in missing])
+        if missing:
+            frames = results[0].frames.get("done", 0) if results else 0
+            rows, seconds = len(missing) - len(left_out), time.monotonic() - started
+            self.context.report(f"{item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
+        if left_out:
+            self._fail(item, _NO_POSES.format(len(left_out)), left_out)
+        else:
+            self.folder.succeeded(item)
+
+    def _compute(
+        self, item: WorkItem, sequence: FrameSequence, missing: Sequence[Row], possible: Sequence[Row]
+    ) -> list[RowResult]:
+        """Those missing rows that are possible (others need poses), and what they are judged by."""
+        job, todo = self.job, [row for row in missing if row in possible]
+        return self.context.evaluate(
+            sequence,
+            with_references(todo, possible) if todo else missing,
+            self.networks,
+            store=self.cache,
+            device=torch.device(job.device),
+            limit=job.frames,
+            sinks=[ExampleWriter(Examples(self.folder.place(item)))] if job.keeps_examples(item) else [],
+            confident=job.confident,
+            stop=self.context.stop,
+            progress=lambda done, total: self.context.progress(item.label, done, total),
+        )
+
+    def _fail(self, item: WorkItem, error: Exception | str, rows: Sequence[Row]) -> None:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        self.folder.fail(item, reason, rows, self.context.launch)
+        self.context.report(f"{item.label}: failed: {reason}")
+
+    def _store(self, item: WorkItem, digest: str, results: Iterable[RowResult]) -> None:
+        """Store rows with what they were computed from."""
+        common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": digest}
+        for result in results:
+            row, network = result.row, self.networks[result.row.method.base]
+            record = Record(
+                suite=self.job.suite.name,
+                dataset=item.dataset,
+                sequence=item.sequence,
+                network=network.label,
+                method=row.method.name,
+                setting=row.setting.to_dict(),
+                frames=result.frames,
+                figures=result.figures,
+                curves=result.curves,
+                state=result.state,
+                ms=result.ms,
+                provenance={**common, "network": network.digest, "threads": torch.get_num_threads()},
+            )
+            self.folder.keep(item, record, result)
+
+
+def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
+    """The missing rows and those whose confidence they are judged by, in the order of ``rows``."""
+    needed = {*missing, *(reference for row in missing for reference in references(row, rows))}
+    return [row for row in rows if row in needed]
+
+
+def failures(folder: EvalFolder, items: Iterable[WorkItem]) -> dict[str, str]:
+    """Why a sequence is broken, by its label."""
+    stored = {item.label: folder.failure(item) for item in items}
+    return {label: str(failure.get("reason")) for label, failure in stored.items() if failure is not None}

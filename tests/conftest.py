@@ -1,0 +1,72 @@
+"""What all tests share: one thread a process, kernels that are compiled once, Hypothesis's profiles."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# One thread per worker, set before torch is imported; .ci/run sets another number for the numerical tests.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+KERNELS = Path(__file__).resolve().parents[1] / "ufmstar_torch" / "kernels"
+MAX_WORKERS = 4  # each takes up to 3 GB
+COMPILE = """
+import torch
+from ufmstar_torch import UfMStar, UfMStarConfig
+for dtype in (torch.float32, torch.float64):
+    depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
+    K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+    ufm = UfMStar(UfMStarConfig(backend="numba"))
+    for _ in range(2):
+        ufm(depth, pose, K)
+"""
+
+
+COMPILER: pytest.StashKey[subprocess.Popen[bytes]] = pytest.StashKey()
+
+settings.register_profile("fast", deadline=None, max_examples=25)
+settings.register_profile("thorough", deadline=None, max_examples=150, print_blob=True)
+settings.load_profile("fast")  # --hypothesis-profile=thorough loads the other one
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Start to compile the kernels while the workers of pytest-xdist collect the tests."""
+    if config.getoption("tx", None) and not config.option.collectonly and not _compiled():
+        config.stash[COMPILER] = subprocess.Popen([sys.executable, "-c", COMPILE])
+
+
+def pytest_xdist_node_collection_finished(node) -> None:
+    """No test starts before the kernels are compiled: numba's cache is shared by the workers."""
+    compiler = node.config.stash.get(COMPILER, None)
+    if compiler is not None:
+        compiler.wait()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A worker for each core, but none where files or tests are named on the command line."""
+    return 0 if _names_files(config) else min(len(os.sched_getaffinity(0)), MAX_WORKERS)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what is marked slow, unless files or tests are named or ``-m`` selects by marker."""
+    if config.option.markexpr or _names_files(config):
+        return
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    config.hook.pytest_deselected(items=slow)
+    items[:] = [item for item in items if not item.get_closest_marker("slow")]
+
+
+def _names_files(config: pytest.Config) -> bool:
+    return any(Path(argument.split("::")[0]).is_file() for argument in config.args)
+
+
+def _compiled() -> bool:
+    """Whether numba's cache is younger than the kernels' sources."""
+    cached = [path.stat().st_mtime for path in KERNELS.glob("__pycache__/*.nbi")]
+    return bool(cached) and max(cached) > max(path.stat().st_mtime for path in KERNELS.glob("*.py"))
