@@ -28,7 +28,7 @@ from scipy.stats import spearmanr
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.eval.report.run_pictures import field_of_view
+from ufmstar_torch.eval.report.outputs import field_of_view
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
-from ufmstar_torch.eval.report.load import load_results
+from ufmstar_torch.eval.report.data import load_results
 
 COLOURS = dict(zip(BASES, ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "0.5"), strict=True))
 # "nll" on an axis that is linear up to .1 nat and logarithmic beyond: its changes reach from .01 to 20.

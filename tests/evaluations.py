@@ -17,9 +17,10 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.metrics.packed_sums import pack
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.results.worklist import WorkItem
 
 Maps = tuple[Tensor, Tensor | None, Tensor]
 # How far sigma falls short of the error: 1 is calibrated.
@@ -29,6 +30,32 @@ NETWORK = "FastDepth"
 
 def rows_of(*names: str) -> list[Row]:
     return [Row(Method.parse(name)) for name in names]
+
+
+# The evaluation that all tests of the report share (``out`` in conftest.py).
+ENSEMBLE = rows_of("Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
+SCENES = [("scannet", f"scene000{i}_00") for i in range(5)]
+KITCHEN = ("7-scenes", "kitchen&_50% $a$ <b>")
+LATER = ("scannet", "scene0009_00")
+HOSTILE = "<script>alert('x')</script>&\"amp;"
+TITLE = f"Title $x$ {HOSTILE}"
+SHAPE = (12, 16)
+
+
+def write_examples(out: Path, dataset: str, sequence: str, rows: Sequence[Row]) -> None:
+    """An example frame "7" with maps of the rows, and a room of the last one."""
+    folder = out / "records" / WorkItem(dataset, sequence, path="", layout="").folder
+    for name in ("examples", "room"):
+        (folder / name).mkdir(parents=True)
+    K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
+    truth = np.full(SHAPE, 3.0, np.float32)
+    np.savez(folder / "examples" / "7.npz", image=np.zeros((*SHAPE, 3), np.uint8), truth=truth, K=K)
+    for n, row in enumerate(rows):
+        maps = {"depth": truth - 1 + 0.1 * np.float32(n), "variance": np.full(SHAPE, 0.1 + n, np.float32)}
+        np.savez(folder / "examples" / f"7@{row.slug}.npz", **maps)
+    covariance = np.eye(3)[None].repeat(2, 0)
+    room = {"mean_world": np.ones((2, 3)), "covariance_world": covariance, "disagreement": [0, 1.0]}
+    np.savez(folder / "room" / f"{rows[-1].slug}_7.npz", **room, T_world_cam=np.eye(4))
 
 
 def draw_maps(row: Row, sequence: str, pixels: int = 800) -> Maps:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -22,10 +23,10 @@ from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report import calibration_plot, colours, plots
-from ufmstar_torch.eval.report.calibration_plot import draw_calibration
-from ufmstar_torch.eval.report.demo_pictures import ENSEMBLE, FILES, NETWORK
-from ufmstar_torch.eval.report.demo_report import explanation, table
+from ufmstar_torch.eval.report.colours import colour_table
+from ufmstar_torch.eval.report.figures import write_curves
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK
+from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
@@ -111,9 +112,9 @@ def test_the_command_prints_one_table_and_says_where_everything_is(done):
 
 def test_everything_is_there_and_complete(done):
     out, *_ = done
-    assert sorted(p.name for p in out.iterdir()) == sorted([*FILES, "summary.json"])
+    assert sorted(p.name for p in out.iterdir()) == sorted([*DEMO_FILES, "summary.json"])
     summary = read_summary(out)
-    assert summary["outputs"] == dict.fromkeys(FILES)
+    assert summary["outputs"] == dict.fromkeys(DEMO_FILES)
     for picture in ("contact_sheet.png", "calibration.png"):
         assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     header = (out / "mixture.ply").read_bytes().split(b"end_header")[0].decode()
@@ -295,14 +296,14 @@ def test_figures_by_kind_and_overall(sequence):
 
 def test_the_table_shows_the_figures_of_the_summary(done):
     summary = read_summary(done[0])
-    text = table(summary)
+    text = demo_table(summary)
     for method in METHODS:
         for key in ("delta1", "nll", "ece_delta", "ece_q", "ause_rmse"):
             assert f"{summary['methods'][method]['figures'][key]:.3g}" in text
         for kind in ("familiar", "unfamiliar"):
             assert f"{summary['surfaces'][kind][method]['rms_sigma']:.3g}" in text
     assert done[2].startswith(text)
-    assert explanation(summary) in done[2]
+    assert demo_explanation(summary) in done[2]
 
 
 @pytest.mark.parametrize(
@@ -403,12 +404,8 @@ def test_an_unknown_option_is_refused(capfd):
 
 
 def test_without_matplotlib_there_is_still_the_same_table(weights, tmp_path, monkeypatch, ufmstar, done):
-    def missing():
-        raise ImportError("pictures need matplotlib: pip install 'ufmstar-torch[viz]'")
-
-    for module in (colours, plots, calibration_plot):
-        monkeypatch.setattr(module, "require_matplotlib", missing)
-    colours.colour_table.cache_clear()
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    colour_table.cache_clear()
     out = tmp_path / "out"
     code, told, _ = ufmstar("demo", "--out", out, "--weights", weights, "--frames", FRAMES, "--seed", SEED)
     assert code == 0
@@ -434,7 +431,7 @@ def test_ctrl_c_is_told_as_such(monkeypatch, ufmstar):
 
 def test_the_calibration_picture_needs_something_to_draw(tmp_path):
     with pytest.raises(ValueError, match="1 to 6 methods"):
-        draw_calibration(tmp_path / "x.png", {})
+        write_curves(tmp_path / "x.png", {})
     assert not (tmp_path / "x.png").exists()
 
 

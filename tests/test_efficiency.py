@@ -13,7 +13,6 @@ from tiny_networks import Linear
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.bench.contender import Contender
-from ufmstar_torch.eval.bench.efficiency_table import efficiency_table, efficiency_tables
 from ufmstar_torch.eval.bench.measure import Plan, measure
 from ufmstar_torch.eval.bench.multiview import state_bytes
 from ufmstar_torch.eval.bench.power import CPU, GPU, NOT_MEASURABLE, PowerMeter, Rail, Source
@@ -21,6 +20,7 @@ from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, ONCE, PROCESS
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.report.efficiency import efficiency_table, efficiency_tables
 from ufmstar_torch.models.any_network import wrap_network
 from ufmstar_torch.models.preprocess import Preprocess
 

@@ -10,10 +10,10 @@ from efficiency_cases import network
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.bench.contender import Contender, contenders, depth_alone
-from ufmstar_torch.eval.bench.efficiency_table import megabytes
 from ufmstar_torch.eval.bench.memory import NetworkMemory, overhead_percent, tensor_bytes
 from ufmstar_torch.eval.bench.multiview import state_bytes
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
+from ufmstar_torch.eval.report.efficiency import megabytes
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
 from ufmstar_torch.models.dropout import MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember

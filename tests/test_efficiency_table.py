@@ -7,9 +7,9 @@ import re
 
 import pytest
 
-from ufmstar_torch.eval.bench.efficiency_table import efficiency_table, efficiency_tables, megabytes
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.power import CPU, GPU, NOT_MEASURABLE
+from ufmstar_torch.eval.report.efficiency import efficiency_table, efficiency_tables, megabytes
 
 
 def part(ms, millijoules=None, low=None):

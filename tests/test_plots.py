@@ -21,7 +21,7 @@ from ufmstar_torch.eval.report.colours import (
     colour_table,
     robust_range,
 )
-from ufmstar_torch.eval.report.plots import FramePanel, contact_sheet, fit_scales
+from ufmstar_torch.eval.report.panels import FramePanel, contact_sheet, fit_scales, map_columns
 from ufmstar_torch.eval.report.video import VideoWriter, preview_frame, write_video
 
 
@@ -103,7 +103,19 @@ class TestContactSheet:
         contact_sheet([panel(error=False)], tmp_path / "without.png")
         contact_sheet([panel(error=False), panel("b")], tmp_path / "mixed.png")
         widths = [load(tmp_path / f"{n}.png").shape[1] for n in ("without", "mixed")]
-        assert widths[1] / widths[0] == pytest.approx(4 / 3, abs=0.05)
+        assert widths[1] / widths[0] == pytest.approx((1.2 + 4 * 2.4) / (1.2 + 3 * 2.4), abs=0.02)
+
+    def test_sigma_and_error_share_a_scale(self, tmp_path: Path) -> None:
+        one = panel()  # the error is twice sigma
+        scales = fit_scales([one])
+        assert scales.length.low == 0
+        assert scales.length.high == pytest.approx(np.percentile(2 * one.sigma[4:], 99))
+        labels = [(c.label, c.scale) for c in map_columns(scales, with_error=True, with_own=True)]
+        assert labels[1:] == [(name, scales.length) for name in ("σ, network alone", "σ, UfM*", "|error|")]
+
+    def test_names_are_no_formulas(self, tmp_path: Path) -> None:
+        contact_sheet([panel("a$b$_{")], tmp_path / "s.png", title=r"$\\x$ $")
+        assert load(tmp_path / "s.png").shape[1] > 100
 
     def test_hopeless_frames_are_drawn(self, tmp_path: Path) -> None:
         empty = np.full((5, 6), np.nan)

@@ -17,7 +17,26 @@ from hypothesis import strategies as st
 from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.report.figure_style import (
+from ufmstar_torch.eval.report.data import Merged, Results
+from ufmstar_torch.eval.report.figures import (
+    MOST_SEQUENCES,
+    ONE_METRE,
+    STAGES,
+    chosen_sequences,
+    density,
+    draw_calibration,
+    draw_entropy,
+    draw_error,
+    draw_latency,
+    draw_sequence_calibration,
+    draw_stages,
+    draw_tradeoff,
+    entropy_range,
+    write_figures,
+)
+from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
+from ufmstar_torch.eval.report.names import NLL
+from ufmstar_torch.eval.report.style import (
     label_ends,
     new_figure,
     save_figure,
@@ -25,21 +44,7 @@ from ufmstar_torch.eval.report.figure_style import (
     spread_apart,
     style_of,
 )
-from ufmstar_torch.eval.report.figures import write_figures
-from ufmstar_torch.eval.report.figures_calibration import (
-    MOST_SEQUENCES,
-    chosen_sequences,
-    draw_calibration,
-    draw_sequence_calibration,
-)
-from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
-from ufmstar_torch.eval.report.figures_entropy import ONE_METRE, density, draw_entropy, entropy_range
-from ufmstar_torch.eval.report.figures_error import draw_error
-from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
-from ufmstar_torch.eval.report.load import Results
-from ufmstar_torch.eval.report.names import NLL
-from ufmstar_torch.eval.report.sums import Merged
-from ufmstar_torch.eval.report.sweep_lines import Point, change, level, points, sweeps
+from ufmstar_torch.eval.report.sweeps import Point, change, level, points, sweeps
 from ufmstar_torch.eval.report.write import write_report
 
 ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")
@@ -177,7 +182,7 @@ def noisy(value: float, seed: int = 0) -> Row:
 def swept() -> Results:
     """NLL = level of the sequence + noise / 10, with two seeds at 2 degrees that differ by .2."""
     values = {noisy(5.0): 0.5, noisy(0.0): 0.0, noisy(2.0, 1): 0.1, noisy(2.0, 2): 0.3, ALONE: 2.0}
-    levels = {"a": 1.0, "b": 4.0, "c": 10.0}
+    levels = {"a": 1.0, "b": 4.0, "c": 10.0, "d": 4.0, "e": 6.0}
     pairs = [(row, s) for row in values for s in levels]
     return in_memory({(row, ("d", s)): {"nll": levels[s] + values[row], "ece_delta": 0.1} for row, s in pairs})
 
@@ -189,9 +194,9 @@ class TestSweeps:
         assert [point.value for point in found] == [0.0, 2.0, 5.0]
         assert [len(point.rows) for point in found] == [1, 2, 1]
         mean = level(swept, found[1], NLL)
-        assert (mean.value, mean.sequences) == (pytest.approx(5.2), 3)
-        deviation = math.sqrt((4.0**2 + 1.0**2 + 5.0**2) / 2)
-        assert mean.half == pytest.approx(4.302652729749464 * deviation / math.sqrt(3))
+        assert (mean.value, mean.sequences) == (pytest.approx(5.2), 5)
+        deviation = math.sqrt((4.0**2 + 1.0**2 + 5.0**2 + 1.0**2 + 1.0**2) / 4)
+        assert mean.half == pytest.approx(2.7764451051977934 * deviation / math.sqrt(5))
 
     def test_the_change_is_in_pairs(self, swept):
         still = Point(0.0, (noisy(0.0),))
@@ -223,7 +228,7 @@ class TestSweeps:
 
     def test_changes_of_every_setting(self):
         either = Row(UFM_STAR.method, Setting({"segment.prune": "either"}))
-        level_ = {"a": 1.0, "b": 4.0, "c": 10.0}
+        level_ = {"a": 1.0, "b": 4.0, "c": 10.0, "d": 4.0, "e": 6.0}
         figures = {(UFM_STAR, ("d", s)): {"nll": v} for s, v in level_.items()}
         figures |= {(either, ("d", s)): {"nll": v + 0.1 + v / 1000} for s, v in level_.items()}
         figure = draw_changes(in_memory(figures), "ensemble")
@@ -308,9 +313,17 @@ class TestStyle:
 
 def test_the_files_say_what_they_are(tmp_path):
     out = write_evaluation(tmp_path / "o", ROWS[:1] + ROWS[2:3], [("rooms", "one two")], suite="own")
-    names = {path.relative_to(out).as_posix() for path in write_report(out, pictures="png")}
+    names = {path.relative_to(out).as_posix() for path in write_report(out, pictures="png").files}
     kinds = {"calibration-rooms", "calibration-sequences-rooms-ensemble", "error-rooms", "entropy-ensemble", "latency"}
     assert {f"figures/{kind}.png" for kind in kinds} <= names
     assert all((out / name).stat().st_size > 1000 for name in names if name.endswith(".png"))
     with pytest.raises(ValueError, match="figures must be svg or png, got 'jpg'"):
-        write_figures(in_memory({}), "jpg")
+        write_figures(in_memory({}), "jpg", {})
+
+
+@pytest.mark.parametrize("name", ["a$b$c", "$", r"\frac{$x$", "50% _ ^ {"])
+def test_names_of_folders_are_no_formulas(tmp_path, name):
+    out = write_evaluation(tmp_path / "o", ROWS[:1] + ROWS[2:3], [(name.replace("/", ""), name)], suite="own")
+    report = write_report(out)
+    assert report.undrawn == {}
+    assert len([path for path in report.files if path.suffix == ".svg"]) >= 5

@@ -5,29 +5,24 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from evaluations import rows_of, write_evaluation
-from PIL import Image
+from evaluations import HOSTILE, KITCHEN, LATER, TITLE, rows_of, write_evaluation
 
+from ufmstar_torch import cli
 from ufmstar_torch.eval.metrics import mean_and_ci
-from ufmstar_torch.eval.report.caveats import caveats
-from ufmstar_torch.eval.report.embed import Embedder
-from ufmstar_torch.eval.report.findings import best_rows, compare, comparisons, headlines
-from ufmstar_torch.eval.report.load import Failed, Results, load_results
-from ufmstar_torch.eval.report.markup import Ids, Markup, join, tag, typeset
-from ufmstar_torch.eval.report.page import write_page
-from ufmstar_torch.eval.report.page_parts import command
-from ufmstar_torch.eval.report.picture import STRIP, Picture, write_index
+from ufmstar_torch.eval.report import figures as figures_module
+from ufmstar_torch.eval.report.data import Failed, Results, load_results
+from ufmstar_torch.eval.report.findings import best_rows, caveats, compare, comparisons, headlines
+from ufmstar_torch.eval.report.page import command, write_page
 from ufmstar_torch.eval.results.record import Record
 
 VOID = {"br", "hr", "img", "meta", "input"}
-HOSTILE = "<script>alert('x')</script>&\"amp;"
 
 
 class Page(HTMLParser):
@@ -95,14 +90,15 @@ def figures(nll: float, ece: float = 0.2, spearman: float = 0.5, delta1: float =
     return {"nll": nll, "ece_delta": ece, "ece_q": ece, "ause_rmse": 0.3, "spearman": spearman, "delta1": delta1}
 
 
-ALONE = [figures(2.0), figures(3.0), figures(4.0)]
+ALONE = [figures(2.0), figures(2.5), figures(3.0), figures(3.5), figures(4.0)]
 
 
 class TestFindings:
     def test_wins_beyond_chance(self) -> None:
-        star = [figures(1.0, 0.1), figures(2.1, 0.11), figures(2.9, 0.09)]
+        gains = [1.0, 0.9, 1.0, 1.0, 1.1]
+        star = [figures(f["nll"] - g, 0.1 + (1 - g) / 10) for f, g in zip(ALONE, gains, strict=True)]
         results = results_of({"Ensemble": ALONE, "UfM*-Ensemble": star})
-        mean, half = mean_and_ci([-1.0, -0.9, -1.1])
+        mean, half = mean_and_ci([-gain for gain in gains])
         (made,) = comparisons(results).values()
         assert {c.quantity.key: c.verdict for c in made} == {
             "nll": "better", "ece_delta": "better", "ece_q": "better", "ause_rmse": "open", "spearman": "open",
@@ -110,7 +106,7 @@ class TestFindings:
         assert made[0].words == f"NLL 3.00 → 2.00 ({mean:.2f} ± {half:.2f})"
         first, losses = headlines(results)
         assert first.startswith("UfM* against the network alone, 3 comparisons of NLL, ECE_δ and ECE_q: ")
-        assert "better in 3, worse in 0, not to be told apart in 0" in first
+        assert "better in 3, worse in 0, undecided in 0" in first
         assert first.endswith("On average NLL falls by 1.00, ECE_δ falls by 50 % and ECE_q falls by 50 %.")
         assert losses.startswith("In none of all 5 comparisons")
         (best,) = (s for s in best_rows(results) if s.startswith("Best NLL"))
@@ -120,10 +116,11 @@ class TestFindings:
         )
 
     def test_losses_are_told(self) -> None:
-        star = [figures(3.0, spearman=0.3), figures(4.1, spearman=0.31), figures(4.9, spearman=0.29)]
+        rises = [1.0, 1.1, 1.0, 1.0, 0.9]
+        star = [figures(f["nll"] + r, spearman=0.2 + r / 10) for f, r in zip(ALONE, rises, strict=True)]
         results = results_of({"Ensemble": ALONE, "UfM*-Ensemble": star})
         first, losses = headlines(results)
-        assert "better in 0, worse in 1, not to be told apart in 2" in first
+        assert "better in 0, worse in 1, undecided in 2" in first
         assert "NLL rises by 1.00" in first
         assert losses.startswith(
             "UfM* is worse beyond chance in 2 of all 5 comparisons: UfM*-Ensemble against Ensemble: NLL"
@@ -132,10 +129,10 @@ class TestFindings:
         assert any(s.startswith("Best Spearman: Ensemble with 0.50") for s in best_rows(results))
 
     def test_ties_within_the_interval(self) -> None:
-        star = [figures(1.0), figures(4.0), figures(3.7)]
+        star = [figures(1.0), figures(4.0), figures(3.7), figures(2.0), figures(3.9)]
         results = results_of({"Ensemble": ALONE, "UfM*-Ensemble": star})
         first, losses = headlines(results)
-        assert "better in 0, worse in 0, not to be told apart in 3" in first
+        assert "better in 0, worse in 0, undecided in 3" in first
         assert losses.startswith("In none of all 5")
         assert any("a lead that may be chance" in s for s in best_rows(results) if s.startswith("Best NLL"))
         assert "Best AUSE: 0.300 m, shared by Ensemble and UfM*-Ensemble." in best_rows(results)
@@ -146,22 +143,24 @@ class TestFindings:
         assert made[0].difference.beyond
         assert made[0].verdict == "open"
 
-    def test_one_sequence_decides_nothing(self) -> None:
-        results = results_of({"Ensemble": ALONE[:1], "UfM*-Ensemble": [figures(1.0)]})
+    @pytest.mark.parametrize(("n", "words"), [(1, "a single sequence"), (4, "4 sequences")])
+    def test_fewer_than_five_sequences_decide_nothing(self, n: int, words: str) -> None:
+        results = results_of({"Ensemble": ALONE[:n], "UfM*-Ensemble": [figures(1.0)] * n})
         first, losses = headlines(results)
-        assert "the better value in 1, on a single sequence, which decides nothing" in first
-        assert losses.startswith("With one sequence nothing can be said")
-        assert any("one sequence" in c for c in caveats(results))
+        assert f"the better value in 1, on {words}, which decides nothing" in first
+        assert losses.startswith("With fewer than 5 sequences nothing can be said")
+        assert caveats(results)[0].startswith(f"n = {n}: with fewer than 5 sequences there are no confidence intervals")
+        assert {c.verdict for made in comparisons(results).values() for c in made} == {"no verdict"}
 
     def test_means_are_over_the_sequences_that_both_have(self) -> None:
         results = results_of({"Ensemble": ALONE, "UfM*-Ensemble": [figures(1.0), figures(2.0)]})
         rows = results.rows
         c = compare(results, rows[1], rows[0])[0]
-        assert (c.mine, c.theirs, c.difference.value, c.difference.sequences) == (1.5, 2.5, -1.0, 2)
+        assert (c.mine, c.theirs, c.difference.value, c.difference.sequences) == (1.5, 2.25, -0.75, 2)
         assert best_rows(results) == []  # means over different sequences are not compared
 
     def test_against_ufm_and_only_where_there_is_a_variance(self) -> None:
-        values = {"DepthOnly": [{"delta1": 0.8}] * 3, "UfM-DepthOnly-100K": ALONE, "UfM*-DepthOnly": ALONE}
+        values = {"DepthOnly": [{"delta1": 0.8}] * 5, "UfM-DepthOnly-100K": ALONE, "UfM*-DepthOnly": ALONE}
         sentences = headlines(results_of(values))
         assert sentences[0].startswith("UfM* against UfM, 3 comparisons")
         assert not any("network alone" in s for s in sentences)
@@ -176,16 +175,16 @@ class TestFindings:
                 "FastDepth",
                 "UfM*-Ensemble",
                 {"ema_alpha": 1.0},
-                figures=figures(n + 1.0 + 0.01 * n),
+                figures=figures(0.5 * n + 1.0 + 0.01 * n),
             )
-            for n in range(3)
+            for n in range(5)
         )
         both = Results(results.out, results.about, (*results.records, *changed))
         (nll, *_) = (s for s in headlines(both) if s.startswith("NLL"))
         assert nll.startswith(
-            "NLL, of 1 setting beside the default: better with 1 (UfM*-Ensemble, smoothing α 1 -0.99 ±"
+            "NLL, of 1 setting beside the default: better with 1 (UfM*-Ensemble, smoothing α 1 -0.98 ±"
         )
-        assert nll.endswith("worse with 0, not to be told apart with 0.")
+        assert nll.endswith("worse with 0, undecided with 0.")
 
     def test_caveats(self) -> None:
         poor = {"Ensemble": [figures(2.0, delta1=0.2) | {"nll_left_out_share": 0.25}] * 2}
@@ -195,59 +194,23 @@ class TestFindings:
         for words in ("Left out, because of errors: 1 sequence;", "rows of 1 sequence are still", "On d only 20 %"):
             assert words in told
         assert "Ensemble 25 %" in told
-        assert caveats(results_of({"Ensemble": [figures(2.0)] * 2})) == []
-
-
-class TestMarkup:
-    def test_text_is_escaped_and_markup_is_not(self) -> None:
-        inner = tag("b", "<i>")
-        assert tag("p", inner, " & ", class_="x", title='"<') == (
-            '<p class="x" title="&quot;&lt;"><b>&lt;i&gt;</b> &amp; </p>'
-        )
-        assert join("<", inner) == "&lt;<b>&lt;i&gt;</b>"
-        assert tag("img", src="data:", hidden=True, alt=None) == '<img src="data:" hidden>'
-
-    def test_minus_signs(self) -> None:
-        assert typeset("a -0.5, UfM-100K, 3-4, <") == "a −0.5, UfM-100K, 3-4, &lt;"
-        assert isinstance(typeset("x"), Markup)
-
-    def test_ids_are_unique(self) -> None:
-        ids = Ids()
-        assert [ids.new("A b"), ids.new("a, b"), ids.new("δ")] == ["a-b", "a-b-2", "part"]
+        assert caveats(results_of({"Ensemble": [figures(2.0)] * 5})) == [
+            "n = 5: the figures are means over 5 sequences, each counting the same."
+        ]
 
 
 @pytest.fixture(scope="module")
-def evaluation(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, list[Path], Path]:
-    """An evaluation with a failure, an unfinished and a hostile sequence, two figures and a picture."""
-    out = tmp_path_factory.mktemp("page") / "out"
-    rows = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
-    sequences = [("scannet", "a"), ("scannet", "b"), ("tum", "c")]
-    write_evaluation(
-        out, rows, sequences, title=f"Title {HOSTILE}", unfinished=[("tum", "later")], failed={("tum", "bad"): HOSTILE}
-    )
-    folder = out / "figures"
-    folder.mkdir()
-    (folder / "calibration-scannet.svg").write_text('<svg width="90pt" height="45.0pt" xmlns="x"><g/></svg>')
-    (folder / "calibration-sequences-tum-x.svg").write_text('<svg width="8pt" height="8pt" xmlns="x"><g/></svg>')
-    for name in ("strip.png", "stale.png"):
-        Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(folder / name)
-    index = [
-        Picture(name, STRIP, f"{HOSTILE} {name}", "caption", f"alt {HOSTILE}") for name in ("strip.png", "stale.png")
-    ]
-    index_file = write_index(folder, index)
-    drawn = [folder / name for name in ("calibration-sequences-tum-x.svg", "calibration-scannet.svg", "strip.png")]
-    files = [out / "results.csv", *drawn, index_file]
-    results = load_results(out, with_sums=False)
-    return results, files, write_page(results, out, files)
+def results(evaluation: Path) -> Results:
+    return load_results(evaluation)
 
 
 @pytest.fixture(scope="module")
-def page(evaluation: tuple[Results, list[Path], Path]) -> Page:
-    return Page(evaluation[2].read_text(encoding="utf-8"))
+def page(evaluation: Path) -> Page:
+    return Page((evaluation / "report.html").read_text(encoding="utf-8"))
 
 
 class TestPage:
-    def test_it_needs_nothing_else(self, page: Page, evaluation: tuple[Results, list[Path], Path]) -> None:
+    def test_it_needs_nothing_else(self, page: Page, evaluation: Path) -> None:
         for _, attributes in page.elements:
             for name in ("src", "href", "srcset", "action", "poster", "data"):
                 value = attributes.get(name)
@@ -255,21 +218,25 @@ class TestPage:
         names = [name for name, _ in page.elements]
         assert "link" not in names
         assert "iframe" not in names
-        text = evaluation[2].read_text(encoding="utf-8")
+        text = (evaluation / "report.html").read_text(encoding="utf-8")
         style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)
         assert style
+        assert "prefers-color-scheme: dark" in style[1]
         assert "url(" not in style[1]
         assert "@import" not in style[1]
         assert not re.search(r"https?://", re.sub(r'src="data:[^"]*"', "", text))
-        assert evaluation[2].stat().st_size < 200_000
 
-    def test_pictures_have_words_and_only_what_was_written_is_shown(self, page: Page) -> None:
+    def test_pictures_have_words_and_their_size(self, page: Page, evaluation: Path) -> None:
         images = page.all("img")
-        assert [i["src"].split(";")[0] for i in images if i["src"]] == [*["data:image/svg+xml"] * 2, "data:image/webp"]
-        assert all(i["alt"] for i in images)
-        assert (images[0]["width"], images[0]["height"]) == ("120", "60")  # 90 x 45 points
-        assert (images[2]["width"], images[2]["height"]) == ("30", "20")
-        assert images[2]["alt"] == f"alt {HOSTILE}"
+        kinds = [(i["src"] or "").split(";")[0] for i in images]
+        files = [path.suffix for path in (evaluation / "figures").iterdir()]
+        assert kinds.count("data:image/svg+xml") == files.count(".svg") >= 8
+        assert kinds.count("data:image/webp") == files.count(".png") == 4  # strip, breakdown, comparison, room
+        assert all(i["alt"] and int(i["width"] or 0) > 50 and int(i["height"] or 0) > 50 for i in images)
+        first = (evaluation / "figures" / "calibration-7-scenes.svg").read_text()
+        points = re.search(r'<svg[^>]* width="([0-9.]+)pt"', first)
+        assert points
+        assert images[0]["width"] == str(round(float(points[1]) * 4 / 3))
 
     def test_headings_ids_and_contents(self, page: Page) -> None:
         ids = [a["id"] for _, a in page.elements if "id" in a]
@@ -286,48 +253,59 @@ class TestPage:
 
     def test_hostile_names_stay_text(self, page: Page) -> None:
         assert len(page.all("script")) == 1
-        assert f"Title {HOSTILE}" in page.text
+        assert "b" not in {name for name, a in page.elements if name == "b" and a}
+        assert TITLE in page.text
         problems = next(t for t in page.tables if t and t[0] == ["data set", "sequence", "reason"])
-        assert problems[1] == ["tum", "bad", HOSTILE]
+        assert problems[1] == ["tum", "fr1_xyz", HOSTILE]
+        assert f"{KITCHEN[1]}, frame 7" in page.text
+        assert any(KITCHEN[1] in (i["alt"] or "") for i in page.all("img"))
 
-    def test_numbers_are_the_results(self, page: Page, evaluation: tuple[Results, list[Path], Path]) -> None:
-        results = evaluation[0]
+    def test_numbers_are_the_results(self, page: Page, results: Results) -> None:
         main = next(n for n, t in enumerate(page.tables) if t and t[-1][0] == "UfM*-Ensemble" and t[0][0] == "")
         heads = page.tables[main][1]
         assert heads[:5] == ["Method", "δ₁ ↑", "NLL ↓", "ECE_δ ↓", "ECE_q ↓"]
+        assert heads[6:9] == ["paper: δ₁", "paper: NLL", "paper: ECE_δ"]  # for who scrolls to them
         for row in results.rows:
-            told = page.row(row.method.name, main)
+            cells = page.row(row.method.name, main)
             for column, (key, decimals) in enumerate({"delta1": 3, "nll": 2, "ece_delta": 3, "ece_q": 3}.items(), 1):
                 mean, half = mean_and_ci([float(r.figures[key] or math.nan) for r in results.of(row)])
-                value, _, interval = told[column].replace("\u202f", "").replace("−", "-").partition("±")
+                value, _, interval = cells[column].replace("\u202f", "").replace("−", "-").partition("±")
                 assert value == f"{mean:.{decimals}f}"
                 assert interval in ("", f"{half:.{decimals}f}")
         # The paper's own row of table 1 stands beside ours.
-        assert page.row("UfM*-Ensemble", main)[6:10] == [
-            "0.68",
-            "0.96\u202f±\u202f0.19",
-            "0.12\u202f±\u202f0.02",
-            "0.13\u202f±\u202f0.02",
-        ]
+        paper = [cell.replace("\u202f", " ") for cell in page.row("UfM*-Ensemble", main)[6:10]]
+        assert paper == ["0.68", "0.96 ± 0.19", "0.12 ± 0.02", "0.13 ± 0.02"]
 
-    def test_sentences_problems_and_how_it_was_made(
-        self, page: Page, evaluation: tuple[Results, list[Path], Path]
-    ) -> None:
-        results = evaluation[0]
+    def test_sentences_problems_and_how_it_was_made(self, page: Page, results: Results) -> None:
         for sentence in [*headlines(results), *caveats(results)]:
-            plain = re.sub(r"(?<![\w.–-])-(?=\d)", "−", sentence)
-            assert plain in page.text
+            assert re.sub(r"(?<![\w.–-])-(?=\d)", "−", sentence) in page.text
+        assert "n = 6: the figures are means over 6 sequences" in page.text
         board = next(t for t in page.tables if t and t[0][0] == "UfM*, beside")
         assert [row[0] for row in board[1:]] == [
-            "UfM*-Ensemble beside Ensemble, 3 sequences",
-            "UfM*-Ensemble beside UfM-Ensemble-100K, 3 sequences",
+            "UfM*-Ensemble beside Ensemble, 6 sequences",
+            "UfM*-Ensemble beside UfM-Ensemble-100K, 6 sequences",
         ]
         verdicts = [c.verdict for c in next(iter(comparisons(results).values()))]
         assert [cell.split(" ")[0] for cell in board[1][1:]] == verdicts
         assert "2 × pose is not finite" in page.text
-        assert "later" in page.text
-        assert "ufmstar eval --suite paper-table-1 --root scannet=DIR --root tum=DIR" in page.text
-        assert "stale" not in page.text
+        assert LATER[1] in page.text
+        assert "ufmstar eval --suite paper-table-1 --root 7-scenes=DIR --root scannet=DIR --root tum=DIR" in page.text
+
+    def test_a_figure_that_fails_does_not_lose_the_page(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        out = write_evaluation(tmp_path / "o", rows_of("Ensemble", "UfM*-Ensemble"), [("rooms", "a")], suite="own")
+
+        def broken(*_: object) -> None:
+            raise ValueError("no <b>such</b> glyph")
+
+        monkeypatch.setattr(figures_module, "draw_entropy", broken)
+        assert cli.main(["report", str(out)]) == 0
+        assert "figure not drawn: entropy ensemble: no <b>such</b> glyph\n" in capsys.readouterr().out
+        page = Page((out / "report.html").read_text(encoding="utf-8"))
+        undrawn = next(t for t in page.tables if t and t[0] == ["figure", "reason"])
+        assert undrawn[1] == ["entropy ensemble", "no <b>such</b> glyph"]
+        assert len(page.all("img")) >= 4
 
     def test_the_command_names_networks(self) -> None:
         network = {"model": "trained", "files": [{"name": "m0.safetensors"}, {"name": "m1.safetensors"}]}
@@ -346,18 +324,18 @@ class TestPage:
         ):  # fmt: skip
             assert command({**about, "settings": settings}) == f"{begin} {words} --out OUT"
 
-    def test_pictures_that_do_not_fit_are_named(
-        self, evaluation: tuple[Results, list[Path], Path], tmp_path: Path
-    ) -> None:
-        results, files, _ = evaluation
-        (tmp_path / "figures").mkdir()
-        small = Page(write_page(results, tmp_path, files, most_bytes=10).read_text(encoding="utf-8"))
+    def test_pictures_that_do_not_fit_are_named(self, tmp_path: Path) -> None:
+        results = replace(results_of({"Ensemble": ALONE}), out=tmp_path)
+        figures_ = [tmp_path / "calibration-x.svg", tmp_path / "unknown-y.svg"]
+        for path in figures_:
+            path.write_text('<svg width="90pt" height="45.0pt" xmlns="x"><g/></svg>')
+        small = Page(write_page(results, figures_, [], most_bytes=10).read_text(encoding="utf-8"))
         assert small.all("img") == []
-        assert "3 pictures did not fit into this page: calibration-scannet.svg, calibration-seq" in small.text
+        assert "2 pictures did not fit into this page: calibration-x.svg, unknown-y.svg." in small.text
+        assert "Further diagrams" in Page(write_page(results, figures_, []).read_text(encoding="utf-8")).text
 
-    def test_embedding_refuses_other_files(self, tmp_path: Path) -> None:
-        (tmp_path / "a.svg").write_text("<svg/>")
-        (tmp_path / "a.gif").write_bytes(b"GIF")
-        for name in ("a.svg", "a.gif"):
-            with pytest.raises(ValueError, match="a picture must be an SVG"):
-                Embedder().take(tmp_path / name)
+    @pytest.mark.parametrize("name", ["a.svg", "a.gif"])
+    def test_embedding_refuses_other_files(self, tmp_path: Path, name: str) -> None:
+        (tmp_path / name).write_text("<svg/>")
+        with pytest.raises(ValueError, match="a picture must be an SVG"):
+            write_page(replace(results_of({"Ensemble": ALONE}), out=tmp_path), [tmp_path / name], [])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from evaluations import rows_of
+from evaluations import KITCHEN, SHAPE, rows_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -18,20 +19,45 @@ from PIL import Image
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
+from ufmstar_torch.eval.report import pictures as pictures_module
 from ufmstar_torch.eval.report.colours import INVALID_GREY
-from ufmstar_torch.eval.report.compare import draw_comparison, largest_difference
-from ufmstar_torch.eval.report.example import Example, RowMaps, find_examples
-from ufmstar_torch.eval.report.grid import break_name, draw_grid
-from ufmstar_torch.eval.report.load import Results
-from ufmstar_torch.eval.report.picture import BREAKDOWN, COMPARE, ROOM, STRIP, file_name, read_index
-from ufmstar_torch.eval.report.pictures import choose, strip_rows, write_pictures
-from ufmstar_torch.eval.report.projection import SIGMAS, View, project, views_of
-from ufmstar_torch.eval.report.rooms import Snapshot, below_ceiling, choose_times, draw_room, find_rooms, painted
-from ufmstar_torch.eval.report.strips import NLL_SCALE, draw_breakdown, draw_strip, figures_of, fit_scales, mean_nll
+from ufmstar_torch.eval.report.data import Results, load_results
+from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
+from ufmstar_torch.eval.report.panels import break_name, draw_grid
+from ufmstar_torch.eval.report.pictures import (
+    BREAKDOWN,
+    COMPARE,
+    NLL_SCALE,
+    ROOM,
+    STRIP,
+    choose,
+    draw_breakdown,
+    draw_comparison,
+    draw_strip,
+    figures_of,
+    file_name,
+    fit_strip_scales,
+    largest_difference,
+    mean_nll,
+    read_index,
+    strip_rows,
+    write_pictures,
+)
+from ufmstar_torch.eval.report.rooms import (
+    SIGMAS,
+    Snapshot,
+    View,
+    below_ceiling,
+    choose_times,
+    draw_room,
+    find_rooms,
+    painted,
+    project,
+    views_of,
+)
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import WorkItem
 
-SHAPE = (12, 16)
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
 
 
@@ -142,7 +168,7 @@ class TestStrips:
 
     def test_one_scale_for_all_rows(self) -> None:
         rows = {"a": RowMaps(full(2.0), full(0.01)), "b": RowMaps(full(2.9), full(4.0))}
-        scales = fit_scales(example(rows), ["a", "b"])
+        scales = fit_strip_scales(example(rows), ["a", "b"])
         values = np.concatenate([np.full(192, v) for v in (1.0, 0.1, 0.1, 2.0)])
         assert scales.length.low == 0
         assert scales.length.high == pytest.approx(np.percentile(values, 99), rel=1e-5)
@@ -322,40 +348,34 @@ class TestChoice:
 
 
 class TestWritePictures:
-    def test_all_kinds_with_their_words(self, tmp_path: Path) -> None:
-        rows = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
-        sequence = "a/b: c"  # no name for a folder
-        folder = tmp_path / "records" / WorkItem("tour", sequence, path="", layout="").folder
-        for name in ("examples", "room"):
-            (folder / name).mkdir(parents=True)
-        np.savez(folder / "examples" / "7.npz", image=np.zeros((*SHAPE, 3), np.uint8), truth=full(3.0), K=K)
-        for n, row in enumerate(rows):
-            maps = {"depth": full(2.0 + 0.1 * n), "variance": full(0.1 + n)}
-            np.savez(folder / "examples" / f"7@{row.slug}.npz", **maps)
-        room = {
-            "mean_world": np.ones((2, 3)),
-            "covariance_world": np.eye(3)[None].repeat(2, 0),
-            "disagreement": [0, 1.0],
-        }
-        np.savez(folder / "room" / f"{rows[2].slug}_7.npz", **room, T_world_cam=np.eye(4))
-        records = tuple(Record("s", "tour", sequence, "FastDepth", row.method.name) for row in rows)
-        results = Results(tmp_path, {"suite": "s"}, records)
-        files = write_pictures(results, tmp_path)
-        pictures = read_index(tmp_path / "figures")
+    def test_all_kinds_with_their_words(self, evaluation: Path, tmp_path: Path) -> None:
+        sequence = KITCHEN[1]  # no name for a folder
+        pictures = read_index(evaluation / "figures")
         assert [p.kind for p in pictures] == [STRIP, BREAKDOWN, COMPARE, ROOM]
-        assert files == [*(tmp_path / "figures" / p.file for p in pictures), tmp_path / "figures" / "pictures.json"]
-        nll = mean_nll(find_examples(folder)[0], "Ensemble")
+        nll = mean_nll(
+            find_examples(evaluation / "records" / WorkItem(*KITCHEN, path="", layout="").folder)[0], "Ensemble"
+        )
         assert f"Ensemble (mean NLL {nll:.2f})" in pictures[0].alt
         assert "2 Gaussians" in pictures[3].alt
         assert all(p.title.startswith(sequence) for p in pictures)
-        files[0].unlink()
-        assert [p.kind for p in read_index(tmp_path / "figures")] == [BREAKDOWN, COMPARE, ROOM]
-        index = json.loads(files[-1].read_text())
+        copied = [shutil.copy(evaluation / "figures" / name, tmp_path) for name in (pictures[1].file, "pictures.json")]
+        assert [p.kind for p in read_index(tmp_path)] == [BREAKDOWN]
+        index = json.loads(Path(copied[1]).read_text())
         index["pictures"][1].pop("alt")
-        files[-1].write_text(json.dumps(index))
+        Path(copied[1]).write_text(json.dumps(index))
         with pytest.raises(ValueError, match="not an index of pictures"):
-            read_index(tmp_path / "figures")
+            read_index(tmp_path)
+
+    def test_a_picture_that_fails_is_named(self, evaluation: Path, tmp_path: Path, monkeypatch: Any) -> None:
+        def broken(*_: object) -> None:
+            raise ValueError("broken")
+
+        monkeypatch.setattr(pictures_module, "draw_breakdown", broken)
+        out = shutil.copytree(evaluation, tmp_path / "o")
+        undrawn: dict[str, str] = {}
+        assert [p.kind for p in write_pictures(load_results(out), undrawn)] == [STRIP, COMPARE, ROOM]
+        assert undrawn == {f"{KITCHEN[1]}, frame 7: breakdown": "broken"}
 
     def test_nothing_kept_nothing_drawn(self, tmp_path: Path) -> None:
         results = Results(tmp_path, {"suite": "s"}, (Record("s", "d", "q", "N", "Ensemble"),))
-        assert write_pictures(results, tmp_path) == []
+        assert write_pictures(results, {}) == []

@@ -19,7 +19,7 @@ from ufmstar_torch import UfMStar, UncertainDepth
 from ufmstar_torch.eval.commands.run import Progress, run
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.run_pictures import field_of_view, square_pixels
+from ufmstar_torch.eval.report.outputs import field_of_view, square_pixels
 from ufmstar_torch.eval.results import run_folder, writers
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.writers import read_frame

@@ -16,8 +16,8 @@ from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.commands.run_job import job_from
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
-from ufmstar_torch.eval.report.plots import fit_scales, map_columns
-from ufmstar_torch.eval.report.run_pictures import Finished
+from ufmstar_torch.eval.report.outputs import Finished
+from ufmstar_torch.eval.report.panels import fit_scales, map_columns
 from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.journal import why_none

@@ -21,7 +21,7 @@ from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 from ufmstar_torch.eval.methods.suite import rows_of, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.load import setting_of
+from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.sequences.ground_truth import truth_at

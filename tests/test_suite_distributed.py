@@ -20,7 +20,7 @@ from trainings import SPEC
 
 from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
-from ufmstar_torch.eval.report.load import load_results
+from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.results import launch, worker
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError

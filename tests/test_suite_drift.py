@@ -22,7 +22,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
-from ufmstar_torch.eval.report.load import setting_of
+from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.frame import Frame
 

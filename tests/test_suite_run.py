@@ -18,7 +18,7 @@ from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
 from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.methods.suite import rows_of
-from ufmstar_torch.eval.report.load import load_results
+from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.results.cache import CacheError
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError

@@ -36,8 +36,9 @@ from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.ufm_config import UfMConfig
-from ufmstar_torch.eval.report.demo_pictures import ENSEMBLE, FILES, NETWORK, DemoPanel, panel, write_pictures
-from ufmstar_torch.eval.report.demo_report import names
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, panel, write_pictures
+from ufmstar_torch.eval.report.panels import FramePanel
+from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.machine import require_device
@@ -55,7 +56,7 @@ STYLE = "mixed"
 SHEET_ROWS = 6
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
-DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*FILES))
+DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
 
 
 class DemoError(ValueError):
@@ -70,7 +71,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         progress: called at the start of each stage and after every step of it.
 
     Returns:
-        What summary.json holds; ``demo_report`` makes a table of it.
+        What summary.json holds; ``report.text`` makes a table of it.
 
     Raises:
         FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
@@ -103,7 +104,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "versions": versions(),
     }
     progress(Progress("pictures", 0, 1, None, 0))
-    shown = names(len(members))
+    shown = demo_names(len(members))
     overall = {shown[method].strip(): values for method, values in metrics.overall().items()}
     title = f"ufmstar demo: {len(sequence)} frames, seed {options.seed}"
     gaussians = rows[2].estimator
@@ -184,11 +185,11 @@ class _Walk(FrameSink):
     def __init__(self, unfamiliar: list[bool], progress: Callable[[Progress], None]) -> None:
         self._unfamiliar, self._progress = unfamiliar, progress
         self._rows = sheet_rows(unfamiliar)
-        self._panels: dict[int, DemoPanel] = {}
+        self._panels: dict[int, FramePanel] = {}
         self.ms: dict[str, list[Mapping[str, float]]] = {}
 
     @property
-    def panels(self) -> list[DemoPanel]:
+    def panels(self) -> list[FramePanel]:
         """See above."""
         return [self._panels[index] for index in self._rows]
 

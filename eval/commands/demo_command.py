@@ -57,7 +57,7 @@ def main(options: DemoOptions) -> int:
     """Run the demo, and print its table; the exit code."""
     from ufmstar_torch.eval.commands import demo
     from ufmstar_torch.eval.commands.terminal import Bars
-    from ufmstar_torch.eval.report.demo_report import explanation, table
+    from ufmstar_torch.eval.report.text import demo_explanation, demo_table
     from ufmstar_torch.eval.results.folder import FolderError
 
     try:
@@ -65,5 +65,5 @@ def main(options: DemoOptions) -> int:
             summary = demo.run_demo(options, bars.show)
     except (demo.DemoError, FileNotFoundError, FolderError) as error:
         raise UsageError(error) from error
-    print(table(summary), explanation(summary), sep="\n\n")
+    print(demo_table(summary), demo_explanation(summary), sep="\n\n")
     return 0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from ufmstar_torch.eval.report.load import ResultsError, load_results
-from ufmstar_torch.eval.report.write import summary, write_report, written
+from ufmstar_torch.eval.report.data import ResultsError, load_results
+from ufmstar_torch.eval.report.text import summary, written
+from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.results.launch import EvalOutcome
 
 
@@ -53,7 +54,7 @@ def draw(outcome: EvalOutcome) -> str:
         OSError: a file cannot be written.
     """
     try:
-        files = write_report(outcome.job.out)
+        report = write_report(outcome.job.out)
     except (ImportError, ResultsError) as error:
         return f"no report: {' '.join(str(error).split())}"
-    return written(outcome.job.out, files)
+    return written(outcome.job.out, report)

@@ -13,7 +13,7 @@ from ufmstar_torch.eval.commands.options import UsageError, option, parse, posit
 class ReportOptions:
     """Tables, figures and a page from the results of an evaluation.
 
-    Draws tables (Markdown and LaTeX), figures, one page (report.html) and tidy results (JSON and CSV) from what
+    Draws tables (Markdown, LaTeX and CSV), figures, one page (report.html) and tidy results (JSON and CSV) from what
     `ufmstar eval` has left in a folder, finished or not, and prints the main table.
 
     Attributes:
@@ -36,13 +36,14 @@ def read(words: Sequence[str]) -> ReportOptions:
 
 def main(options: ReportOptions) -> int:
     """Draw the report, and print the main table; the exit code."""
-    from ufmstar_torch.eval.report.load import ResultsError, load_results
-    from ufmstar_torch.eval.report.write import summary, write_report, written
+    from ufmstar_torch.eval.report.data import ResultsError, load_results
+    from ufmstar_torch.eval.report.text import summary, written
+    from ufmstar_torch.eval.report.write import write_report
 
     try:
         print(summary(load_results(options.out, with_sums=False)))
-        files = write_report(options.out, figures=not options.no_figures, pictures=options.format)
+        report = write_report(options.out, figures=not options.no_figures, pictures=options.format)
     except ResultsError as error:
         raise UsageError(error) from error
-    print(written(options.out, files))
+    print(written(options.out, report))
     return 0

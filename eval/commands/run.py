@@ -25,7 +25,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
-from ufmstar_torch.eval.report.run_pictures import Finished, common_scales, draw_sheet, draw_video, write_mixture
+from ufmstar_torch.eval.report.outputs import Finished, common_scales, draw_sheet, draw_video, write_mixture
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.journal import Journal, MapWriter, row_state
 from ufmstar_torch.eval.results.run_folder import RunFolder

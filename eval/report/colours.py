@@ -1,18 +1,22 @@
-"""Colours that do not mislead: perceptually uniform maps, ranges by percentile, grey for what is invalid."""
+"""Colours of pictures: perceptually uniform maps, ranges by percentile, grey for invalid pixels; writing of PNGs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.results.files import write_atomic
+
 # Depth and uncertainty get different maps, so that nobody takes one picture for the other.
 DEPTH_MAP = "viridis"
 ERROR_MAP = "magma"
+INK, FAINT = "#1a1a1a", "#6b6b6b"  # of words
 # In neither map: both are coloured at medium lightness.
 INVALID_GREY = 150
 PERCENTILES = (1.0, 99.0)
@@ -71,6 +75,22 @@ def require_matplotlib() -> Any:
     except ImportError as error:
         raise ImportError("pictures need matplotlib: pip install 'ufmstar-torch[viz]'") from error
     return matplotlib
+
+
+def plain(text: str) -> str:
+    """Text for matplotlib as it stands: a pair of dollar signs would make a formula of what lies between."""
+    return text.replace("$", r"\$")
+
+
+def save_png(figure: Any, path: Path) -> None:
+    """Write a matplotlib figure as PNG, atomically; the same figure gives the same bytes.
+
+    Raises:
+        OSError: see ``write_atomic``.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    write_atomic(path, FigureCanvasAgg(figure).print_png)
 
 
 def robust_range(

@@ -13,20 +13,9 @@ import numpy as np
 from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, TRUTH
-from ufmstar_torch.eval.report.aggregate import Mean, difference
-from ufmstar_torch.eval.report.figure_style import (
-    ALONE_STYLE,
-    LABEL,
-    TICK,
-    Style,
-    counted,
-    finish,
-    label_ends,
-    new_figure,
-    short_name,
-    style_of,
-)
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.colours import FAINT, INK, plain
+from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.means import Mean, difference
 from ufmstar_torch.eval.report.names import (
     DIFFERENCES,
     ECE_DELTA,
@@ -38,8 +27,19 @@ from ufmstar_torch.eval.report.names import (
     setting_label,
     setting_name,
 )
-from ufmstar_torch.eval.report.plots import FAINT, INK
-from ufmstar_torch.eval.report.sweep_lines import Line, Point, Rest, change, default_value, level, sweep_lines
+from ufmstar_torch.eval.report.style import (
+    ALONE_STYLE,
+    LABEL,
+    TICK,
+    Style,
+    counted,
+    finish,
+    label_ends,
+    new_figure,
+    short_name,
+    style_of,
+)
+from ufmstar_torch.eval.report.sweeps import Line, Point, Rest, change, default_value, level, sweep_lines
 
 SHOWN = (NLL, ECE_DELTA, ECE_Q)
 # Lines of the same method by what is fixed; they differ from all of ``style_of``'s.
@@ -67,7 +67,7 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
         _draw_levels(axes[0][column], results, drawn, alone, styles, name, quantity)
         if below.pairs:
             _draw_changes(axes[1][column], results, below, styles, name, quantity)
-        axes[-1][column].set_xlabel(f"{word} [{unit}]" if unit else word, size=LABEL, color=INK)
+        axes[-1][column].set_xlabel(plain(f"{word} [{unit}]" if unit else word), size=LABEL, color=INK)
     return figure
 
 
@@ -103,12 +103,12 @@ class _Below:
 def _paired(
     lines: Iterable[Line], reference: Callable[[Line, float], Point | None]
 ) -> tuple[tuple[Line, tuple[tuple[Point, Point], ...]], ...]:
-    found = []
+    paired = []
     for line in lines:
         pairs = ((point, reference(line, point.value)) for point in line.points)
         kept = tuple((point, other) for point, other in pairs if other is not None)
-        found += [(line, kept)] if kept else []
-    return tuple(found)
+        paired += [(line, kept)] if kept else []
+    return tuple(paired)
 
 
 def _draw_levels(
@@ -163,7 +163,7 @@ def _dashed(axes: Any, line: Line, means: Sequence[Mean], label: str, style: Sty
     """A line for reference, level where it has one point; what to write at its end."""
     if all(math.isnan(mean.value) for mean in means):
         return []
-    look = {"color": style.colour, "linestyle": "--", "linewidth": 1.4, "label": label}
+    look: dict[str, Any] = {"color": style.colour, "linestyle": "--", "linewidth": 1.4, "label": label}
     if len(means) == 1:
         axes.axhline(means[0].value, **look)
     else:
@@ -172,10 +172,10 @@ def _dashed(axes: Any, line: Line, means: Sequence[Mean], label: str, style: Sty
 
 
 def _line(
-    axes: Any, found: Sequence[Point], means: Sequence[Mean], label: str, style: Style, end: str
+    axes: Any, points: Sequence[Point], means: Sequence[Mean], label: str, style: Style, end: str
 ) -> list[tuple[float, str, str]]:
     """A line with its band; what to write at its end."""
-    kept = [(point.value, mean) for point, mean in zip(found, means, strict=True) if not math.isnan(mean.value)]
+    kept = [(point.value, mean) for point, mean in zip(points, means, strict=True) if not math.isnan(mean.value)]
     if not kept:
         return []
     x = np.array([value for value, _ in kept])
@@ -250,7 +250,9 @@ def draw_changes(results: Results, base: str) -> Any | None:
             )  # fmt: skip
         finish(place, title=f"Δ {quantity.heading}", x="less the default")
     axes[0].set_ylim(len(lines) - 0.5, -0.5)
-    axes[0].set_yticks(range(len(lines)), _variant_names([row for row, _ in lines]), size=TICK)
+    axes[0].set_yticks(
+        range(len(lines)), [plain(name) for name in _variant_names([row for row, _ in lines])], size=TICK
+    )
     figure.supxlabel("filled: the 95 % interval leaves out 0", size=TICK, color=FAINT, x=0.99, ha="right")
     return figure
 

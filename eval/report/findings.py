@@ -1,4 +1,4 @@
-"""What an evaluation has found, in words that are computed from its numbers."""
+"""Sentences computed from the numbers of an evaluation: comparisons, best rows, and what limits them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
-from ufmstar_torch.eval.report.aggregate import (
+from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.means import (
+    MIN_SEQUENCES,
     Mean,
     better,
     difference,
@@ -19,12 +21,14 @@ from ufmstar_torch.eval.report.aggregate import (
     references,
     value_of,
 )
-from ufmstar_torch.eval.report.load import Results
 from ufmstar_torch.eval.report.names import DELTA1, DIFFERENCES, ECE_DELTA, ECE_Q, LOWER, NLL, Quantity, row_label
 from ufmstar_torch.eval.report.table import number
 
-BETTER, WORSE, OPEN, ALONE_SEQUENCE = "better", "worse", "open", "one sequence"
-_VERDICTS = (BETTER, WORSE, OPEN, ALONE_SEQUENCE)
+BETTER, WORSE, OPEN, UNDECIDED = "better", "worse", "open", "no verdict"
+# Where accuracy is below it, calibration says little (the paper's own caveat) [share of pixels].
+POOR_ACCURACY = 0.5
+# Where more pixels than that have no NLL, its mean is no longer that of the method [share].
+MANY_LEFT_OUT = 0.01
 # The paper's three: what "uncertainty quality" means there.
 QUALITY = (NLL, ECE_DELTA, ECE_Q)
 
@@ -51,16 +55,16 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """One of "better" and "worse" (beyond the interval), "open" (within it) and "one sequence" (no interval).
+        """One of "better" and "worse" (beyond the interval), "open" (within it) and "no verdict" (no interval).
 
         A difference that prints as 0 is open too, however narrow its interval.
         """
-        if self.difference.sequences < 2:
-            return ALONE_SEQUENCE
+        if not self.difference.decidable:
+            return UNDECIDED
         if float(number(self.difference.value, self.quantity.decimals)) == 0:
             return OPEN
-        found = better(self.difference, self.quantity)
-        return OPEN if found is None else BETTER if found else WORSE
+        verdict = better(self.difference, self.quantity)
+        return OPEN if verdict is None else BETTER if verdict else WORSE
 
     @property
     def words(self) -> str:
@@ -75,29 +79,27 @@ class Comparison:
 
 def compare(results: Results, row: Row, reference: Row, dataset: str | None = None) -> list[Comparison]:
     """A row against a reference in all figures that both have."""
-    found = []
+    made = []
     for quantity in DIFFERENCES:
         delta = difference(results, row, reference, quantity, dataset)
         if delta.sequences:
             mine, theirs = _on_common(results, row, reference, quantity, dataset)
-            found.append(Comparison(row, reference, quantity, mine, theirs, delta))
-    return found
+            made.append(Comparison(row, reference, quantity, mine, theirs, delta))
+    return made
 
 
 def comparisons(results: Results, dataset: str | None = None) -> dict[tuple[Row, Row], list[Comparison]]:
-    """Every row of UfM* with its default settings against what it is to be judged by."""
+    """Every row of UfM* with its default settings against its references."""
     rows = [row for row in results.rows if row.method.fusion == UFM_STAR and row.setting == DEFAULT]
     pairs = ((row, reference) for row in rows for reference in references(results, row))
-    found = {(row, reference): compare(results, row, reference, dataset) for row, reference in pairs}
-    return {pair: made for pair, made in found.items() if made}
+    return {pair: made for pair in pairs if (made := compare(results, *pair, dataset))}
 
 
 def headlines(results: Results) -> list[str]:
     """UfM* against the networks and against UfM, where it does not win, and what an ablation's settings change."""
-    found = comparisons(results)
     against = {
-        "the network alone": [c for (_, ref), made in found.items() if ref.method.fusion == ALONE for c in made],
-        "UfM": [c for (_, ref), made in found.items() if ref.method.fusion == UFM for c in made],
+        name: [c for (_, ref), made in comparisons(results).items() if ref.method.fusion == fusion for c in made]
+        for name, fusion in (("the network alone", ALONE), ("UfM", UFM))
     }
     sentences = [_tally(name, made) for name, made in against.items() if made]
     sentences += [_losses(c for made in against.values() for c in made)] if any(against.values()) else []
@@ -107,6 +109,35 @@ def headlines(results: Results) -> list[str]:
 def best_rows(results: Results) -> list[str]:
     """Which row has the best mean of each figure, and whether its lead is beyond chance."""
     return [sentence for quantity in (DELTA1, *DIFFERENCES) if (sentence := _best(results, quantity))]
+
+
+def caveats(results: Results) -> list[str]:
+    """What a reader must know before believing the figures."""
+    notes = []
+    if results.missing:
+        sequences = {(dataset, sequence) for dataset, sequence, _ in results.missing}
+        notes.append(f"Not finished: rows of {count(len(sequences), 'sequence')} are still to be evaluated.")
+    if results.failed:
+        notes.append(f"Left out, because of errors: {count(len(results.failed), 'sequence')}; see Problems.")
+    n = len(results.sequences())
+    notes.append(
+        f"n = {n}: the figures are means over {count(n, 'sequence')}, each counting the same."
+        if n >= MIN_SEQUENCES
+        else f"n = {n}: with fewer than {MIN_SEQUENCES} sequences there are no confidence intervals and no verdicts; "
+        "the means may be far from those of other sequences."
+    )
+    for dataset in results.datasets:
+        accuracy = _mean_accuracy(results, dataset)
+        if accuracy < POOR_ACCURACY:
+            notes.append(
+                f"On {dataset} only {100 * accuracy:.0f} % of the pixels lie within 25 % of the truth (δ₁). Where "
+                "accuracy is that poor, calibration says little, as the paper notes; look at the entropy there."
+            )
+    notes += _left_out(results)
+    missing = results.about.get("missing_bases") or []
+    if missing:
+        notes.append(f"Rows left out because no network was given for them: {', '.join(missing)}.")
+    return notes
 
 
 def _on_common(
@@ -124,18 +155,20 @@ def _on_common(
 
 def _tally(name: str, made: Sequence[Comparison]) -> str:
     """How often UfM* is better than one kind of reference, in the paper's figures, and by how much on average."""
-    told = [c for c in made if c.quantity in QUALITY]
-    of = {verdict: sum(c.verdict == verdict for c in told) for verdict in _VERDICTS}
-    if not told:
+    judged = [c for c in made if c.quantity in QUALITY]
+    if not judged:
         return f"Against {name} there is no figure of NLL or calibration to compare."
-    about = f"UfM* against {name}, {count(len(told), 'comparison')} of NLL, ECE_δ and ECE_q"
-    if of[ALONE_SEQUENCE]:
-        better_ = sum((c.difference.value < 0) == (c.quantity.better == LOWER) for c in told if c.difference.value)
-        return f"{about}: the better value in {better_}, on a single sequence, which decides nothing."
-    counts = f"better in {of[BETTER]}, worse in {of[WORSE]}, not to be told apart in {of[OPEN]}"
+    about = f"UfM* against {name}, {count(len(judged), 'comparison')} of NLL, ECE_δ and ECE_q"
+    verdicts = [c.verdict for c in judged]
+    if UNDECIDED in verdicts:
+        lower = sum((c.difference.value < 0) == (c.quantity.better == LOWER) for c in judged if c.difference.value)
+        fewest = min(c.difference.sequences for c in judged)
+        on = "a single sequence" if fewest == 1 else f"{fewest} sequences"
+        return f"{about}: the better value in {lower}, on {on}, which decides nothing."
+    counts = f"better in {verdicts.count(BETTER)}, worse in {verdicts.count(WORSE)}"
     # A mean over networks, for a reader who wants one number.
-    changes = [_mean_change(of_figure) for q in QUALITY if (of_figure := [c for c in told if c.quantity is q])]
-    return f"{about}: {counts}. On average {join(changes)}."
+    changes = [_mean_change(of_figure) for q in QUALITY if (of_figure := [c for c in judged if c.quantity is q])]
+    return f"{about}: {counts}, undecided in {verdicts.count(OPEN)}. On average {join(changes)}."
 
 
 def _mean_change(made: Sequence[Comparison]) -> str:
@@ -151,16 +184,16 @@ def _mean_change(made: Sequence[Comparison]) -> str:
 
 def _losses(made: Iterable[Comparison]) -> str:
     """Where UfM* does not win."""
-    judged = [c for c in made if c.verdict != ALONE_SEQUENCE]
+    judged = [c for c in made if c.verdict != UNDECIDED]
     worse = [c for c in judged if c.verdict == WORSE]
     if not judged:
-        return "With one sequence nothing can be said about where UfM* does not win."
+        return f"With fewer than {MIN_SEQUENCES} sequences nothing can be said about where UfM* does not win."
     if not worse:
         return (
             f"In none of all {len(judged)} comparisons, ranking (AUSE, Spearman) included, is UfM* worse beyond chance."
         )
-    told = "; ".join(f"{row_label(c.row)} against {row_label(c.reference)}: {c.words}" for c in worse)
-    return f"UfM* is worse beyond chance in {len(worse)} of all {len(judged)} comparisons: {told}."
+    listed = "; ".join(f"{row_label(c.row)} against {row_label(c.reference)}: {c.words}" for c in worse)
+    return f"UfM* is worse beyond chance in {len(worse)} of all {len(judged)} comparisons: {listed}."
 
 
 def _best(results: Results, quantity: Quantity) -> str:
@@ -183,13 +216,13 @@ def _best(results: Results, quantity: Quantity) -> str:
         shared = join([row_label(row) for row in (first, *alike)])
         return f"Best {quantity.name}: {value}, shared by {shared}." if len(alike) < 6 else ""
     lead = difference(results, first, order[1], quantity)
-    told = f"Best {quantity.name}: {row_label(first)} with {value}, before {row_label(order[1])}"
+    ranking = f"Best {quantity.name}: {row_label(first)} with {value}, before {row_label(order[1])}"
     second = number(means[order[1]].value, quantity.decimals)
-    if lead.sequences < 2:
-        return f"{told} ({second})."
+    if not lead.decidable:
+        return f"{ranking} ({second})."
     beyond = "a lead beyond chance" if better(lead, quantity) else "a lead that may be chance"
     change = f"{number(lead.value, quantity.decimals, signed=True)} ± {number(lead.half, quantity.decimals)}"
-    return f"{told} ({second}; {beyond}, {change})."
+    return f"{ranking} ({second}; {beyond}, {change})."
 
 
 def _settings(results: Results) -> list[str]:
@@ -200,18 +233,18 @@ def _settings(results: Results) -> list[str]:
     pairs = [(row, defaults[row.method]) for row in varied if row.method in defaults]
     made = [c for pair in pairs for c in compare(results, *pair)]
     for quantity in DIFFERENCES:
-        of_figure = [c for c in made if c.quantity is quantity and c.verdict != ALONE_SEQUENCE]
+        of_figure = [c for c in made if c.quantity is quantity and c.verdict != UNDECIDED]
         if not of_figure:
             continue
         parts = []
         for verdict in (BETTER, WORSE):
-            found = sorted((c for c in of_figure if c.verdict == verdict), key=lambda c: -abs(c.difference.value))
-            named = "; ".join(f"{row_label(c.row)} {_change(c)}" for c in found[:4])
-            more = f"; and {len(found) - 4} more" if len(found) > 4 else ""
-            parts.append(f"{verdict} with {len(found)}{f' ({named}{more})' if found else ''}")
+            listed = sorted((c for c in of_figure if c.verdict == verdict), key=lambda c: -abs(c.difference.value))
+            named = "; ".join(f"{row_label(c.row)} {_change(c)}" for c in listed[:4])
+            more = f"; and {len(listed) - 4} more" if len(listed) > 4 else ""
+            parts.append(f"{verdict} with {len(listed)}{f' ({named}{more})' if listed else ''}")
         sentences.append(
             f"{quantity.name}, of {count(len(of_figure), 'setting')} beside the default: {', '.join(parts)}, "
-            f"not to be told apart with {sum(c.verdict == OPEN for c in of_figure)}."
+            f"undecided with {sum(c.verdict == OPEN for c in of_figure)}."
         )
     return sentences
 
@@ -222,8 +255,32 @@ def _change(c: Comparison) -> str:
 
 
 def join(parts: Sequence[str]) -> str:
+    """ "a, b and c"."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
 def count(n: int, noun: str) -> str:
+    """ "1 row", "2 rows"."""
     return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
+def _mean_accuracy(results: Results, dataset: str) -> float:
+    """δ₁ of a data set, mean over all rows; 1 where there is none."""
+    values = [mean_of(results.of(row, dataset), DELTA1).value for row in results.rows]
+    known = [value for value in values if not math.isnan(value)]
+    return math.fsum(known) / len(known) if known else 1.0
+
+
+def _left_out(results: Results) -> list[str]:
+    shares = {}
+    for row in results.rows:
+        share = mean_over([value_of(record, "nll_left_out_share") for record in results.of(row)]).value
+        if share > MANY_LEFT_OUT:
+            shares[row] = share
+    if not shares:
+        return []
+    listed = ", ".join(f"{row_label(row)} {100 * share:.0f} %" for row, share in list(shares.items())[:6])
+    more = f" and {len(shares) - 6} more rows" if len(shares) > 6 else ""
+    return [
+        f"NLL is not defined where a variance is 0, and leaves these pixels out: {listed}{more}. Read NLL with care."
+    ]

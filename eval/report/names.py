@@ -13,7 +13,7 @@ LOWER, HIGHER = "lower", "higher"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A figure as people read it.
+    """A figure, its name and unit in tables and figures.
 
     Attributes:
         key: of ``Record.figures``, or "state.bytes_mean", "ms.network", "frames.done" for the others.
@@ -78,10 +78,10 @@ EXTRA = (
     NETWORK_MS,
     UNCERTAINTY_MS,
 )
-# Of which differences between rows are told.
+# Figures of which differences between rows are shown.
 DIFFERENCES = (NLL, ECE_DELTA, ECE_Q, AUSE, SPEARMAN)
 
-# Settings as people call them, with the unit of their values.
+# Settings for people, with the unit of their values.
 SETTINGS = {
     "rotation_noise": ("rotation noise", "°"),
     "translation_noise": ("translation noise", "m"),

@@ -1,55 +1,122 @@
-"""All pictures of a report: which frames, which rows, and the words that go with them."""
+"""The pictures of a report: which frames and rows, how they are drawn, and the words that go with them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT
-from ufmstar_torch.eval.report.compare import draw_comparison
-from ufmstar_torch.eval.report.example import Example, find_examples
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.examples import Example, Map, RowMaps, deviation, find_examples
 from ufmstar_torch.eval.report.names import row_label
-from ufmstar_torch.eval.report.picture import BREAKDOWN, COMPARE, ROOM, STRIP, Picture, file_name, write_index
-from ufmstar_torch.eval.report.rooms import choose_times, draw_room, find_rooms
-from ufmstar_torch.eval.report.strips import draw_breakdown, draw_strip, mean_nll
+from ufmstar_torch.eval.report.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
+from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
+from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.worklist import WorkItem
 
+INDEX = "pictures.json"
+STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
 # So that a report of a hundred sequences stays one that can be read, and mailed.
 MOST_FRAMES, MOST_ROOMS = 4, 3
 _BREAKDOWN_BASES = ("ensemble", "aleatoric")
+# Errors of drawing, after which a report goes on without the picture.
+DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
+# [nats] The same in all strips, so that they can be compared. 6 is an error of some 3.5 sigma (of sigma = .3 m): beyond
+# it a row is simply wrong there, and how much more so would only flatten the rest of the map. Its map is neither
+# depth's nor that of lengths, and has no grey.
+NLL_SCALE = ColourScale(-2.0, 6.0, "plasma")
+DIFFERENCE_MAP = "RdBu_r"
+# Side of the enlarged part of a comparison by that of the map.
+ZOOM = 1 / 3
 
 
-def write_pictures(results: Results, out: Path) -> list[Path]:
-    """Draw strips, breakdowns, comparisons and rooms of the example frames into ``OUT/figures``.
+@dataclass(frozen=True)
+class Picture:
+    """One picture.
+
+    Attributes:
+        file: name within the figures' folder.
+        kind: "strip", "breakdown", "compare" or "room".
+        title: what it shows, a few words.
+        caption: how to read it.
+        alt: what a reader who cannot see it should know.
+    """
+
+    file: str
+    kind: str
+    title: str
+    caption: str
+    alt: str
+
+
+def write_pictures(results: Results, undrawn: dict[str, str]) -> list[Picture]:
+    """Draw strips, breakdowns, comparisons and rooms of the example frames into ``OUT/figures``, with an index.
 
     Args:
         results: of the evaluation.
-        out: its folder.
-
-    Returns:
-        The files, the index of pictures last; none where no example was kept.
+        undrawn: gets the reason of each picture that cannot be drawn, by its name.
 
     Raises:
         ValueError: an example cannot be read; the message names the file.
         ImportError: matplotlib is missing.
         OSError: a file cannot be written.
     """
-    folder = out / "figures"
+    folder = results.out / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     rows = {row.slug: row for row in results.rows}
-    pictures = list(_of_frames(results, folder, rows)) + list(_of_rooms(results, folder, rows))
-    if not pictures:
+    pictures = []
+    for name, draw in [*_of_frames(results, folder, rows), *_of_rooms(results, folder, rows)]:
+        try:
+            pictures.append(draw())
+        except DRAWING_ERRORS as error:
+            undrawn[name] = " ".join(str(error).split()) or type(error).__name__
+    if pictures:
+        write_json_atomic(folder / INDEX, {"pictures": [asdict(picture) for picture in pictures]})
+    return pictures
+
+
+def read_index(folder: Path) -> list[Picture]:
+    """The pictures of a folder whose files exist; [] if none were made.
+
+    Raises:
+        ValueError: the index is not one.
+    """
+    path = folder / INDEX
+    if not path.is_file():
         return []
-    return [*(folder / picture.file for picture in pictures), write_index(folder, pictures)]
+    names = {f.name for f in fields(Picture)}
+    listed = json.loads(path.read_text(encoding="utf-8"))["pictures"]
+    if any(not isinstance(entry, dict) or entry.keys() != names for entry in listed):
+        raise ValueError(f"{path} is not an index of pictures")
+    return [Picture(**entry) for entry in listed if (folder / entry["file"]).is_file()]
+
+
+def file_name(*parts: str) -> str:
+    """A name for a PNG from names of users; a few letters of a digest keep names apart that would look alike."""
+    short = re.sub(r"[^A-Za-z0-9.-]+", "-", "_".join(parts).replace("*", "star"))[:100].strip("-.")
+    return f"{short}_{sha256(repr(parts).encode()).hexdigest()[:6]}.png"
+
+
+# ---- which frames and rows ----
+
+Drawing = tuple[str, Callable[[], Picture]]
 
 
 def choose(examples: Sequence[Example], most: int) -> list[Example]:
-    """Frames of as many sequences as there can be: the last of each first, since by then most has been seen twice."""
+    """Frames of as many sequences as possible: the last of each first, since by then most has been seen twice."""
     turns: list[tuple[int, int, Example]] = []
     for number, (_, group) in enumerate(groupby(examples, key=lambda e: (e.dataset, e.sequence))):
         turns += [(turn, number, example) for turn, example in enumerate(reversed(list(group)))]
@@ -60,67 +127,58 @@ def choose(examples: Sequence[Example], most: int) -> list[Example]:
 def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
     """A base's rows for a strip, as the paper's: alone, UfM (pruned if there is such), UfM*; of default settings."""
     of_base = [row for row in rows if row.method.base == base and row.setting == DEFAULT and not row.method.full]
-    plain = [row for row in of_base if not row.method.fixed_param]
-    by_fusion = {fusion: [row for row in plain if row.method.fusion == fusion] for fusion in (ALONE, UFM, UFM_STAR)}
+    default = [row for row in of_base if not row.method.fixed_param]
+    by_fusion = {fusion: [row for row in default if row.method.fusion == fusion] for fusion in (ALONE, UFM, UFM_STAR)}
     pruned = [row for row in by_fusion[UFM] if row.method.max_points is not None]
     return [*by_fusion[ALONE], *(pruned or by_fusion[UFM])[:1], *by_fusion[UFM_STAR]]
 
 
-def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Picture]:
+def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
     labels = {slug: row_label(row) for slug, row in rows.items()}
     examples = [
         replace(example, dataset=dataset, sequence=sequence)
         for dataset, sequence in results.sequences()
-        for example in find_examples(_place(results, dataset, sequence), labels)
+        for example in find_examples(_folder_of(results, dataset, sequence), labels)
     ]
-    for example in choose(examples, MOST_FRAMES):
-        there = [row for slug, row in rows.items() if slug in example.rows]
-        bases = dict.fromkeys(row.method.base for row in there)
+    for e in choose(examples, MOST_FRAMES):
+        shown = [row for slug, row in rows.items() if slug in e.rows]
+        bases = dict.fromkeys(row.method.base for row in shown)
+        frame = f"{e.sequence}, frame {e.frame}"
         for base in bases:
-            of_base = strip_rows(there, base)
+            of_base = strip_rows(shown, base)
             if of_base:
-                yield _strip(folder, example, of_base, base)
-        parts = [row for base in _BREAKDOWN_BASES for row in strip_rows(there, base) if row.method.fusion != UFM]
+                yield f"{frame}: strip of {base}", partial(_strip, folder, e, of_base, base)
+        parts = [row for base in _BREAKDOWN_BASES for row in strip_rows(shown, base) if row.method.fusion != UFM]
         if any(row.method.fusion == UFM_STAR for row in parts):
-            yield _breakdown(folder, example, parts)
+            yield f"{frame}: breakdown", partial(_breakdown, folder, e, parts)
         for base in bases:
-            pair = [row for row in strip_rows(there, base) if row.method.fusion != ALONE]
+            pair = [row for row in strip_rows(shown, base) if row.method.fusion != ALONE]
             if len(pair) == 2:
-                yield _comparison(folder, example, *pair)
+                yield f"{frame}: comparison of {base}", partial(_comparison, folder, e, *pair)
 
 
-def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Picture]:
+def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
     drawn = 0
     for dataset, sequence in results.sequences():
-        rooms = find_rooms(_place(results, dataset, sequence))
+        rooms = find_rooms(_folder_of(results, dataset, sequence))
         # One row of each room is enough: the suite's first UfM* with its default settings.
         slug = next((s for s, row in rows.items() if s in rooms and row.setting == DEFAULT), None)
         if slug is None or drawn == MOST_ROOMS:
             continue
         snapshots = choose_times(rooms[slug])
-        if not any(len(snapshot.mean) for snapshot in snapshots):
-            continue
-        drawn += 1
-        label = row_label(rows[slug])
-        name = file_name(ROOM, dataset, sequence, slug)
-        scale = draw_room(folder / name, snapshots, f"{label}, {sequence}")
-        counts = [len(snapshot.mean) for snapshot in snapshots]
-        times = f"{len(snapshots)} times" if len(snapshots) > 1 else "one time"
-        yield Picture(
-            name,
-            ROOM,
-            f"{sequence}: the Gaussians of {label} at {times}",
-            "Each Gaussian is an ellipse as large as the patch it stands for, painted from far to near; what lies "
-            "above the camera (the ceiling) is left out. Black: seen from one view only, or with no disagreement. "
-            "Blue: the camera, its path and where it looks.",
-            f"The room of {sequence} from above and obliquely, {' then '.join(map(str, counts))} Gaussians, coloured "
-            f"by disagreement from 0 to {scale.high:.2g} m.",
-        )
+        if any(len(snapshot.mean) for snapshot in snapshots):
+            drawn += 1
+            name = file_name(ROOM, dataset, sequence, slug)
+            label = row_label(rows[slug])
+            yield f"{sequence}: room", partial(_room, folder, name, label, sequence, snapshots)
 
 
-def _place(results: Results, dataset: str, sequence: str) -> Path:
+def _folder_of(results: Results, dataset: str, sequence: str) -> Path:
     """The folder of a sequence, whose name need not be fit for one."""
     return results.out / "records" / WorkItem(dataset, sequence, path="", layout="").folder
+
+
+# ---- the words of each picture ----
 
 
 def _strip(folder: Path, example: Example, rows: Sequence[Row], base: str) -> Picture:
@@ -133,7 +191,7 @@ def _strip(folder: Path, example: Example, rows: Sequence[Row], base: str) -> Pi
         f"{example.sequence}, frame {example.frame}: {Method(base).name}",
         "A good standard deviation σ looks like the error beside it. NLL is bright where a row was too sure of itself; "
         "its colours are the same in all strips. Lengths share one scale.",
-        f"Depth, error, standard deviation and NLL of {_told(example, slugs)}.",
+        f"Depth, error, standard deviation and NLL of {_listed(example, slugs)}.",
     )
 
 
@@ -147,7 +205,7 @@ def _breakdown(folder: Path, example: Example, rows: Sequence[Row]) -> Picture:
         f"{example.sequence}, frame {example.frame}: what the variance is made of",
         "The parts add up as variances, V = A + E + M; shown are their square roots, in metres, on one scale with the "
         "error. A and E are the network's own, M is what the views disagree by.",
-        f"Aleatoric, epistemic and multiview parts of {_told(example, slugs)}.",
+        f"Aleatoric, epistemic and multiview parts of {_listed(example, slugs)}.",
     )
 
 
@@ -160,13 +218,188 @@ def _comparison(folder: Path, example: Example, ufm: Row, ufm_star: Row) -> Pict
         f"{example.sequence}, frame {example.frame}: {row_label(ufm_star)} against {row_label(ufm)}",
         "Red: UfM* is the less sure of the two; blue: the surer. The blue box marks where they differ most on average, "
         "enlarged below.",
-        f"Standard deviations and their difference, of {_told(example, [ufm.slug, ufm_star.slug])}.",
+        f"Standard deviations and their difference, of {_listed(example, [ufm.slug, ufm_star.slug])}.",
     )
 
 
-def _told(example: Example, slugs: Sequence[str]) -> str:
+def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
+    scale = draw_room(folder / name, snapshots, f"{label}, {sequence}")
+    counts = [len(snapshot.mean) for snapshot in snapshots]
+    times = f"{len(snapshots)} times" if len(snapshots) > 1 else "one time"
+    return Picture(
+        name,
+        ROOM,
+        f"{sequence}: the Gaussians of {label} at {times}",
+        "Each Gaussian is an ellipse as large as the patch it stands for, painted from far to near; what lies "
+        "above the camera (the ceiling) is left out. Black: seen from one view only, or with no disagreement. "
+        "Blue: the camera, its path and where it looks.",
+        f"The room of {sequence} from above and obliquely, {' then '.join(map(str, counts))} Gaussians, coloured "
+        f"by disagreement from 0 to {scale.high:.2g} m.",
+    )
+
+
+def _listed(example: Example, slugs: Sequence[str]) -> str:
     """Rows with their mean NLL, for those who cannot see the picture."""
-    found = ((slug, mean_nll(example, slug)) for slug in slugs)
+    means = ((slug, mean_nll(example, slug)) for slug in slugs)
     return ", ".join(
-        f"{example.label(slug)} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for slug, nll in found
+        f"{example.label(slug)} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for slug, nll in means
     )
+
+
+# ---- drawing ----
+
+
+def fit_strip_scales(example: Example, rows: Iterable[str]) -> PanelScales:
+    """Scales over the truth and these rows of a frame: depth between percentiles 1 and 99, lengths from 0 to 99."""
+    listed = list(rows)
+    depths = [(example.truth, example.truth > 0), *((example.rows[r].depth, example.rows[r].valid) for r in listed)]
+    lengths = [(value, None) for r in listed for value in (example.error(r), example.rows[r].sigma)]
+    depth, length = robust_range(depths, from_zero=False), robust_range(lengths, from_zero=True)
+    return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(*length, ERROR_MAP))
+
+
+def draw_strip(path: Path, example: Example, rows: Sequence[str]) -> PanelScales:
+    """Image and truth, then depth, error, standard deviation and NLL of each row, on common scales.
+
+    Args:
+        path: the picture (PNG).
+        example: the frame.
+        rows: keys of ``example.rows``, at least one.
+
+    Returns:
+        The scales that were used.
+    """
+    scales = fit_strip_scales(example, rows)
+    truth = Panel(scales.depth.rgb(example.truth, example.truth > 0), "ground truth")
+    head = GridRow(example.sequence, [f"frame {example.frame}"], [Panel(example.image, "image"), truth])
+    body = []
+    for row in rows:
+        depth = Panel(scales.depth.rgb(example.rows[row].depth, example.rows[row].valid))
+        body.append(GridRow(example.label(row), figures_of(example, row), [depth, *_judged(example, row, scales)]))
+    body[0] = body[0].captioned(("predicted depth", "|error|", "σ = √V", "NLL"))
+    bars = [
+        Bar("depth [m]", scales.depth, 0, extend="both"),
+        Bar("|error| and σ [m]", scales.length, 1, span=2),
+        Bar("NLL [nats]", NLL_SCALE, 3, extend="both"),
+    ]
+    draw_grid(path, [head, *body], bars, aspect=example.aspect)
+    return scales
+
+
+def draw_breakdown(path: Path, example: Example, rows: Sequence[str]) -> PanelScales:
+    """The parts of each row's variance: sqrt of A, E, M and V beside the error and the NLL; see ``draw_strip``."""
+    scales = fit_strip_scales(example, rows)
+    body = []
+    for row in rows:
+        maps = example.rows[row]
+        parts = [_part(p, maps, scales.length) for p in (maps.aleatoric, maps.epistemic, maps.disagreement)]
+        error, sigma, nll = _judged(example, row, scales)
+        body.append(GridRow(example.label(row), figures_of(example, row), [*parts, sigma, error, nll]))
+    captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
+    body[0] = body[0].captioned(captions)
+    bars = [
+        Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5),
+        Bar("NLL [nats]", NLL_SCALE, 5, extend="both"),
+    ]
+    draw_grid(path, body, bars, aspect=example.aspect)
+    return scales
+
+
+def draw_comparison(path: Path, example: Example, ufm: str, ufm_star: str) -> Box:
+    """Image, error, sigma by UfM and by UfM*, and UfM* minus UfM; below, the part where they differ most.
+
+    Returns:
+        That part, (left, top, width, height) in pixels of the maps.
+    """
+    scales = fit_strip_scales(example, [ufm, ufm_star])
+    old, new = example.rows[ufm].sigma, example.rows[ufm_star].sigma
+    difference = new - old
+    box = largest_difference(difference, ZOOM)
+    reach = robust_range([(np.abs(difference), None)], from_zero=True)[1]
+    signed = ColourScale(-reach, reach, DIFFERENCE_MAP)
+    maps = {
+        "image": example.image,
+        f"|error| of {example.label(ufm_star)}": scales.length.rgb(example.error(ufm_star)),
+        f"σ, {example.label(ufm)}": scales.length.rgb(old),
+        f"σ, {example.label(ufm_star)}": scales.length.rgb(new),
+        "difference of σ": signed.rgb(difference),
+    }
+    boxes = [_scaled(box, old.shape, picture.shape) for picture in maps.values()]
+    whole = [Panel(picture, name, b) for (name, picture), b in zip(maps.items(), boxes, strict=True)]
+    enlarged = [Panel(p[top : top + h, x : x + w]) for p, (x, top, w, h) in zip(maps.values(), boxes, strict=True)]
+    lines = [line for row in (ufm, ufm_star) for line in (f"{example.label(row)}:", *figures_of(example, row))]
+    rows = [
+        GridRow(example.sequence, [f"frame {example.frame}"], whole),
+        GridRow("where they differ most", lines, enlarged),
+    ]
+    bars = [
+        Bar("|error| and σ [m]", scales.length, 1, span=3),
+        Bar("UfM* minus UfM [m]", signed, 4, extend="both"),
+    ]
+    draw_grid(path, rows, bars, aspect=example.aspect)
+    return box
+
+
+def largest_difference(difference: NDArray[Any], share: float) -> Box:
+    """The box with the largest mean |difference|, missing values (NaN) counting as none.
+
+    Args:
+        difference: [h, w].
+        share: side of the box by that of the map, in (0, 1].
+
+    Returns:
+        (left, top, width, height) [px]; the first such box from the top left.
+
+    Raises:
+        ValueError: share is out of range.
+    """
+    if not 0 < share <= 1:
+        raise ValueError(f"share must lie in (0, 1], got {share}")
+    h, w = difference.shape
+    height, width = max(1, round(share * h)), max(1, round(share * w))
+    size = np.where(np.isfinite(difference), np.abs(difference), 0).astype(np.float64)
+    sums = np.zeros((h + 1, w + 1))
+    sums[1:, 1:] = size.cumsum(0).cumsum(1)
+    boxes = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    # Sums of rounded sums differ in the last bits where the boxes' own do not.
+    top, left = np.unravel_index(int(np.argmax(boxes.round(9))), boxes.shape)
+    return int(left), int(top), width, height
+
+
+def _scaled(box: Box, shape: tuple[int, ...], picture: tuple[int, ...]) -> Box:
+    """A box of a map in a picture of another size."""
+    y, x = picture[0] / shape[0], picture[1] / shape[1]
+    left, top, width, height = box
+    return round(left * x), round(top * y), max(1, round(width * x)), max(1, round(height * y))
+
+
+def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:
+    """|error|, sigma and NLL of a row."""
+    error, sigma = scales.length.rgb(example.error(row)), scales.length.rgb(example.rows[row].sigma)
+    return Panel(error), Panel(sigma), Panel(NLL_SCALE.rgb(example.nll(row)))
+
+
+def _part(part: Map | None, maps: RowMaps, scale: ColourScale) -> Panel:
+    if part is None:
+        return Panel(None, absent="none")
+    usable = maps.valid & np.isfinite(part) & (part >= 0)
+    return Panel(scale.rgb(deviation(part, usable)))
+
+
+def figures_of(example: Example, row: str) -> list[str]:
+    """The row's figures on this frame, a line each: mean NLL, root mean square error, and the expected one."""
+    error, sigma = example.error(row).astype(np.float64), example.rows[row].sigma
+    known = np.isfinite(error)
+    if not known.any():
+        return ["no ground truth"]
+    rms_sigma = np.sqrt(np.mean(np.square(sigma[known], dtype=np.float64)))
+    nll = mean_nll(example, row)
+    nll_words = "no NLL: V = 0" if nll is None else f"mean NLL {nll:.2f}"
+    return [nll_words, f"RMSE {np.sqrt(np.mean(error[known] ** 2)):.2f} m", f"rms σ {rms_sigma:.2f} m"]
+
+
+def mean_nll(example: Example, row: str) -> float | None:
+    """The row's mean NLL on this frame [nats]; None without a pixel that has one."""
+    nll = example.nll(row)
+    judged = np.isfinite(nll)
+    return float(nll[judged].mean()) if judged.any() else None

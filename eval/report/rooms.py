@@ -1,4 +1,4 @@
-"""The Gaussians of a room at several times, coloured by the disagreement between the views."""
+"""The Gaussians of a room at several times, from above and obliquely, coloured by the disagreement of the views."""
 
 from __future__ import annotations
 
@@ -11,13 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import ERROR_MAP, ColourScale, require_matplotlib, robust_range
-from ufmstar_torch.eval.report.example import load_arrays
-from ufmstar_torch.eval.report.plots import FAINT, INK
-from ufmstar_torch.eval.report.projection import Ellipses, View, project, views_of
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.report.colours import (
+    ERROR_MAP,
+    FAINT,
+    INK,
+    ColourScale,
+    plain,
+    require_matplotlib,
+    robust_range,
+    save_png,
+)
+from ufmstar_torch.eval.report.examples import load_arrays
+from ufmstar_torch.eval.report.panels import Bar, draw_bar
 
 Array = NDArray[np.float64]
+# A patch that is evenly covered from -a to a has sigma = a / sqrt(3): so drawn, an ellipse is as large as its patch.
+SIGMAS = float(np.sqrt(3.0))
 # A ceiling hides the room from above; the highest camera is held well below it [m].
 HEADROOM = 0.3
 MOST_TIMES = 4
@@ -86,7 +95,6 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
     if not any(len(snapshot.mean) for snapshot in snapshots):
         raise ValueError("snapshots must hold at least one Gaussian")
     require_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     roots = [np.sqrt(np.maximum(snapshot.disagreement, 0)) for snapshot in snapshots]
@@ -98,32 +106,24 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
     width = _LEFT + len(snapshots) * _CELL + 0.1
     height = _TOP + sum(tall) + _BOTTOM
     figure = Figure(figsize=(width, height), dpi=110, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    figure.text(0.1 / width, 1 - 0.2 / height, title, size=11, weight="bold", color=INK, va="center")
+    figure.text(0.1 / width, 1 - 0.2 / height, plain(title), size=11, weight="bold", color=INK, va="center")
     for line, (view, (low, high)) in enumerate(zip(views, limits, strict=True)):
         bottom = height - _TOP - sum(tall[: line + 1])
-        figure.text(
-            0.2 / width,
-            (bottom + tall[line] / 2) / height,
-            view.name,
-            size=8,
-            color=FAINT,
-            rotation=90,
-            va="center",
-            ha="center",
-        )
+        side = {"size": 8, "color": FAINT, "rotation": 90, "va": "center", "ha": "center"}
+        figure.text(0.2 / width, (bottom + tall[line] / 2) / height, view.name, **side)
         for column, snapshot in enumerate(shown):
-            place = ((_LEFT + column * _CELL) / width, bottom / height, _CELL / width, tall[line] / height)
-            axes = figure.add_axes(place)
+            box = ((_LEFT + column * _CELL) / width, bottom / height, _CELL / width, tall[line] / height)
+            axes = figure.add_axes(box)
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             _draw_view(axes, view, snapshot, scale)
             if line == 0:
-                count = len(snapshots[column].mean)
-                axes.set_title(f"after frame {snapshot.frame}: {count} Gaussians", size=8.5, color=INK, pad=4)
+                label = f"after frame {snapshot.frame}: {len(snapshots[column].mean)} Gaussians"
+                axes.set_title(plain(label), size=8.5, color=INK, pad=4)
             if line == 0 and column == 0:
                 _draw_ruler(axes, low, high)
-    _draw_scale(figure, scale, width, height)
-    write_atomic(path, lambda file: canvas.print_png(file))
+    bar = figure.add_axes((_LEFT / width, 0.42 / height, min(4.0, width - 2 * _LEFT) / width, 0.1 / height))
+    draw_bar(bar, Bar("√m, disagreement between the views [m]", scale, 0))
+    save_png(figure, path)
     return scale
 
 
@@ -187,18 +187,6 @@ def _draw_ruler(axes: Any, low: Array, high: Array) -> None:
     axes.text(x + length / 2, y + 0.02 * (high[1] - low[1]), f"{length:g} m", size=7.5, color=INK, ha="center")
 
 
-def _draw_scale(figure: Any, scale: ColourScale, width: float, height: float) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    axes = figure.add_axes((_LEFT / width, 0.42 / height, min(4.0, width - 2 * _LEFT) / width, 0.1 / height))
-    mappable = ScalarMappable(Normalize(scale.low, scale.high), scale.colour_map)
-    bar = figure.colorbar(mappable, cax=axes, orientation="horizontal", extend="max", extendfrac=0.03)
-    bar.ax.tick_params(labelsize=7.5, length=2.5, pad=2, color=INK, labelcolor=INK)
-    bar.outline.set_linewidth(0.5)
-    bar.set_label("√m, disagreement between the views [m]", size=8, color=INK, labelpad=1)
-
-
 def _limits(view: View, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
     """[2] lower and upper corner of what the picture shows, the same at all times [m].
 
@@ -230,3 +218,94 @@ def _load(file: Path, frame: str) -> Snapshot:
     )
     path = stored["path"].astype(np.float64) if "path" in stored else T[None, :3, 3]
     return Snapshot(frame, mean, covariance, disagreement, T, path)
+
+
+# ---- Gaussians seen from far away: an orthographic camera, and the ellipses that covariances leave on its image ----
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An orthographic camera.
+
+    Attributes:
+        right: [3] unit vector that points right in the picture, in the world.
+        up: [3] the one that points up.
+        name: "from above", say.
+    """
+
+    right: Array
+    up: Array
+    name: str
+
+    @property
+    def towards(self) -> Array:
+        """[3] unit vector from the scene to the viewer."""
+        return np.cross(self.right, self.up)
+
+    def plane(self, points: Array) -> Array:
+        """[..., 2] coordinates of world points [..., 3] in the picture [m]."""
+        return np.stack([points @ self.right, points @ self.up], axis=-1)
+
+    def nearness(self, points: Array) -> Array:
+        """[...] how near world points [..., 3] are to the viewer [m]; what is larger hides what is smaller."""
+        nearness: Array = points @ self.towards
+        return nearness
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipses:
+    """Ellipses in a picture.
+
+    Attributes:
+        centre: [K, 2] [m].
+        axes: [K, 2] semi-axes, the longer first [m].
+        angle: [K] of the longer one, from right towards up, in (-90, 90] [degrees].
+    """
+
+    centre: Array
+    axes: Array
+    angle: Array
+
+
+def project(view: View, mean: Array, covariance: Array, sigmas: float = SIGMAS) -> Ellipses:
+    """The ellipses of Gaussians: P Sigma P^T is the covariance in the picture, P the view's two rows.
+
+    Args:
+        view: the camera.
+        mean: [K, 3] in the world [m].
+        covariance: [K, 3, 3] [m^2].
+        sigmas: semi-axes in standard deviations.
+    """
+    P = np.stack([view.right, view.up])
+    flat = P @ covariance @ P.T
+    a, b, c = flat[:, 0, 0], (flat[:, 0, 1] + flat[:, 1, 0]) / 2, flat[:, 1, 1]
+    middle, spread = (a + c) / 2, np.hypot((a - c) / 2, b)
+    # Rounding can leave the smaller eigenvalue of a line just below 0.
+    axes = sigmas * np.sqrt(np.maximum(np.stack([middle + spread, middle - spread], axis=-1), 0))
+    return Ellipses(view.plane(mean), axes, np.degrees(np.arctan2(2 * b, a - c) / 2))
+
+
+def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[View, View]:
+    """From above, and obliquely from behind the first camera.
+
+    Data sets differ in which axis points up; a camera's own up (-y) is right on average.
+
+    Args:
+        T_world_cam: [n, 4, 4] poses of cameras.
+        elevation: of the oblique view over the horizon [degrees].
+    """
+    up = _unit(-T_world_cam[:, :3, 1].mean(0), np.array([0.0, 0.0, 1.0]))
+    first = T_world_cam[0, :3, 2]
+    # A camera that looks straight down has no forward on the floor: any direction serves then.
+    fallback = np.eye(3)[np.argmin(np.abs(up))]
+    forward = _unit(first - up * (first @ up), _unit(fallback - up * (fallback @ up), fallback))
+    right = np.cross(forward, up)
+    tilt = np.radians(elevation)
+    oblique = View(right, np.cos(tilt) * up + np.sin(tilt) * forward, "obliquely")
+    return View(right, forward, "from above"), oblique
+
+
+def _unit(vector: Array, otherwise: Array) -> Array:
+    """The vector at length 1, or another one where it has no direction."""
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-6 else otherwise

@@ -1,25 +1,31 @@
-"""A table as values, before it is Markdown or LaTeX."""
+"""A table as one data frame of cells, and its forms: Markdown, LaTeX (booktabs) and CSV; ``table.html.j2`` has HTML."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.report.aggregate import Mean
+import pandas as pd
+
+from ufmstar_torch.eval.report.means import Mean
 from ufmstar_torch.eval.report.names import LOWER, Quantity
 
 # A narrower interval is not printed, as in the paper.
 SMALL_INTERVAL = 0.01
+DASH = "–"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What stands in a cell.
+    """The content of a cell, as printed.
 
     Attributes:
-        value: as printed; "" = nothing to print (a dash).
-        half: half-width of its confidence interval as printed, "" = none.
+        value: "" = no such figure (a dash).
+        half: half-width of its confidence interval, "" = none.
         bold: the best of its block.
         remark: a word behind it.
     """
@@ -31,32 +37,30 @@ class Cell:
 
     @classmethod
     def of(cls, mean: Mean, decimals: int | None, *, signed: bool = False, bold: bool = False) -> Cell:
-        """A mean with its interval; intervals below .01 are left out, and those of a single sequence."""
+        """A mean with its interval, where there is one and it is at least .01 wide (of differences, any)."""
         if math.isnan(mean.value):
             return cls()
         if decimals is None:
             decimals = significant(mean.value)
-        value = number(mean.value, decimals, signed=signed)
         wide = mean.half >= SMALL_INTERVAL or (signed and mean.half > 0)
-        return cls(value, number(mean.half, decimals) if wide else "", bold)
+        return cls(number(mean.value, decimals, signed=signed), number(mean.half, decimals) if wide else "", bold)
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column's heading; ``group`` stands over neighbours of the same group, "" = none."""
+class Column(NamedTuple):
+    """A column's heading; neighbours of the same ``group`` share a heading above ("" = none)."""
 
+    group: str
     name: str
     latex: str
-    group: str = ""
 
 
-@dataclass(frozen=True)
-class Line:
-    """A row of a table."""
+class Line(NamedTuple):
+    """A row of a table: its block (rows that belong together), its label, whether that is bold, and its cells."""
 
+    block: int
     label: str
+    bold: bool
     cells: tuple[Cell, ...]
-    bold: bool = False
 
 
 @dataclass(frozen=True)
@@ -67,28 +71,63 @@ class Table:
         name: of its files.
         title: its caption.
         first: heading of the labels.
-        columns: headings.
-        blocks: lines by what belongs together.
+        frame: of ``Cell``; index (block, label, bold), columns (group, name, latex).
         notes: sentences below.
     """
 
     name: str
     title: str
     first: str
-    columns: tuple[Column, ...]
-    blocks: tuple[tuple[Line, ...], ...]
+    frame: pd.DataFrame
     notes: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        for line in self.lines:
-            if len(line.cells) != len(self.columns):
-                found = f"{len(line.cells)} cells for {len(self.columns)} columns"
-                raise ValueError(f"{self.name}: {line.label} has {found}")
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        title: str,
+        first: str,
+        columns: Sequence[Column],
+        lines: Iterable[Line],
+        notes: Iterable[str] = (),
+    ) -> Table:
+        """A table from its columns and lines; a line with another number of cells raises ValueError."""
+        listed = list(lines)
+        for line in listed:
+            if len(line.cells) != len(columns):
+                raise ValueError(f"{name}: {line.label} has {len(line.cells)} cells for {len(columns)} columns")
+        frame = pd.DataFrame([list(line.cells) for line in listed], columns=range(len(columns)), dtype=object)
+        frame.columns = pd.MultiIndex.from_tuples(columns, names=Column._fields)
+        labels = [(line.block, line.label, line.bold) for line in listed]
+        frame.index = pd.MultiIndex.from_arrays(list(zip(*labels, strict=True)) or [[], [], []], names=Line._fields[:3])
+        return cls(name, title, first, frame, tuple(notes))
 
     @property
-    def lines(self) -> tuple[Line, ...]:
-        """Of all blocks."""
-        return tuple(line for block in self.blocks for line in block)
+    def columns(self) -> list[Column]:
+        """Headings of the columns."""
+        return [Column(*labels) for labels in self.frame.columns]
+
+    @property
+    def lines(self) -> list[Line]:
+        """The rows of all blocks."""
+        cells = self.frame.itertuples(index=False, name=None)
+        return [Line(*labels, found) for labels, found in zip(self.frame.index, cells, strict=True)]
+
+    @property
+    def blocks(self) -> Iterator[list[Line]]:
+        """The rows by block."""
+        return (list(lines) for _, lines in groupby(self.lines, key=lambda line: line.block))
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Headings over neighbouring columns, and the number of columns below each; [] without any heading."""
+        spans = [(name, len(list(of))) for name, of in groupby(self.columns, key=lambda column: column.group)]
+        return spans if any(name for name, _ in spans) else []
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the table has no line, or only dashes."""
+        return not any(cell.value for line in self.lines for cell in line.cells)
 
 
 def number(value: float, decimals: int | None, *, signed: bool = False) -> str:
@@ -108,9 +147,140 @@ def significant(value: float) -> int:
 
 
 def mark_best(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
-    """Bold where a cell prints the best value of its block; none where all print the same, or stand alone."""
+    """Bold where a cell prints the best value of its block; none where all print the same, or there is one alone."""
     printed = [float(cell.value) for cell in cells if cell.value]
     if quantity.better is None or len(set(printed)) < 2:
         return list(cells)
     best = min(printed) if quantity.better == LOWER else max(printed)
     return [replace(cell, bold=bool(cell.value) and float(cell.value) == best) for cell in cells]
+
+
+# ---- Markdown ----
+
+
+def markdown(table: Table) -> str:
+    """The table under its title, with its notes below."""
+    rows = [[table.first, *(column.name for column in table.columns)], ["---", *("---:" for _ in table.columns)]]
+    for line in table.lines:
+        label = markdown_text(line.label)
+        rows.append([f"**{label}**" if line.bold else label, *map(_markdown_cell, line.cells)])
+    body = "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+    notes = "\n".join(f"- {markdown_text(note)}" for note in table.notes)
+    return "\n\n".join(filter(None, (f"### {markdown_text(table.title)}", body, notes))) + "\n"
+
+
+def markdown_text(text: str) -> str:
+    """Plain text for Markdown, on one line: nothing of it becomes emphasis, code, HTML, a formula or a link.
+
+    Links without brackets ("https://...", "www...", addresses with an @) are known by letters alone, which cannot be
+    escaped: an invisible word joiner (U+2060) breaks them.
+    """
+    text = re.sub(r"([\\|*_<`\[\]~$])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"(?i)://|(?<=\bwww)\.|(?<=\w)@(?=\w)", lambda mark: f"\u2060{mark[0]}", text)
+
+
+def _markdown_cell(cell: Cell) -> str:
+    if not cell.value:
+        return DASH
+    value = cell.value.replace("<", "&lt;")
+    value = f"**{value}**" if cell.bold else value
+    value = f"{value} ± {cell.half}" if cell.half else value
+    return f"{value} ({cell.remark})" if cell.remark else value
+
+
+# ---- LaTeX ----
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "–": "--", "°": r"$^\circ$", "²": "$^2$",
+    "³": "$^3$", "₀": "$_0$", "₁": "$_1$", "α": r"$\alpha$", "δ": r"$\delta$", "η": r"$\eta$", "μ": r"$\mu$",
+    "π": r"$\pi$", "σ": r"$\sigma$", "<": "$<$", ">": "$>$", "Δ": r"$\Delta$", "*": "$^*$",
+    "↓": r"$\downarrow$", "↑": r"$\uparrow$", "×": r"$\times$",
+}  # fmt: skip
+
+
+def latex(table: Table) -> str:
+    """A ``table`` environment, set as the paper's; the document needs the package booktabs."""
+    frame = table.frame.map(_latex_cell)
+    frame.index = pd.Index(
+        [rf"\textbf{{{latex_text(line.label)}}}" if line.bold else latex_text(line.label) for line in table.lines]
+    )
+    heads = [[latex_text(c.group) for c in table.columns], [c.latex for c in table.columns]]
+    names = [None, latex_text(table.first)]
+    frame.columns = pd.MultiIndex.from_arrays(heads, names=names) if table.groups else pd.Index(heads[1], name=names[1])
+    text = frame.style.to_latex(
+        hrules=True,
+        column_format=f"l{'c' * len(table.columns)}",
+        position="t",
+        position_float="centering",
+        caption=" ".join([f"{latex_text(table.title)}.", *map(latex_text, table.notes)]),
+        label=f"tab:{re.sub(r'[^A-Za-z0-9.-]+', '-', table.name)}",
+        multicol_align="c",
+    )
+    return f"% needs \\usepackage{{booktabs}}\n{_ruled(table, text)}"
+
+
+def latex_text(text: str) -> str:
+    """Plain text as LaTeX; "UfM*" gets its star as an exponent."""
+    return "".join(_LATEX.get(character, character) for character in text)
+
+
+def _ruled(table: Table, text: str) -> str:
+    """The text of pandas' Styler with rules below the groups of columns, and a gap between blocks."""
+    top, body = text.split("\\midrule\n")
+    if table.groups:
+        rules, start = "", 2
+        for name, count in table.groups:
+            rules += rf"\cmidrule(lr){{{start}-{start + count - 1}}}" if name else ""
+            start += count
+        *above, heads = top.splitlines()
+        top = "\n".join([*above, rules, heads, ""])
+    rows = body.splitlines(keepends=True)
+    spaced = []
+    for number_, line in enumerate(table.lines):
+        if number_ and line.block != table.lines[number_ - 1].block:
+            spaced.append("\\addlinespace\n")
+        spaced.append(rows[number_])
+    return "".join([top, "\\midrule\n", *spaced, *rows[len(table.lines) :]])
+
+
+def _latex_cell(cell: Cell) -> str:
+    if not cell.value:
+        return "--"
+    if cell.value[0].isalpha():  # words instead of a number
+        return latex_text(cell.value)
+    value = rf"\mathbf{{{cell.value}}}" if cell.bold else cell.value
+    text = f"${value} \\pm {cell.half}$" if cell.half else f"${value}$"
+    return f"{text} ({latex_text(cell.remark)})" if cell.remark else text
+
+
+# ---- CSV ----
+
+
+def table_csv(tables: Iterable[Table]) -> str:
+    """Tables below each other: title, label, and for each column its value and, where any has one, its half-width."""
+    frames = []
+    for table in tables:
+        frame = pd.DataFrame({"table": table.title, table.first: [line.label for line in table.lines]}, dtype=object)
+        for position, column in enumerate(table.columns):
+            prefix = f"{column.group}: "
+            name = column.name if column.name.lower().startswith(prefix.lower()) or not column.group else None
+            name = name or f"{prefix}{column.name}"
+            cells = [line.cells[position] for line in table.lines]
+            frame[name] = [cell.value for cell in cells]
+            if any(cell.half for cell in cells):
+                frame[f"{name} ±"] = [cell.half for cell in cells]
+        frames.append(frame)
+    return pd.concat(frames).map(csv_text).to_csv(index=False, lineterminator="\n")
+
+
+def csv_text(value: Any) -> str:
+    """A CSV field: text that a spreadsheet would take for a formula gets an apostrophe, numbers do not."""
+    text = "" if value is None or value != value else str(value)
+    if text[:1] not in ("=", "+", "-", "@", "\t", "\r"):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text

@@ -1,25 +1,54 @@
-"""The tables of a report: the paper's columns, further ones, single sequences, and paired differences."""
+"""The tables of a report and their files: the paper's columns, further ones, single sequences, paired differences."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
 
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.report.aggregate import Mean, better, difference, has_variance, mean_of, references, value_of
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import FORMAT, Results
+from ufmstar_torch.eval.report.efficiency import efficiency_tables, paper_efficiency_tables
+from ufmstar_torch.eval.report.means import (
+    MIN_SEQUENCES,
+    Mean,
+    better,
+    difference,
+    has_variance,
+    mean_of,
+    mean_over,
+    references,
+    value_of,
+)
 from ufmstar_torch.eval.report.names import DIFFERENCES, EXTRA, MAIN, Quantity, row_label
-from ufmstar_torch.eval.report.paper import BY_SUITE, PaperTable
-from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, mark_best
+from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
+from ufmstar_torch.eval.report.table import (
+    Cell,
+    Column,
+    Line,
+    Table,
+    csv_text,
+    latex,
+    mark_best,
+    markdown,
+    table_csv,
+)
+from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.results.record import Record
 
 METHOD = "Method"
-# [nats] Above it, a mean NLL is that of a few pixels: sigma = .25 d of a room makes about 1.
+# [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
 NLL_OF_FEW = 100.0
-# LaTeX headings of the paper's columns.
+# Columns of results.csv and table.csv; "setting" stands for a column for each setting.
+LINE_COLUMNS = ("suite", "dataset", "sequence", "network", "method", "setting", "figure", "value")
+MEAN_COLUMNS = ("suite", "dataset", "network", "method", "setting", "figure", "mean", "half_width", "sequences")
+# The paper's columns, and their LaTeX.
 _PAPER_COLUMNS = {
     "delta1": ("δ₁", r"$\delta_1$"),
     "nll": ("NLL", "NLL"),
@@ -37,14 +66,13 @@ def main_table(results: Results, dataset: str | None = None) -> Table:
         results: of an evaluation.
         dataset: one of its data sets; None = all sequences of all.
     """
-    quoted = BY_SUITE.get(results.suite)
-    table = _means(results, dataset, MAIN, "main", "Ours" if quoted else "")
-    return table if quoted is None else _beside_paper(table, results, quoted)
+    quoted = paper_table_of(results.suite)
+    return _means(results, dataset, MAIN, "main", quoted)
 
 
 def extra_table(results: Results, dataset: str | None = None) -> Table:
     """What the paper's tables leave out: errors in metres, ranking, pixels without a figure, times."""
-    return _means(results, dataset, EXTRA, "extra", "")
+    return _means(results, dataset, EXTRA, "extra")
 
 
 def sequence_tables(results: Results, dataset: str) -> list[Table]:
@@ -52,38 +80,41 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
     tables = []
     for name, sequence in results.sequences(dataset):
         of = {row: [r for r in results.of(row, name) if r.sequence == sequence] for row in results.rows}
-        records = {row: found for row, found in of.items() if found}
-        frames = max(int(value_of(found[0], "frames.done") or 0) for found in records.values())
-        lines = _lines(results, {row: _cells(found, MAIN) for row, found in records.items()}, MAIN)
+        records = {row: listed for row, listed in of.items() if listed}
+        counts = (value_of(listed[0], "frames.done") for listed in records.values())
+        frames = max((int(count) for count in counts if count == count), default=0)
+        lines = _lines({row: _cells(listed, MAIN) for row, listed in records.items()}, MAIN)
         title = f"{name}, {sequence}" + (f": {frames} frames" if frames else "")
-        tables.append(Table(f"{name}-{sequence}", title, METHOD, _columns(MAIN, ""), lines))
+        tables.append(Table.of(f"{name}-{sequence}", title, METHOD, _columns(MAIN, ""), lines))
     return tables
 
 
 def difference_table(results: Results, dataset: str | None = None) -> Table:
     """Row less reference, in pairs on the same sequences; bold where the interval leaves out 0 to the better side."""
-    lines: dict[str, list[Line]] = {}
-    for row in results.rows:
-        if not has_variance(results, row):
-            continue
+    blocks: dict[str, int] = {}
+    lines = []
+    for row in (row for row in results.rows if has_variance(results, row)):
         for reference in references(results, row):
-            found = [difference(results, row, reference, q, dataset) for q in DIFFERENCES]
-            count = max(mean.sequences for mean in found)
+            means = [difference(results, row, reference, q, dataset) for q in DIFFERENCES]
+            count = max(mean.sequences for mean in means)
             if count:
-                label = f"{row_label(row)} – {row_label(reference)}"
-                cells = [Cell(str(count)), *map(_difference_cell, found, DIFFERENCES)]
-                lines.setdefault(row.method.base, []).append(Line(label, tuple(cells)))
-    columns = (
-        Column("sequences", "Sequences"),
-        *(Column(f"Δ {q.heading}", rf"$\Delta$ {q.latex_heading}") for q in DIFFERENCES),
-    )
-    notes = (
+                block = blocks.setdefault(row.method.base, len(blocks))
+                cells = (Cell(str(count)), *map(_difference_cell, means, DIFFERENCES))
+                lines.append(Line(block, f"{row_label(row)} – {row_label(reference)}", False, cells))
+    columns = [
+        Column("", "sequences", "Sequences"),
+        *(Column("", f"Δ {q.heading}", rf"$\Delta$ {q.latex_heading}") for q in DIFFERENCES),
+    ]
+    notes = [
         "Mean over sequences of row – reference on the same sequence, with its 95 % confidence interval.",
         "Bold: better beyond the interval. (worse): worse beyond it. All others may be chance, and with many rows "
         "one in twenty lies beyond its interval by chance.",
-    )
+    ]
+    if any(int(line.cells[0].value) < MIN_SEQUENCES for line in lines):
+        notes.append(f"Of fewer than {MIN_SEQUENCES} sequences there is no confidence interval, and no verdict.")
     title = f"{results.title}, paired differences, {_where(results, dataset)}"
-    return Table("differences", title, "Row – reference", columns, tuple(map(tuple, lines.values())), notes)
+    ordered = sorted(lines, key=lambda line: line.block)
+    return Table.of("differences", title, "Row – reference", columns, ordered, notes)
 
 
 def _difference_cell(mean: Mean, quantity: Quantity) -> Cell:
@@ -92,66 +123,59 @@ def _difference_cell(mean: Mean, quantity: Quantity) -> Cell:
     return cell if verdict is not False else replace(cell, remark="worse")
 
 
-def _means(results: Results, dataset: str | None, quantities: Sequence[Quantity], name: str, group: str) -> Table:
-    """A table of means over the sequences of one data set, or of all."""
+def _means(
+    results: Results, dataset: str | None, quantities: Sequence[Quantity], name: str, quoted: PaperTable | None = None
+) -> Table:
+    """A table of means over the sequences of one data set, or of all; the paper's columns last."""
     records = {row: results.of(row, dataset) for row in results.rows}
-    records = {row: found for row, found in records.items() if found}
-    on = {row: {(r.dataset, r.sequence) for r in found} for row, found in records.items()}
+    records = {row: listed for row, listed in records.items() if listed}
+    on = {row: {(r.dataset, r.sequence) for r in listed} for row, listed in records.items()}
     alike = len({frozenset(where) for where in on.values()}) == 1
-    cells = {row: _cells(found, quantities) for row, found in records.items()}
+    cells = {row: _cells(listed, quantities) for row, listed in records.items()}
+    group = "Ours" if quoted else ""
     columns = _columns(quantities, group)
     notes = [_network_note(results), _interval_note(records), _nll_note(records, quantities)]
     if not alike:
-        columns = (Column("sequences", "Sequences", group), *columns)
-        cells = {row: [Cell(str(len(on[row]))), *found] for row, found in cells.items()}
+        columns = [Column(group, "sequences", "Sequences"), *columns]
+        cells = {row: [Cell(str(len(on[row]))), *listed] for row, listed in cells.items()}
         notes.append("The rows are means over different sequences, so none is marked as the best.")
-    lines = _lines(results, cells, quantities if alike else ())
+    lines = _lines(cells, quantities if alike else ())
+    if quoted:
+        columns += [Column("Paper", f"paper: {_PAPER_COLUMNS[c][0]}", _PAPER_COLUMNS[c][1]) for c in quoted.columns]
+        theirs = {row_label(row): quoted.rows.get(row.method.name, {}) for row in cells}
+        lines = [
+            line._replace(cells=(*line.cells, *(theirs[line.label].get(c, Cell()) for c in quoted.columns)))
+            for line in lines
+        ]
+        notes.append(
+            f"The paper's own figures are of {quoted.network} on {quoted.measured_on}; compare the differences between "
+            "rows, not the rows with each other."
+        )
     title = f"{results.title}, {_where(results, dataset)}"
-    return Table(name, title, METHOD, columns, lines, tuple(filter(None, notes)))
+    return Table.of(name, title, METHOD, columns, lines, filter(None, notes))
 
 
 def _cells(records: Sequence[Record], quantities: Sequence[Quantity]) -> list[Cell]:
     return [Cell.of(mean_of(records, q), q.decimals) for q in quantities]
 
 
-def _columns(quantities: Sequence[Quantity], group: str) -> tuple[Column, ...]:
-    return tuple(Column(q.heading, q.latex_heading, group) for q in quantities)
+def _columns(quantities: Sequence[Quantity], group: str) -> list[Column]:
+    return [Column(group, q.heading, q.latex_heading) for q in quantities]
 
 
-def _lines(
-    results: Results, cells: Mapping[Row, Sequence[Cell]], quantities: Sequence[Quantity]
-) -> tuple[tuple[Line, ...], ...]:
+def _lines(cells: Mapping[Row, Sequence[Cell]], quantities: Sequence[Quantity]) -> list[Line]:
     """Rows by base, the best of each in bold; one block where every base has a single row, as in table 4."""
     bases = [row.method.base for row in cells]
     together = len(set(bases)) == len(bases)
-    blocks = []
-    for _, group in groupby(cells, key=lambda row: None if together else row.method.base):
+    lines = []
+    for block, (_, group) in enumerate(groupby(cells, key=lambda row: None if together else row.method.base)):
         rows = list(group)
-        columns = list(zip(*(cells[row] for row in rows), strict=True))
+        columns: list[Sequence[Cell]] = list(zip(*(cells[row] for row in rows), strict=True))
         if quantities:
-            columns = [tuple(mark_best(column, q)) for column, q in zip(columns, quantities, strict=True)]
-        lines = zip(rows, zip(*columns, strict=True), strict=True)
-        blocks.append(tuple(Line(row_label(row), tuple(found), row.method.fusion == UFM_STAR) for row, found in lines))
-    return tuple(blocks)
-
-
-def _beside_paper(table: Table, results: Results, quoted: PaperTable) -> Table:
-    """The table with the paper's columns added."""
-    heads = [_PAPER_COLUMNS[key] for key in quoted.columns]
-    columns = tuple(Column(f"paper: {name}", latex, "Paper") for name, latex in heads)
-    names = {row_label(row): row.method.name for row in results.rows}
-
-    def extended(line: Line) -> Line:
-        found = quoted.rows.get(names[line.label], {})
-        cells = (found.get(key) for key in quoted.columns)
-        return Line(line.label, (*line.cells, *(Cell(c.value, c.half) if c else Cell() for c in cells)), line.bold)
-
-    note = (
-        f"The paper's own figures are of {quoted.network} on {quoted.told}; compare the differences between rows, "
-        "not the rows with each other."
-    )
-    blocks = tuple(tuple(map(extended, block)) for block in table.blocks)
-    return Table(table.name, table.title, table.first, (*table.columns, *columns), blocks, (*table.notes, note))
+            columns = [mark_best(column, q) for column, q in zip(columns, quantities, strict=True)]
+        for row, of_row in zip(rows, zip(*columns, strict=True), strict=True):
+            lines.append(Line(block, row_label(row), row.method.fusion == UFM_STAR, of_row))
+    return lines
 
 
 def _where(results: Results, dataset: str | None) -> str:
@@ -166,7 +190,7 @@ def _where(results: Results, dataset: str | None) -> str:
 
 def _network_note(results: Results) -> str:
     networks: dict[str, list[str]] = {}
-    for base in dict.fromkeys(row.method.base for row in results.rows):
+    for base in results.bases:
         networks.setdefault(results.network(base) or "", []).append(base)
     if len(networks) == 1:
         return f"Network: {next(iter(networks))}."
@@ -174,9 +198,10 @@ def _network_note(results: Results) -> str:
 
 
 def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:
-    most = max(len(found) for found in records.values())
-    if most == 1:
-        return "One sequence: no confidence intervals."
+    most = max(len(listed) for listed in records.values())
+    if most < MIN_SEQUENCES:
+        number = "One sequence" if most == 1 else f"{most} sequences, fewer than {MIN_SEQUENCES}"
+        return f"{number}: no confidence intervals."
     return (
         "Means over sequences, each counting the same, with 95 % confidence intervals (those below 0.01 are left out)."
     )
@@ -185,8 +210,8 @@ def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:
 def _nll_note(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quantity]) -> str:
     """A warning where the NLL is that of a few pixels."""
     shown = any(quantity.key == "nll" for quantity in quantities)
-    found = [record.figures.get("nll") for of_row in records.values() for record in of_row]
-    if not shown or max((nll for nll in found if nll is not None), default=0.0) < NLL_OF_FEW:
+    values = [record.figures.get("nll") for of_row in records.values() for record in of_row]
+    if not shown or max((nll for nll in values if nll is not None), default=0.0) < NLL_OF_FEW:
         return ""
     return (
         f"An NLL above {NLL_OF_FEW:.0f} tells of a few pixels with almost no variance and of nothing else; those with "
@@ -194,11 +219,136 @@ def _nll_note(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quan
     )
 
 
-def is_empty(table: Table) -> bool:
-    """Whether a table has nothing to say: no line, or only dashes."""
-    return not any(cell.value for line in table.lines for cell in line.cells)
+# ---- files ----
 
 
-def finite(value: float) -> float | None:
-    """A number for JSON: None for NaN."""
-    return None if math.isnan(value) else value
+def write_tables(results: Results) -> list[Path]:
+    """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: main, extra and differences over all sequences and, where there
+    are several data sets, over those of each, ``sequences-DATASET`` for single sequences, and ``efficiency`` with the
+    paper's table 2 below ours where it was measured.
+
+    Returns:
+        Their paths.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    folder = results.out / "tables"
+    folder.mkdir(exist_ok=True)
+    written = []
+    for name, tables in _table_files(results):
+        shown = [table for table in tables if not table.is_empty]
+        if shown:
+            texts = {
+                "md": "\n".join(map(markdown, shown)),
+                "tex": "\n".join(map(latex, shown)),
+                "csv": table_csv(shown),
+            }
+            written += [_write_text(folder / f"{name}.{kind}", text) for kind, text in texts.items()]
+    return written
+
+
+def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
+    each = results.datasets if len(results.datasets) > 1 else ()
+    for dataset in (None, *each):
+        for make in (main_table, extra_table, difference_table):
+            table = make(results, dataset)
+            yield table.name if dataset is None else f"{table.name}-{dataset}", [table]
+    for dataset in results.datasets:
+        yield f"sequences-{dataset}", sequence_tables(results, dataset)
+    if results.efficiency is not None:
+        networks = (row["network"] for row in results.efficiency["rows"])
+        yield "efficiency", [*efficiency_tables(results.efficiency), *paper_efficiency_tables(networks)]
+
+
+def write_tidy(results: Results) -> list[Path]:
+    """Write ``results.json``, ``results.csv`` (a line per figure) and ``table.csv`` (means over sequences).
+
+    Returns:
+        Their paths.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    lines, means = tidy_lines(results), mean_lines(results)
+    paths = [results.out / name for name in ("results.json", "results.csv", "table.csv")]
+    write_json_atomic(
+        paths[0],
+        {
+            "format": FORMAT,
+            "suite": results.suite,
+            "title": results.title,
+            "lines": lines,
+            "table": means,
+            "failed": list(results.failed),
+            "missing": [{"dataset": d, "sequence": s, "row": row.slug} for d, s, row in results.missing],
+        },
+    )
+    for path, entries, head in zip(paths[1:], (lines, means), (LINE_COLUMNS, MEAN_COLUMNS), strict=True):
+        _write_text(path, _tidy_csv(entries, head))
+    return paths
+
+
+def tidy_lines(results: Results) -> list[dict[str, Any]]:
+    """One line per (suite, data set, sequence, network, method, setting, figure), with its value."""
+    return [
+        {
+            **{name: getattr(record, name) for name in LINE_COLUMNS[:5]},
+            "setting": dict(record.setting),
+            "figure": key,
+            "value": value,
+        }
+        for record in results.records
+        for key, value in _values(record)
+    ]
+
+
+def mean_lines(results: Results) -> list[dict[str, Any]]:
+    """Means over sequences with the half-width of their 95 % intervals; the data set "*" stands for all together."""
+    lines = []
+    for dataset in (*results.datasets, *((None,) if len(results.datasets) > 1 else ())):
+        for row in results.rows:
+            records = results.of(row, dataset)
+            for key in dict.fromkeys(key for record in records for key, _ in _values(record)):
+                mean = mean_over([value_of(record, key) for record in records])
+                lines.append(
+                    {
+                        "suite": records[0].suite,
+                        "dataset": dataset or "*",
+                        "network": records[0].network,
+                        "method": records[0].method,
+                        "setting": dict(records[0].setting),
+                        "figure": key,
+                        "mean": mean.value,
+                        "half_width": mean.half,
+                        "sequences": mean.sequences,
+                    }
+                )
+    return lines
+
+
+def _values(record: Record) -> Iterator[tuple[str, float | None]]:
+    """(figure, value) of all numbers of a record: figures, then counts of frames, state and times."""
+    yield from record.figures.items()
+    for name in ("frames", "state", "ms"):
+        group: Mapping[str, Any] = getattr(record, name)
+        yield from ((f"{name}.{key}", value) for key, value in group.items() if isinstance(value, int | float))
+
+
+def _tidy_csv(lines: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
+    """Lines with a column for each setting in place of "setting"; numbers in full, nothing for a missing value."""
+    settings = sorted({name for line in lines for name in line["setting"]})
+    columns = [c for name in columns for c in (settings if name == "setting" else [name])]
+    flat = [{**line["setting"], **{name: value for name, value in line.items() if name != "setting"}} for line in lines]
+    frame = pd.DataFrame({column: [_field(line.get(column)) for line in flat] for column in columns}, dtype=object)
+    return frame.to_csv(index=False, lineterminator="\n")
+
+
+def _field(value: Any) -> str:
+    plain = to_json(value)
+    return "" if plain is None else csv_text(plain) if isinstance(plain, str) else json.dumps(plain)
+
+
+def _write_text(path: Path, text: str) -> Path:
+    write_atomic(path, lambda file: file.write(text.encode()))
+    return path

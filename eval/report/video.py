@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.report.colours import ColourScale, colour_table, require_matplotlib
-from ufmstar_torch.eval.report.plots import Column, FramePanel, PanelScales, map_columns
+from ufmstar_torch.eval.report.panels import Column, FramePanel, PanelScales, map_columns
 
 GAP, HEAD, FOOT, BAR = 4, 22, 36, 8  # pixels
 PAPER, INK, FAINT = (255, 255, 255), (26, 26, 26), (107, 107, 107)
@@ -64,22 +63,17 @@ def preview_frame(
 
 
 def _draw_bar(canvas: Any, draw: Any, left: int, width: int, top: int, column: Column) -> None:
-    """Name above the cell; below it the colour bar with the values of its ends."""
+    """Name above the cell; below it the colour bar with the values of its ends, beyond which colours do not change."""
     from PIL import Image
 
     _text(draw, (left + width // 2, HEAD // 2), f"{column.label} [m]", INK, "mm")
     table = colour_table(column.scale.colour_map)
     strip = table[np.linspace(0, 255, width).astype(np.intp)][None]
     canvas.paste(Image.fromarray(strip).resize((width, BAR)), (left, top + 4))
-    low, high = _ends(column.scale)
-    _text(draw, (left + 1, top + BAR + 15), low, FAINT, "lm")
-    _text(draw, (left + width - 1, top + BAR + 15), high, FAINT, "rm")
-
-
-def _ends(scale: ColourScale) -> tuple[str, str]:
-    """The ends of a scale in words; beyond them the colour does not change."""
+    scale: ColourScale = column.scale
     low = "0" if scale.low == 0 else f"≤ {scale.low:.2g}"
-    return low, f"≥ {scale.high:.2g}"
+    _text(draw, (left + 1, top + BAR + 15), low, FAINT, "lm")
+    _text(draw, (left + width - 1, top + BAR + 15), f"≥ {scale.high:.2g}", FAINT, "rm")
 
 
 def _text(draw: Any, at: tuple[int, int], text: str, colour: tuple[int, int, int], anchor: str) -> None:
@@ -95,7 +89,7 @@ def _font(size: int) -> Any:
 
 
 class VideoWriter:
-    """Writes an H.264 mp4 frame by frame; a context manager.
+    """Writes an H.264 mp4 frame by frame with imageio; a context manager.
 
     The file appears under its name when the block ends, also when it ends by Ctrl-C or an error: it then
     holds the frames so far. Without a frame there is no file.
@@ -105,7 +99,7 @@ class VideoWriter:
         fps: frames per second.
 
     Raises:
-        ImportError: imageio-ffmpeg is missing; names the extra that brings it.
+        ImportError: imageio or imageio-ffmpeg is missing; names the extra that brings it.
         ValueError: another ending, or fps is not positive.
     """
 
@@ -115,10 +109,13 @@ class VideoWriter:
             raise ValueError(f"path must end in .mp4, got {self.path.name}")
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}")
-        _require_ffmpeg()
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'") from error
         self.fps = fps
-        self._size: tuple[int, int] | None = None
-        self._pipe: Generator[None, Any, None] | None = None
+        self._size: tuple[int, ...] = ()
+        self._writer: Any = None
         # ffmpeg goes by the ending, so it comes last here.
         self._temporary = self.path.with_name(f".{self.path.stem}.{os.getpid()}.tmp.mp4")
 
@@ -131,12 +128,25 @@ class VideoWriter:
         """
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or any(n % 2 for n in frame.shape[:2]):
             raise ValueError(f"frame must be uint8 [H, W, 3] of even size, got {frame.dtype} {frame.shape}")
-        size = (frame.shape[1], frame.shape[0])
-        if self._pipe is None:
-            self._pipe, self._size = self._open(size), size
-        if size != self._size:
-            raise ValueError(f"frame must have the size of the first, {self._size}, got {size}")
-        self._pipe.send(np.ascontiguousarray(frame))
+        if self._writer is None:
+            self._writer, self._size = self._open(), frame.shape
+        if frame.shape != self._size:
+            raise ValueError(f"frame must have the size of the first, {self._size[1::-1]}, got {frame.shape[1::-1]}")
+        self._writer.append_data(np.ascontiguousarray(frame))
+
+    def _open(self) -> Any:
+        import imageio.v2
+
+        return imageio.v2.get_writer(
+            self._temporary,
+            format="FFMPEG",
+            fps=self.fps,
+            codec="libx264",
+            pixelformat="yuv420p",  # what browsers and slide programs play
+            macro_block_size=2,
+            quality=7,
+            ffmpeg_log_level="error",
+        )
 
     def close(self) -> None:
         """Finish the file.
@@ -144,38 +154,21 @@ class VideoWriter:
         Raises:
             OSError: ffmpeg wrote no file.
         """
-        if self._pipe is None:
+        if self._writer is None:
             return
-        pipe, self._pipe = self._pipe, None
+        writer, self._writer = self._writer, None
         try:
-            pipe.close()
+            writer.close()
             if not self._temporary.is_file() or self._temporary.stat().st_size == 0:
                 raise OSError(f"ffmpeg wrote no video for {self.path}")
             os.replace(self._temporary, self.path)
         finally:
             self._temporary.unlink(missing_ok=True)
 
-    def _open(self, size: tuple[int, int]) -> Generator[None, Any, None]:
-        pipe: Generator[None, Any, None] = _require_ffmpeg().write_frames(
-            str(self._temporary),
-            size,
-            fps=self.fps,
-            codec="libx264",
-            pix_fmt_in="rgb24",
-            pix_fmt_out="yuv420p",  # what browsers and slide programs play
-            macro_block_size=2,
-            quality=7,
-            ffmpeg_log_level="error",
-        )
-        pipe.send(None)
-        return pipe
-
     def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -187,11 +180,3 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
             video.add(frame)
             count += 1
     return count
-
-
-def _require_ffmpeg() -> Any:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'") from error
-    return imageio_ffmpeg

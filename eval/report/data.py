@@ -1,24 +1,30 @@
-"""The folder of ``ufmstar eval``, read: records, sums over sequences, what failed and what is missing."""
+"""The results of ``ufmstar eval``: records, sums over the sequences of a data set, failed and missing sequences."""
 
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.report.sums import Merged, SumsError, merge_sums
+from ufmstar_torch.eval.metrics.packed_sums import unpack
 from ufmstar_torch.eval.results.record import Record
 
 FORMAT = 1
 FAILED = "failed.json"
-# What stands in ``Setting.to_dict()`` beside the overrides of the config.
-OWN = tuple(f.name for f in fields(Setting) if f.name != "overrides")
+METRICS, BY_ERROR = "metrics", "nll_by_error:"
+# The keys of ``Setting.to_dict()`` that are fields of Setting; all others are overrides of the config.
+SETTING_FIELDS = tuple(f.name for f in fields(Setting) if f.name != "overrides")
+Sums = dict[str, dict[str, Tensor]]
 
 
 class ResultsError(ValueError):
@@ -36,19 +42,34 @@ class Failed:
 
 
 @dataclass(frozen=True)
+class Merged:
+    """Several sequences evaluated as one, every pixel with the same weight.
+
+    Attributes:
+        figures: ``SequenceMetrics.compute()``.
+        curves: ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE", "error_by_error:REFERENCE".
+        sequences: their number.
+    """
+
+    figures: Mapping[str, float]
+    curves: Mapping[str, list[float]] = field(default_factory=dict)
+    sequences: int = 1
+
+
+@dataclass(frozen=True)
 class Results:
-    """What an evaluation has found so far.
+    """The results of an evaluation, finished or not.
 
     Attributes:
         out: its folder.
         about: ``eval.json``.
-        records: by data set, sequence and row (rows in the suite's order), so the same however it was shared out.
-        merged: figures and curves over all pixels of a data set's sequences, by (dataset, row); without those
-            of which the sums of a sequence are gone.
+        records: sorted by data set, sequence and row (in the suite's order), whichever process wrote them.
+        merged: figures and curves over all pixels of a data set, by (dataset, row); only where the sums of all
+            sequences exist.
         failed: sequences that could not be evaluated.
-        missing: (dataset, sequence, row) still to be evaluated.
+        missing: (dataset, sequence, row) not evaluated yet.
         efficiency: ``efficiency.json``, or None.
-        notes: what a reader should know about the folder.
+        notes: problems of the folder, a sentence each.
     """
 
     out: Path
@@ -62,25 +83,30 @@ class Results:
 
     @property
     def suite(self) -> str:
-        """Its name, as "paper-table-1"."""
+        """The suite's name, as "paper-table-1"."""
         return str(self.about["suite"])
 
     @property
     def title(self) -> str:
-        """For people."""
+        """The suite's title."""
         return str(self.about.get("title") or self.suite)
 
     @cached_property
     def rows(self) -> tuple[Row, ...]:
-        """Those of which there is a record, in the suite's order, then in the order of their names."""
-        there = {row_of(r) for r in self.records}
-        listed = [row for row in listed_rows(self.about) if row in there]
-        return (*listed, *sorted(there - set(listed), key=lambda row: row.slug))
+        """Rows with a record, in the suite's order, then by name."""
+        recorded = {row_of(record) for record in self.records}
+        listed = [row for row in listed_rows(self.about) if row in recorded]
+        return (*listed, *sorted(recorded - set(listed), key=lambda row: row.slug))
+
+    @cached_property
+    def bases(self) -> tuple[str, ...]:
+        """Bases (kinds of network) of the rows, in their order."""
+        return tuple(dict.fromkeys(row.method.base for row in self.rows))
 
     @cached_property
     def datasets(self) -> tuple[str, ...]:
         """Names, sorted."""
-        return tuple(sorted({r.dataset for r in self.records}))
+        return tuple(sorted({record.dataset for record in self.records}))
 
     def of(self, row: Row, dataset: str | None = None) -> tuple[Record, ...]:
         """The records of a row, of one data set or (None) of all, by data set and sequence."""
@@ -91,35 +117,35 @@ class Results:
         return tuple(sorted({(r.dataset, r.sequence) for r in self.records if dataset in (None, r.dataset)}))
 
     def network(self, base: str) -> str | None:
-        """The network behind the rows of a base, as shown; None without a record."""
+        """The label of the network of a base; None without a record."""
         return next((r.network for r in self.records if Method.parse(r.method).base == base), None)
 
     @cached_property
     def _by_row(self) -> dict[tuple[Row, str | None], tuple[Record, ...]]:
-        found: dict[tuple[Row, str | None], list[Record]] = {}
+        groups: dict[tuple[Row, str | None], list[Record]] = {}
         for record in self.records:
             for dataset in (record.dataset, None):
-                found.setdefault((row_of(record), dataset), []).append(record)
-        return {key: tuple(records) for key, records in found.items()}
+                groups.setdefault((row_of(record), dataset), []).append(record)
+        return {key: tuple(records) for key, records in groups.items()}
 
 
 def load_results(out: Path, *, with_sums: bool = True) -> Results:
-    """Read what ``ufmstar eval`` has left in a folder, finished or not.
+    """Read the folder of an evaluation, finished or not.
 
     Args:
         out: the folder.
-        with_sums: also add up the sums of the sequences of each data set, which figures need (some milliseconds
-            a record); otherwise ``merged`` is empty.
+        with_sums: also add the sums of the sequences of each data set, which figures need (some milliseconds a
+            record); otherwise ``merged`` is empty.
 
     Raises:
         ResultsError: the folder is no evaluation, holds no record, or records that do not belong together.
         OSError: a file cannot be read.
     """
     about = _about(out)
-    found = {path: _record(path) for path in sorted((out / "records").rglob("*.json")) if path.name != FAILED}
+    by_path = {path: _record(path) for path in sorted((out / "records").rglob("*.json")) if path.name != FAILED}
     order = {row: number for number, row in enumerate(listed_rows(about))}
-    paths = sorted(found, key=lambda path: _place(found[path], order))
-    records = [found[path] for path in paths]
+    paths = sorted(by_path, key=lambda path: _sort_key(by_path[path], order))
+    records = [by_path[path] for path in paths]
     _check(out, about, paths, records)
     failed = _failed(out)
     merged, notes = _merged(paths, records) if with_sums else ({}, [])
@@ -130,7 +156,7 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
         merged=merged,
         failed=failed,
         missing=_missing(about, records, failed),
-        efficiency=_optional(out / "efficiency.json"),
+        efficiency=_read_json(out / "efficiency.json"),
         notes=tuple(notes),
     )
 
@@ -142,8 +168,8 @@ def row_of(record: Record) -> Row:
 
 def setting_of(values: Mapping[str, Any]) -> Setting:
     """The inverse of ``Setting.to_dict()``."""
-    own = {name: values[name] for name in OWN if name in values}
-    return Setting(overrides={name: value for name, value in values.items() if name not in OWN}, **own)
+    own = {name: values[name] for name in SETTING_FIELDS if name in values}
+    return Setting(overrides={name: value for name, value in values.items() if name not in own}, **own)
 
 
 def listed_rows(about: Mapping[str, Any]) -> list[Row]:
@@ -156,7 +182,7 @@ def _about(out: Path) -> dict[str, Any]:
     path = out / "eval.json"
     if not path.is_file():
         raise ResultsError(f"{out} is no folder of `ufmstar eval`: it has no eval.json")
-    about = _optional(path)
+    about = _read_json(path)
     if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("suite"), str):
         raise ResultsError(f"{path} is not the description of an evaluation of format {FORMAT}")
     try:
@@ -166,7 +192,8 @@ def _about(out: Path) -> dict[str, Any]:
     return about
 
 
-def _optional(path: Path) -> Any:
+def _read_json(path: Path) -> Any:
+    """The content of a JSON file, None where there is no file."""
     if not path.is_file():
         return None
     try:
@@ -185,14 +212,13 @@ def _record(path: Path) -> Record:
     return record
 
 
-def _place(record: Record, order: Mapping[Row, int]) -> tuple[str, str, int, str]:
-    """The key by which records are sorted: nothing of it depends on who wrote them, or when."""
+def _sort_key(record: Record, order: Mapping[Row, int]) -> tuple[str, str, int, str]:
     row = row_of(record)
     return record.dataset, record.sequence, order.get(row, len(order)), row.slug
 
 
 def _check(out: Path, about: Mapping[str, Any], paths: Sequence[Path], records: Sequence[Record]) -> None:
-    """Raise ResultsError where the records are none, or not of one evaluation."""
+    """Raise ResultsError where there is no record, or records are not of one evaluation."""
     if not records:
         raise ResultsError(f"{out} holds no finished sequence yet (no record under {out / 'work'})")
     networks: dict[str, tuple[str, Path]] = {}
@@ -213,41 +239,87 @@ def _check(out: Path, about: Mapping[str, Any], paths: Sequence[Path], records: 
 
 
 def _failed(out: Path) -> tuple[Failed, ...]:
-    found = []
+    failed = []
     for path in sorted((out / "records").rglob(FAILED)):
-        values = _optional(path)
+        values = _read_json(path)
         if not isinstance(values, dict) or "reason" not in values:
             raise ResultsError(f"{path} does not say why a sequence failed")
         dataset = str(values.get("dataset") or path.parent.parent.name)
         sequence = str(values.get("sequence") or path.parent.name)
-        found.append(Failed(dataset, sequence, str(values["reason"]), tuple(map(str, values.get("rows", ())))))
-    return tuple(sorted(found, key=lambda f: (f.dataset, f.sequence)))
+        failed.append(Failed(dataset, sequence, str(values["reason"]), tuple(map(str, values.get("rows", ())))))
+    return tuple(sorted(failed, key=lambda f: (f.dataset, f.sequence)))
 
 
 def _missing(
     about: Mapping[str, Any], records: Iterable[Record], failed: Iterable[Failed]
 ) -> tuple[tuple[str, str, Row], ...]:
-    """What ``eval.json`` promises, less what is there and what has failed."""
-    there = {(r.dataset, r.sequence, row_of(r)) for r in records}
+    """What ``eval.json`` lists, without records and failed sequences."""
+    done = {(r.dataset, r.sequence, row_of(r)) for r in records}
     broken = {(f.dataset, f.sequence) for f in failed}
     wanted = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
     rows = listed_rows(about)
-    return tuple((*s, row) for s in wanted if s not in broken for row in rows if (*s, row) not in there)
+    return tuple((*s, row) for s in wanted if s not in broken for row in rows if (*s, row) not in done)
+
+
+# ---- sums over sequences ----
 
 
 def _merged(paths: Sequence[Path], records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
-    """Sums of each (dataset, row), added in the order of the sequences; and what could not be added."""
+    """Sums of each (dataset, row), added in the order of the sequences; a note where a file is missing."""
     groups: dict[tuple[str, Row], list[Path]] = {}
     for path, record in zip(paths, records, strict=True):
         groups.setdefault((record.dataset, row_of(record)), []).append(path.with_suffix(".pt"))
     merged, notes = {}, []
-    for (dataset, row), sums in groups.items():
-        gone = [path for path in sums if not path.is_file()]
+    for (dataset, row), files in groups.items():
+        gone = [path for path in files if not path.is_file()]
         if gone:
             notes.append(f"{dataset}, {row.label}: no curve over all sequences, {gone[0]} is not there")
-            continue
-        try:
-            merged[dataset, row] = merge_sums(sums)
-        except SumsError as error:
-            raise ResultsError(str(error)) from error
+        else:
+            merged[dataset, row] = _merge_sums(files)
     return merged, notes
+
+
+def _merge_sums(paths: Sequence[Path]) -> Merged:
+    """Add sums in the order given, which decides the last bits, and compute figures and curves from them."""
+    total: Sums = {}
+    for path in paths:
+        for name, states in _read_sums(path).items():
+            mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
+            if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
+                raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
+            for key, value in states.items():
+                mine[key] = mine[key] + value
+    return _compute(total, paths)
+
+
+def _read_sums(path: Path) -> Sums:
+    """``RowResult.sums`` of one row on one sequence."""
+    try:
+        sums = torch.load(path, map_location="cpu", weights_only=True)
+    except (EOFError, KeyError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+        raise ResultsError(f"{path} does not hold the sums of metrics: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(sums, dict) or METRICS not in sums or not all(isinstance(s, Mapping) for s in sums.values()):
+        raise ResultsError(f"{path} does not hold the sums of metrics by name")
+    return {name: {key: unpack(value) for key, value in states.items()} for name, states in sums.items()}
+
+
+def _compute(total: Sums, paths: Sequence[Path]) -> Merged:
+    """Figures and curves of summed states."""
+    from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
+
+    states = total[METRICS]
+    kinds = {key.split(".")[1] for key in states if key.startswith("metrics.")}
+    metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds)
+    by_error = {name: NLLByError() for name in total if name.startswith(BY_ERROR)}
+    try:
+        metrics.load_state_dict(dict(states))
+        for name, metric in by_error.items():
+            metric.load_state_dict(dict(total[name]))
+    except RuntimeError as error:
+        text = " ".join(str(error).split())[:200]
+        raise ResultsError(f"{paths[0]} holds sums of other metrics: {text}") from error
+    curves = metrics.curves()
+    for name, metric in by_error.items():
+        reference = name.removeprefix(BY_ERROR)
+        curves |= {f"{curve}:{reference}": value.tolist() for curve, value in metric.compute().items()}
+    return Merged(metrics.compute(), curves, len(paths))

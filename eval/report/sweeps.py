@@ -12,8 +12,8 @@ from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, default_of
-from ufmstar_torch.eval.report.aggregate import Mean, mean_over, value_of
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.means import Mean, mean_over, value_of
 from ufmstar_torch.eval.report.names import Quantity, setting_label
 
 COUNT = "anchor_count"
@@ -63,9 +63,9 @@ class Line:
 
 def sweeps(results: Results) -> list[tuple[str, str]]:
     """(base, setting) of every setting of which some line has at least three numbers, the default among them or not."""
-    found = dict.fromkeys((row.method.base, name) for row in results.rows for name in _changed(row))
+    varied = dict.fromkeys((row.method.base, name) for row in results.rows for name in _changed(row))
     return [
-        (base, name) for base, name in found if any(len(line.points) >= 3 for line in sweep_lines(results, base, name))
+        (base, name) for base, name in varied if any(len(line.points) >= 3 for line in sweep_lines(results, base, name))
     ]
 
 
@@ -144,9 +144,9 @@ def _changed(row: Row) -> Sequence[str]:
 
 def _by_sequence(results: Results, point: Point, quantity: Quantity) -> Mapping[tuple[str, str], float]:
     """The figure of each sequence, the mean over the point's rows (the seeds of a noise)."""
-    found: dict[tuple[str, str], list[float]] = {}
+    by_sequence: dict[tuple[str, str], list[float]] = {}
     for row in point.rows:
         for record in results.of(row):
             value = quantity.factor * value_of(record, quantity.key)
-            found.setdefault((record.dataset, record.sequence), []).append(value)
-    return {where: math.fsum(values) / len(values) for where, values in found.items()}
+            by_sequence.setdefault((record.dataset, record.sequence), []).append(value)
+    return {where: math.fsum(values) / len(values) for where, values in by_sequence.items()}

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ufmstar_torch.eval.report.colours import ERROR_MAP, ColourScale, robust_range
@@ -62,7 +64,11 @@ def write_mixture_ply(
     _fill(table, ("f_dc_0", "f_dc_1", "f_dc_2"), (parts.colour / 255 - 0.5) / SH_DC)
     table["opacity"] = np.log(OPACITY / (1 - OPACITY))
     _fill(table, ("scale_0", "scale_1", "scale_2"), np.log(parts.sigma))
-    _fill(table, ("rot_0", "rot_1", "rot_2", "rot_3"), quaternion(parts.axes))
+    _fill(
+        table,
+        ("rot_0", "rot_1", "rot_2", "rot_3"),
+        Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True),
+    )
     for name in ("weight", "disagreement", "count"):
         table[name] = getattr(parts, name)
     _write_ply(Path(path), {"vertex": table}, [parts.legend])
@@ -152,57 +158,24 @@ def read_mixture_npz(path: str | Path) -> tuple[GaussianMixture, Tensor | None]:
     return GaussianMixture(**fields), T_world_first
 
 
-def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[K, 4] unit quaternions w x y z, w >= 0, of the rotations R [K, 3, 3].
-
-    Of the four forms of the same quaternion, each scaled by another of its entries, the one with the
-    largest entry is taken: it never divides by something small.
-    """
-    m = {(i, j): R[:, i, j] for i in range(3) for j in range(3)}
-    xx, yy, zz = m[0, 0], m[1, 1], m[2, 2]
-    wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    forms = np.stack(  # row a: 4 q_a (w, x, y, z)
-        [
-            np.stack([1 + xx + yy + zz, wx, wy, wz], -1),
-            np.stack([wx, 1 + xx - yy - zz, xy, xz], -1),
-            np.stack([wy, xy, 1 - xx + yy - zz, yz], -1),
-            np.stack([wz, xz, yz, 1 - xx - yy + zz], -1),
-        ],
-        axis=1,
-    )
-    best = np.argmax(np.diagonal(forms, axis1=1, axis2=2), axis=1)
-    q = forms[np.arange(len(R)), best]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[:, :1] < 0, -q, q)
-
-
 def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Unit vectors [10 4^s + 2, 3] and outward triangles [20 4^s, 3] of a divided icosahedron."""
+    """Unit vectors [10 4^s + 2, 3] and outward triangles [20 4^s, 3] of a divided icosahedron.
+
+    All vertices lie on the sphere, so the triangles are those of their convex hull; dividing adds the hull's edges'
+    middles as vertices.
+    """
     g = (1 + 5**0.5) / 2
     base = [(0, a, b * g) for a in (-1, 1) for b in (-1, 1)]
     vertices = np.array([np.roll(v, shift) for shift in range(3) for v in base]) / np.hypot(1, g)
-    # Faces of the icosahedron: the triples at edge length.
-    near = np.linalg.norm(vertices[:, None] - vertices, axis=-1) < 1.1
-    triples = [(a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] & near[b, c] & near[a, c]]
-    faces = np.array(triples)
-    inward = np.linalg.det(vertices[faces]) < 0
-    faces[inward] = faces[inward][:, ::-1]
     for _ in range(subdivisions):
-        vertices, faces = _divide(vertices, faces)
-    return vertices, faces
-
-
-def _divide(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Every triangle into four, the new vertices on the sphere and shared by neighbours."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    unique, index = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
-    middle = vertices[unique].sum(1)
-    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
-    a, b, c = faces.T
-    ab, bc, ca = index.reshape(3, -1) + len(vertices)
-    corners = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
-    return np.concatenate([vertices, middle]), np.concatenate([np.stack(t, -1) for t in corners])
+        triangles = ConvexHull(vertices).simplices
+        edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+        middle = vertices[edges].sum(1)
+        vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=-1, keepdims=True)])
+    triangles = ConvexHull(vertices).simplices.astype(np.int64)
+    inward = np.linalg.det(vertices[triangles]) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return vertices, triangles
 
 
 class _Components:

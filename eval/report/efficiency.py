@@ -1,23 +1,24 @@
 """The paper's table of efficiency: what uncertainty adds, in time, power, energy and memory; one per architecture.
 
-A part that was not measured has the words in its cell, never a number: "not measurable here" without a sensor, "not
+A part that was not measured has words in its cell, never a number: "not measurable here" without a sensor, "not
 separable" where a network predicts depth and variance in one. A difference that the noise hides is an upper bound.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from ufmstar_torch.eval.bench.lines import NETWORK
-from ufmstar_torch.eval.bench.memory import MEGABYTE
-from ufmstar_torch.eval.bench.power import CPU, GPU, NOT_MEASURABLE
-from ufmstar_torch.eval.bench.race import DEPTH, MULTIVIEW, PROCESSOR, WALL
-from ufmstar_torch.eval.report.latex import latex
-from ufmstar_torch.eval.report.markdown import markdown
-from ufmstar_torch.eval.report.table import Cell, Column, Line, Table
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.report.paper import PaperTable, paper_tables
+from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, latex, markdown
 
+# Keys and words of ``efficiency.json``, as eval/bench writes them.
+DEPTH, NETWORK, MULTIVIEW = "depth", "network_uncertainty", "multiview"
+WALL, PROCESSOR = "wall", "processor"
+CPU, GPU = "cpu", "gpu"
+NOT_MEASURABLE = "not measurable here"
 NOT_SEPARABLE = "not separable"
 UNITS = {GPU: "GPU", CPU: "CPU"}
 _SMALLEST = 0.01  # less prints as "<0.01"
@@ -50,37 +51,54 @@ def efficiency_tables(
     ]
 
 
+def paper_efficiency_tables(networks: Iterable[str]) -> list[Table]:
+    """The paper's table 2 for each of its networks that is among ``networks`` (labels), for all if none is."""
+    labels = [label.lower() for label in networks]
+    quoted = [table for table in paper_tables() if table.number == 2]
+    known = [table for table in quoted if any(table.network.lower() in label for label in labels)]
+    return [_paper_table(table) for table in known or quoted]
+
+
 def _table(run: Mapping[str, Any], label: str, relative: bool, kind: str) -> Table:
     rows = [row for row in run["rows"] if row["network"] == label]
-    bases = dict.fromkeys(row["base"] for row in rows)
+    bases = list(dict.fromkeys(row["base"] for row in rows))  # a block per base, as in the paper
     units = run["devices"]["units"]
     clock = _clock(units) if relative else None
-    blocks = [
-        tuple(_line(row, units, clock, kind) for row in rows if row["base"] == base) for base in bases
-    ]  # a block per base, as in the paper
-    network = run["networks"][next(iter(bases))]
-    slug = "".join(c if c.isalnum() else "-" for c in label.lower())
-    return Table(
-        f"efficiency-{slug}",
+    lines = [_line(row, block, units, clock, kind) for block, b in enumerate(bases) for row in rows if row["base"] == b]
+    network = run["networks"][bases[0]]
+    return Table.of(
+        f"efficiency-{''.join(c if c.isalnum() else '-' for c in label.lower())}",
         f"Efficiency of uncertainty, {label}",
         "Method",
         _columns(relative),
-        tuple(blocks),
+        lines,
         (_about_depth(network, units[DEPTH], relative), *_notes(run, rows, relative, kind)),
     )
 
 
-def _columns(relative: bool) -> tuple[Column, ...]:
+def _paper_table(quoted: PaperTable) -> Table:
+    """The paper's table 2 of one network, column below column of ours."""
+    bases = list(dict.fromkeys(Method.parse(method).base for method in quoted.rows))
+    lines = []
+    for method, cells in quoted.rows.items():
+        found = tuple(cells.get(column, Cell()) for column in quoted.columns)
+        lines.append(Line(bases.index(Method.parse(method).base), method, method.startswith("UfM*"), found))
+    alone = f"Depth alone: {quoted.alone['latency_ms']} ms, {quoted.alone['memory_mb']} MB."
+    notes = (alone, f"Measured by the paper on {quoted.measured_on}.")
+    title = f"The paper's table 2, {quoted.network}"
+    return Table.of(f"paper-efficiency-{quoted.network}", title, "Method", _columns(False), lines, notes)
+
+
+def _columns(relative: bool) -> list[Column]:
     time = ("Latency [× depth]", r"Latency [$\times$ depth]") if relative else ("Latency [ms]",) * 2
-    power, energy = ("Power [W]",) * 2, ("Energy [mJ]",) * 2
-    units = [Column(f"{unit} {name}", tex, unit) for unit in UNITS.values() for name, tex in (time, power, energy)]
-    return (
-        *units,
-        Column("Energy overhead [%]", r"Energy overhead [\%]"),
-        Column("DNN unc. mem. [MB]", "DNN unc. [MB]", "Memory"),
-        Column("MVD mem. [MB]", "MVD [MB]", "Memory"),
-        Column("Mem. overhead [%]", r"Overhead [\%]", "Memory"),
-    )
+    per_unit = (time, ("Power [W]",) * 2, ("Energy [mJ]",) * 2)
+    return [
+        *(Column(unit, f"{unit} {name}", tex) for unit in UNITS.values() for name, tex in per_unit),
+        Column("", "Energy overhead [%]", r"Energy overhead [\%]"),
+        Column("Memory", "DNN unc. mem. [MB]", "DNN unc. [MB]"),
+        Column("Memory", "MVD mem. [MB]", "MVD [MB]"),
+        Column("Memory", "Mem. overhead [%]", r"Overhead [\%]"),
+    ]
 
 
 def _clock(units: Mapping[str, str]) -> str:
@@ -88,12 +106,12 @@ def _clock(units: Mapping[str, str]) -> str:
     return PROCESSOR if set(units.values()) == {CPU} else WALL
 
 
-def _line(row: Mapping[str, Any], units: Mapping[str, str], clock: str | None, kind: str) -> Line:
+def _line(row: Mapping[str, Any], block: int, units: Mapping[str, str], clock: str | None, kind: str) -> Line:
     cells: list[str] = []
     for unit in UNITS:
         parts = [part for part in (NETWORK, MULTIVIEW) if _counts(row, part) and units[part] == unit]
         cells += [_latency(row, parts, clock), *_power_and_energy(row, parts, kind)]
-    return Line(row["row"], tuple(map(Cell, (*cells, _energy_overhead(row, kind), *_memory(row)))))
+    return Line(block, row["row"], False, tuple(map(Cell, (*cells, _energy_overhead(row, kind), *_memory(row)))))
 
 
 def _counts(row: Mapping[str, Any], part: str) -> bool:
@@ -119,9 +137,9 @@ def _latency(row: Mapping[str, Any], parts: Sequence[str], clock: str | None) ->
 
 def _spread(row: Mapping[str, Any], part: str, clock: str | None) -> tuple[float, float, float]:
     """Lower quartile, median and upper quartile, in ms or as multiples of depth by a clock."""
-    told = row["latency"][part] if clock is None else row["ratios_to_depth"][part][clock]
+    times = row["latency"][part] if clock is None else row["ratios_to_depth"][part][clock]
     names = ("q1_ms", "median_ms", "q3_ms") if clock is None else ("q1", "median", "q3")
-    low, middle, high = (told[name] for name in names)
+    low, middle, high = (times[name] for name in names)
     return low, middle, high
 
 
@@ -129,22 +147,22 @@ def _power_and_energy(row: Mapping[str, Any], parts: Sequence[str], kind: str) -
     """Of the parts on one unit: watts while they run, and millijoules per frame."""
     if not parts:
         return "", ""
-    told = [row["energy"][part] for part in parts]
-    if any("not_separable" in one for one in told):
+    spent = [row["energy"][part] for part in parts]
+    if any("not_separable" in one for one in spent):
         return NOT_SEPARABLE, NOT_SEPARABLE
-    if any("not_measurable" in one for one in told):
+    if any("not_measurable" in one for one in spent):
         return NOT_MEASURABLE, NOT_MEASURABLE
-    if len(told) == 1 and told[0][kind]["q1"] <= 0:
-        return "", f"<{_digits(max(told[0][kind]['q3'], _SMALLEST), 1)}"
-    energy = sum(max(0.0, one[kind]["millijoules"]) for one in told)
-    seconds = sum(one[kind]["seconds"] for one in told)
+    if len(spent) == 1 and spent[0][kind]["q1"] <= 0:
+        return "", f"<{_digits(max(spent[0][kind]['q3'], _SMALLEST), 1)}"
+    energy = sum(max(0.0, one[kind]["millijoules"]) for one in spent)
+    seconds = sum(one[kind]["seconds"] for one in spent)
     return _digits(1e-3 * energy / seconds, 1) if seconds > 0 else "", _digits(energy, 1)
 
 
 def _energy_overhead(row: Mapping[str, Any], kind: str) -> str:
-    told = row["energy_overhead_percent"]
-    if told is not None and kind in told:
-        return _percent(told[kind])
+    overhead = row["energy_overhead_percent"]
+    if overhead is not None and kind in overhead:
+        return _percent(overhead[kind])
     if any("not_separable" in part for part in row["energy"].values()):
         return NOT_SEPARABLE
     return NOT_MEASURABLE
@@ -163,7 +181,7 @@ def _memory(row: Mapping[str, Any]) -> tuple[str, str, str]:
 
 def megabytes(count: float) -> str:
     """Bytes as megabytes (10^6), as the paper prints them: 1245, 74.6, 0.03, <0.01."""
-    value = count / MEGABYTE
+    value = count / 1e6
     if 0 < value < _SMALLEST:
         return "<0.01"
     return f"{value:.{0 if value >= 1000 or value == 0 else 1 if value >= 1 else 2}f}"

@@ -1,4 +1,4 @@
-"""The frames that an evaluation kept to look at: image, ground truth, and what every row said of it."""
+"""The example frames that an evaluation keeps: image, ground truth, and the maps of every row."""
 
 from __future__ import annotations
 
@@ -119,11 +119,11 @@ def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list
     stems = {file.stem: file for file in files}
     # A frame's name may hold an "@", as a setting's does: a row's file is one whose frame has a file of its own.
     owner = {stem: _frame_of(stem, stems) for stem in stems}
-    found = []
+    examples = []
     for frame in sorted(stem for stem, of in owner.items() if of is None):
         of_frame = {stem[len(frame) + 1 :]: stems[stem] for stem, of in owner.items() if of == frame}
-        found += _load(folder, frame, stems[frame], of_frame, labels or {})
-    return found
+        examples += _load(folder, frame, stems[frame], of_frame, labels or {})
+    return examples
 
 
 def load_arrays(file: Path) -> dict[str, NDArray]:
@@ -167,11 +167,11 @@ def _load(
             camera = scene["K"].astype(np.float64).tobytes() + repr(scene["truth"].shape).encode()
             scenes.setdefault(camera, scene)
             rows.setdefault(camera, {})[row] = RowMaps(**maps)
-    found = []
+    examples = []
     for camera, of_camera in rows.items():
         image, truth, K = (scenes[camera][name] for name in _SCENE)
-        found.append(Example(folder.parent.name, folder.name, frame, image, truth, K, of_camera, labels))
-    return found
+        examples.append(Example(folder.parent.name, folder.name, frame, image, truth, K, of_camera, labels))
+    return examples
 
 
 def _require(file: Path, stored: Mapping[str, NDArray], names: tuple[str, ...]) -> None:

@@ -1,17 +1,21 @@
-"""Means and paired differences over sequences, with their confidence intervals."""
+"""Means and paired differences over sequences, with 95 % confidence intervals where there are enough sequences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
-from ufmstar_torch.eval.report.load import Results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import LOWER, Quantity
 from ufmstar_torch.eval.results.record import Record
+
+# With fewer sequences there is neither an interval nor a verdict: Student's interval of two to four values claims a
+# normal distribution that nobody has checked.
+MIN_SEQUENCES = 5
 
 
 @dataclass(frozen=True)
@@ -20,8 +24,8 @@ class Mean:
 
     Attributes:
         value: NaN without a sequence.
-        half: half-width of its 95 % confidence interval, NaN for fewer than two sequences.
-        sequences: how many had the figure.
+        half: half-width of its 95 % confidence interval, NaN for fewer than ``MIN_SEQUENCES`` sequences.
+        sequences: number of sequences that have the figure.
     """
 
     value: float
@@ -32,6 +36,11 @@ class Mean:
     def beyond(self) -> bool:
         """Whether 0 lies outside the interval; False where there is no interval."""
         return abs(self.value) > self.half
+
+    @property
+    def decidable(self) -> bool:
+        """Whether there are enough sequences for an interval."""
+        return self.sequences >= MIN_SEQUENCES
 
 
 def value_of(record: Record, key: str) -> float:
@@ -50,7 +59,8 @@ def mean_over(values: Sequence[float]) -> Mean:
     from ufmstar_torch.eval.metrics import mean_and_ci
 
     kept = [value for value in values if not math.isnan(value)]
-    return Mean(*mean_and_ci(kept), len(kept))
+    mean, half = mean_and_ci(kept)
+    return Mean(mean, half if len(kept) >= MIN_SEQUENCES else math.nan, len(kept))
 
 
 def mean_of(records: Sequence[Record], quantity: Quantity) -> Mean:
@@ -59,7 +69,7 @@ def mean_of(records: Sequence[Record], quantity: Quantity) -> Mean:
 
 
 def difference(results: Results, row: Row, reference: Row, quantity: Quantity, dataset: str | None = None) -> Mean:
-    """Mean of row - reference over the sequences that have both.
+    """Mean of row - reference over the sequences that both have.
 
     Sequences differ far more than methods do, and that part cancels in each difference.
     """
@@ -75,11 +85,11 @@ def better(mean: Mean, quantity: Quantity) -> bool | None:
     return (mean.value < 0) == (quantity.better == LOWER)
 
 
-def references(results: Results, row: Row) -> Iterator[Row]:
-    """The rows beside which a row is to be judged, of those that are there and have a variance.
+def references(results: Results, row: Row) -> list[Row]:
+    """The rows with a variance with which a row is compared.
 
-    The base alone on the same images; UfM of the same base, pruned rather than not, for rows of UfM*; UfM* as it is
-    for its variants; and the default for a row of an ablation.
+    The base alone on the same images; UfM of the same base, pruned rather than not, for rows of UfM*; plain UfM* for
+    its variants; and the default for a row of an ablation.
     """
     method, base = row.method, row.method.base
     same_images = Setting(skip=row.setting.skip)
@@ -95,9 +105,9 @@ def references(results: Results, row: Row) -> Iterator[Row]:
             wanted += [r for r in plain if not (r.method.full or r.method.fixed_param)]
     if row.setting != DEFAULT:
         wanted += [r for r in mine if r.method == method and r.setting == DEFAULT]
-    return (r for r in wanted if has_variance(results, r))
+    return [r for r in wanted if has_variance(results, r)]
 
 
 def has_variance(results: Results, row: Row) -> bool:
-    """Whether a row says how far it may be trusted: a network of depth alone does not."""
+    """Whether a row has a variance: a network of depth alone has none."""
     return any(not math.isnan(value_of(record, "ece_delta")) for record in results.of(row))

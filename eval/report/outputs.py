@@ -1,12 +1,12 @@
-"""What a run leaves to look at: contact sheet, preview video, and the mixture for viewers.
+"""What a run and the demo leave to look at: contact sheet, preview video, curves, and the mixture for viewers.
 
-The pictures are drawn from the finished frames on disk, so that their scales fit the whole run, and a run
-that was stopped and continued gets the same ones.
+A run's pictures are drawn from its finished frames on disk, so that their scales fit the whole run, and a run that was
+stopped and continued gets the same ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
+from ufmstar_torch.eval.engine.stream import FrameResult
+from ufmstar_torch.eval.methods.method import UFM_STAR
+from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import INVALID_GREY
-from ufmstar_torch.eval.report.plots import FramePanel, PanelScales, contact_sheet, fit_scales
+from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
+from ufmstar_torch.eval.report.panels import FramePanel, PanelScales, contact_sheet, fit_scales
 from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
+from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.writers import read_frame
-from ufmstar_torch.eval.sequences import FrameSequence
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Size
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
 from ufmstar_torch.ufmstar import UfMStar
 
+# Rows of the demo beside UfM and UfM*: the member in turn alone, and all members on every image.
+NETWORK, ENSEMBLE = "network", "ensemble"
+SHEET, CURVES, PLY, ELLIPSOIDS, NPZ = (
+    "contact_sheet.png",
+    "calibration.png",
+    "mixture.ply",
+    "ellipsoids.ply",
+    "mixture.npz",
+)
+DEMO_FILES = (SHEET, CURVES, PLY, ELLIPSOIDS, NPZ, "curves.json")
 SHEET_ROWS, SCALE_FRAMES = 6, 12
 # Without timestamps; and the range in which a recording's own rate is kept.
 DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
@@ -67,6 +80,10 @@ class Finished:
             image = np.full((*size_square, 3), INVALID_GREY, np.uint8)
         return FramePanel(name=record["name"], image=image, note=note, **shown)
 
+    def spread(self, count: int) -> list[int]:
+        """Numbers of at most ``count`` frames spread over the run, the first and the last included."""
+        return sorted(set(np.linspace(0, len(self.records) - 1, count).round().astype(int).tolist()))
+
     def fps(self) -> float:
         """Frames per second of the recording, for the video."""
         times = [self.frames.entries[record["index"]].timestamp for record in self.records]
@@ -83,14 +100,14 @@ class Finished:
             return None
 
 
-def draw_sheet(finished: Finished, scales: PanelScales, title: str) -> None:
+def draw_sheet(finished: Finished, scales: PanelScales, title: str, rows: int = SHEET_ROWS) -> None:
     """Write contact_sheet.png: frames spread over the run, the last one included.
 
-    The first is not: nothing has been compared by then, so its disagreement is 0.
+    The first is not, unless it is the only one: it was compared with nothing, so its disagreement is 0.
     """
-    count = len(finished.records)
-    rows = sorted(set(np.linspace(0, count - 1, SHEET_ROWS + 1).round().astype(int)[1:].tolist()))
-    contact_sheet([finished.panel(n) for n in rows], finished.out / "contact_sheet.png", title=title, scales=scales)
+    numbers = finished.spread(rows + 1)
+    panels = [finished.panel(number) for number in numbers[1:] or numbers]
+    contact_sheet(panels, finished.out / SHEET, title=title, scales=scales)
 
 
 def draw_video(finished: Finished, scales: PanelScales) -> Iterator[int]:
@@ -103,15 +120,23 @@ def draw_video(finished: Finished, scales: PanelScales) -> Iterator[int]:
 
 def common_scales(finished: Finished) -> PanelScales:
     """Colour scales for sheet and video, from frames spread over the whole run."""
-    chosen = sorted(set(np.linspace(0, len(finished.records) - 1, SCALE_FRAMES).round().astype(int).tolist()))
-    return fit_scales([finished.panel(number) for number in chosen])
+    return fit_scales([finished.panel(number) for number in finished.spread(SCALE_FRAMES)])
+
+
+def mixture_writers(ufm: UfMStar) -> dict[str, Callable[[Path], object]]:
+    """By file name, what writes the mixture in world coordinates: as splats, as ellipsoids, and exactly."""
+    mixture, first = ufm.mixture, ufm.T_world_first
+    return {
+        PLY: lambda path: write_mixture_ply(path, mixture, T_world_first=first),
+        ELLIPSOIDS: lambda path: write_ellipsoids_ply(path, mixture, T_world_first=first),
+        NPZ: lambda path: write_mixture_npz(path, mixture, T_world_first=first),
+    }
 
 
 def write_mixture(out: Path, ufm: UfMStar) -> None:
-    """Write the mixture in world coordinates as splats and ellipsoids, and exactly as npz."""
-    write_mixture_ply(out / "mixture.ply", ufm.mixture, T_world_first=ufm.T_world_first)
-    write_ellipsoids_ply(out / "ellipsoids.ply", ufm.mixture, T_world_first=ufm.T_world_first)
-    write_mixture_npz(out / "mixture.npz", ufm.mixture, T_world_first=ufm.T_world_first)
+    """Write all files of ``mixture_writers`` into a folder."""
+    for name, write in mixture_writers(ufm).items():
+        write(out / name)
 
 
 def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
@@ -133,3 +158,74 @@ def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: 
     height, width = image.shape[:2]
     part = image[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
     return part if part.size else image
+
+
+# ---- the demo ----
+
+
+def panel(name: str, note: str, result: FrameResult) -> FramePanel:
+    """One row of the demo's sheet: the network's depth, its own sigma, that of UfM*, and the true error.
+
+    Args:
+        name: of the frame.
+        note: the kind of room.
+        result: the frame through the demo's rows, with an image and ground truth.
+    """
+    own, star, truth = result.rows[NETWORK].estimate, result.rows[UFM_STAR].estimate, result.rows[UFM_STAR].truth
+    assert result.frame is not None
+    assert result.frame.image is not None
+    assert truth is not None
+    assert star.variance is not None
+    assert own.variance is not None
+    depth = star.depth.float().numpy()
+    return FramePanel(
+        name=name,
+        note=note,
+        image=result.frame.image,
+        depth=depth,
+        sigma=star.variance.float().sqrt().numpy(),
+        own_sigma=own.variance.float().sqrt().numpy(),
+        error=np.where(truth > 0, np.abs(depth - truth), np.nan).astype(np.float32),
+        valid=star.valid.numpy(),
+    )
+
+
+def write_pictures(
+    out: Path,
+    panels: Sequence[FramePanel],
+    metrics: Mapping[str, SequenceMetrics],
+    ufm_star: UfMStar,
+    title: str,
+) -> dict[str, str | None]:
+    """Write all of :data:`DEMO_FILES`.
+
+    Args:
+        out: an existing folder.
+        panels: rows of the contact sheet.
+        metrics: by the name that the legend shows.
+        ufm_star: at the end of the tour.
+        title: of the pictures.
+
+    Returns:
+        By file: None if it was written, else why not (an optional package is missing).
+
+    Raises:
+        OSError: a full disk, say.
+    """
+    from ufmstar_torch.eval.report.figures import write_curves
+
+    curves = {name: values.curves() for name, values in metrics.items()}
+    todo: dict[str, Callable[[Path], object]] = {
+        SHEET: lambda path: contact_sheet(panels, path, title=title),
+        CURVES: lambda path: write_curves(path, curves, title=title),
+        **mixture_writers(ufm_star),
+        "curves.json": lambda path: write_json_atomic(path, curves),
+    }
+    made: dict[str, str | None] = {}
+    for name, write in todo.items():
+        try:
+            write(out / name)
+            made[name] = None
+        except ImportError as error:  # the demo's figures need no pictures
+            made[name] = str(error)
+    return made

@@ -1,4 +1,4 @@
-"""How all figures of a report look: one colour and mark per kind of method, words at the lines, no global state."""
+"""How figures look: one colour and mark per kind of method, names at the ends of lines, no global state."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
-from ufmstar_torch.eval.report.colours import require_matplotlib
-from ufmstar_torch.eval.report.plots import FAINT, INK
+from ufmstar_torch.eval.report.colours import FAINT, INK, plain, require_matplotlib
 from ufmstar_torch.eval.results.files import write_atomic
 
 GRID = "#e6e6e6"
@@ -72,15 +71,15 @@ def new_figure(width: float, height: float, title: str) -> Any:
 
     layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white", layout=layout)
-    figure.suptitle(title, size=TITLE, weight="bold", color=INK, x=0.012, ha="left")
+    figure.suptitle(plain(title), size=TITLE, weight="bold", color=INK, x=0.012, ha="left")
     return figure
 
 
 def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
     """Words, a faint grid behind, no box."""
-    axes.set_title(title, size=LABEL + 0.5, color=INK, loc="left")
-    axes.set_xlabel(x, size=LABEL, color=INK)
-    axes.set_ylabel(y, size=LABEL, color=INK)
+    axes.set_title(plain(title), size=LABEL + 0.5, color=INK, loc="left")
+    axes.set_xlabel(plain(x), size=LABEL, color=INK)
+    axes.set_ylabel(plain(y), size=LABEL, color=INK)
     axes.tick_params(labelsize=TICK, color=FAINT, labelcolor=INK)
     axes.grid(color=GRID, linewidth=0.6)
     axes.set_axisbelow(True)
@@ -93,7 +92,7 @@ def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
 def spread_apart(places: Sequence[float], gap: float, low: float, high: float) -> list[float]:
     """Places at least ``gap`` apart within [low, high] in the same order, each as near to its own as can be.
 
-    Neighbours that are too close form a group about the mean of what they want; groups that touch are joined.
+    Neighbours that are too close form a group about the mean of their places; groups that touch are joined.
     Where they do not fit, the gap is smaller.
     """
     if not places:
@@ -103,22 +102,15 @@ def spread_apart(places: Sequence[float], gap: float, low: float, high: float) -
     groups: list[list[float]] = []  # [number of members, mean of (wanted - offset within the group)]
     for i in order:
         groups.append([1, places[i]])
-        while len(groups) > 1 and _first(groups[-2]) + groups[-2][0] * gap > _first(groups[-1]):
+        while len(groups) > 1 and groups[-2][1] + groups[-2][0] * gap > groups[-1][1]:
             n, start = groups.pop()
             m, before = groups.pop()
             groups.append([m + n, (m * before + n * (start - m * gap)) / (m + n)])
-    found = [start + k * gap for n, start in groups for k in range(int(n))]
+    spread = [start + k * gap for n, start in groups for k in range(int(n))]
     # Pushed in from the top, then from the bottom: the gap fits, so both can hold.
-    for k in range(len(found) - 1, -1, -1):
-        found[k] = min(found[k], high - (len(found) - 1 - k) * gap)
-    for k in range(len(found)):
-        found[k] = max(found[k], low + k * gap)
-    places_by_index = dict(zip(order, found, strict=True))
-    return [places_by_index[i] for i in range(len(places))]
-
-
-def _first(group: Sequence[float]) -> float:
-    return group[1]
+    spread = [min(place, high - (len(spread) - 1 - k) * gap) for k, place in enumerate(spread)]
+    by_index = {i: max(place, low + k * gap) for k, (i, place) in enumerate(zip(order, spread, strict=True))}
+    return [by_index[i] for i in range(len(places))]
 
 
 def label_ends(axes: Any, ends: Iterable[tuple[float, str, str]], *, size: float = TICK) -> None:
@@ -131,13 +123,13 @@ def label_ends(axes: Any, ends: Iterable[tuple[float, str, str]], *, size: float
         ends: (y of the line's end, name, colour).
         size: of the letters [pt].
     """
-    found = list(ends)
+    listed = list(ends)
     transform = axes.transData + axes.transAxes.inverted()
     x = axes.get_xlim()[1]
-    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _, _ in found]
+    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _, _ in listed]
     height = axes.get_position().height * axes.figure.get_figheight()
-    for place, (_, name, colour) in zip(spread_apart(wanted, 1.25 * size / 72 / height, 0, 1), found, strict=True):
-        axes.text(1.02, place, name, transform=axes.transAxes, color=colour, size=size, va="center", ha="left")
+    for place, (_, name, colour) in zip(spread_apart(wanted, 1.25 * size / 72 / height, 0, 1), listed, strict=True):
+        axes.text(1.02, place, plain(name), transform=axes.transAxes, color=colour, size=size, va="center", ha="left")
 
 
 def save_figure(figure: Any, path: Path) -> None:
