@@ -2,7 +2,7 @@
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: install test lint types package bench clean
+.PHONY: install test test-all lint types package bench clean
 
 install:
 	python3 -m venv $(VENV)
@@ -10,6 +10,9 @@ install:
 
 test:
 	$(BIN)/pytest
+
+test-all:
+	$(BIN)/pytest -m "slow or not slow"
 
 lint:
 	$(BIN)/ruff check .

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -32,11 +33,7 @@ class AlignedNetwork(DepthNetwork):
         Raises:
             ValueError: the network returns another shape.
         """
-        relative = self.network(image)
-        if not isinstance(relative, Tensor):
-            raise ValueError(f"network must return a tensor of relative depth, got {type(relative).__name__}")
-        if relative.dim() == 4 and relative.shape[1] == 1:
-            relative = relative[:, 0]
+        relative = as_map(self.network(image), "the network's relative depth")
         if relative.shape[-2:] != image.shape[-2:]:
             raise ValueError(f"network must return {tuple(image.shape[-2:])} px, got {tuple(relative.shape)}")
         if relative.dtype in (torch.float16, torch.bfloat16):

@@ -150,7 +150,7 @@ class AlignmentSums:
             scale, offset = theta[..., 0], torch.full_like(w, shift)
         require_each(determined, w, "has predictions that hardly differ, which determine no alignment; total weight:")
         grows = "distance" if self.kind == "affine" else "nearness"
-        sentence = f"does not grow with {grows}, as kind {self.kind!r} says it does; the fitted scale is"
+        sentence = f"does not grow with {grows}, as kind {self.kind!r} declares; the fitted scale is"
         require_each(scale > 0, scale, sentence)
         return Alignment(self.kind, scale, offset, max_depth)
 

@@ -13,14 +13,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
-from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.models.distribution import DepthDistribution, split_batch
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
@@ -117,7 +116,7 @@ class BatchEnsemble(DepthNetwork):
         self.members = members
 
     def distribution(self, image: Tensor, member: int | None = None, *, repeat: bool = True) -> DepthDistribution:
-        """What the members say, for the losses.
+        """The members' distributions, for the losses.
 
         Args:
             image: [B, 3, H, W] as ``preprocess`` returns it.
@@ -131,23 +130,21 @@ class BatchEnsemble(DepthNetwork):
         """
         count = len(image)
         if member is not None:
-            turns = torch.full((count,), self._checked(member), device=image.device)
+            members = torch.full((count,), self._checked(member), device=image.device)
         elif repeat:
-            turns = torch.arange(self.members, device=image.device).repeat_interleave(count)
+            members = torch.arange(self.members, device=image.device).repeat_interleave(count)
             image = image.repeat(self.members, 1, 1, 1)
         elif count < self.members:
             raise ValueError(f"a batch of {count} cannot be split among {self.members} members")
         else:
-            turns = torch.arange(count, device=image.device) * self.members // count
-        with self._turns(turns):
+            members = torch.arange(count, device=image.device) * self.members // count
+        with self._selected(members):
             return self.network.distribution(image)
 
     def forward(self, image: Tensor) -> DepthPrediction:
         """The members' mixture of ``image`` [B, 3, H, W]: mean depth [B, H, W] [m], mean A and the variance
         between the members as E [m^2], from one pass with a batch of N B."""
-        together = self.distribution(image)
-        maps = zip(*(getattr(together, f.name).chunk(self.members) for f in fields(together)), strict=True)
-        return combine([type(together)(*parts).prediction() for parts in maps])
+        return combine(split_batch(self.distribution(image).prediction(), self.members))
 
     def member(self, n: int) -> BatchEnsembleMember:
         """Member n as a network, with the weights of this one: nothing is copied.
@@ -183,10 +180,10 @@ class BatchEnsemble(DepthNetwork):
         return member
 
     @contextmanager
-    def _turns(self, turns: Tensor) -> Iterator[None]:
-        """Tell every layer whose turn it is, in this thread, for the length of a call."""
+    def _selected(self, members: Tensor) -> Iterator[None]:
+        """Select the member [B] of every image for all layers, in this thread, for the length of a call."""
         selection = converted_layers(self.network)[0].selection
-        selection.members = turns
+        selection.members = members
         try:
             yield
         finally:
@@ -196,7 +193,7 @@ class BatchEnsemble(DepthNetwork):
 class BatchEnsembleMember(DepthNetwork):
     """One member of a :class:`BatchEnsemble`, made by its ``member``.
 
-    It holds on to the whole ensemble as a module of its own, so that all members stay one through ``.to()``,
+    It registers the whole ensemble as a part, so that all members stay one through ``.to()``,
     ``deepcopy`` (of a list of them) and ``load_state_dict``. A state_dict repeats the shared tensors' names
     for every member, but not the tensors.
     """
@@ -217,7 +214,7 @@ class BatchEnsembleMember(DepthNetwork):
         return self.distribution(image).prediction()
 
     def extra_repr(self) -> str:
-        """Which one."""
+        """The member's number."""
         return f"n={self.n}"
 
 

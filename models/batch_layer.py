@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 
 class Selection(threading.local):
-    """Which member sees which image, for all layers of one network; each thread has its own.
+    """The member that every image goes through, for all layers of one network; each thread has its own.
 
     Attributes:
         members: [B] int64, the member of every image; None outside of a call.
@@ -34,10 +34,10 @@ class BatchLayer(nn.Module):
 
     Args:
         layer: a Conv2d or Linear; becomes W (the parameter itself, so that tied weights stay tied) and every
-            member's first bias. It loses its parameters: code that still holds on to it fails, instead of
-            going on without the members.
+            member's first bias. It loses its parameters: code that still refers to it fails, instead of
+            continuing without the members.
         members: N.
-        selection: who sees what; the same object for all layers of a network.
+        selection: the member of every image; the same object for all layers of a network.
     """
 
     bias: Tensor | None
@@ -70,7 +70,7 @@ class BatchLayer(nn.Module):
         """
         members = self.selection.members
         if members is None:
-            raise RuntimeError("a layer of a BatchEnsemble is called through it, which says whose turn it is")
+            raise RuntimeError("a layer of a BatchEnsemble has to be called through it, which selects the members")
         if len(members) != len(x):
             raise ValueError(f"a BatchEnsemble of {len(members)} images has a layer that got {len(x)}")
         y = self.shared(x * self._per_channel(self.r, x))
@@ -103,5 +103,5 @@ class BatchLayer(nn.Module):
         return layer
 
     def extra_repr(self) -> str:
-        """How many members."""
+        """The number of members."""
         return f"members={self.members}"

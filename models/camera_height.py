@@ -2,10 +2,10 @@
 
 A plane n . P = h (n its unit normal, pointing down; P = d r, r = ((u-cx)/fx, (v-cy)/fy, 1)) has inverse depth
 1/d = (n . r) / h, which is linear in the ray r, and so is a prediction that is inverse depth up to scale and
-shift. What one plane can tell:
+shift. One plane determines:
 
 - The scale, where the prediction at infinite distance is known (0: inverse depth up to scale). The plane's
-  direction is found as well.
+  direction is estimated as well.
 - Scale and shift, where the direction "up" is known exactly (an accelerometer, a calibrated mount, the pose of
   a gravity-aligned SLAM): the horizon is where inverse depth is 0. Without it a shift looks just like a tilt
   of the plane, since the third component of r is 1 everywhere.
@@ -69,7 +69,7 @@ def align_to_camera_height(
         height_m: [m] of the camera's centre above the ground, along the ground's normal.
         kind: "inverse", or "affine" for depth up to scale.
         at_infinity: the prediction at infinite distance (in the open, that of the sky), 0 for inverse depth up
-            to scale; None = found from ``up_cam``. Not with "affine", which is up to scale here.
+            to scale; None = estimated with ``up_cam``. Not with "affine", which is up to scale here.
         up_cam: [3] or [B, 3] upwards in the camera frame (R_world_cam^T e_z in a world with z up). None: a level
             camera, (0, -1, 0), as a first guess.
         valid: [B, H, W] bool, where ground is looked for; None = wherever the camera looks 10 degrees or more

@@ -72,7 +72,7 @@ class DepthAnything(HuggingFaceDepth):
             dtype: of the weights; depth is float32 in any case (float64 for float64).
             device: where the weights go; None = the CPU.
             revision: branch, tag or commit on the hub.
-            local_files_only: whether the hub may not be asked.
+            local_files_only: do not access the hub.
 
         Raises:
             ValueError: ``size`` is no multiple of the patch.

@@ -1,4 +1,4 @@
-"""What a network with an uncertainty head says of a pixel before it becomes depth and variances.
+"""Parameters of the distribution that an uncertainty head predicts per pixel.
 
 The losses need the parameters of the distribution, UfM* its moments (``DepthPrediction``).
 """
@@ -71,3 +71,13 @@ class EvidentialDepth:
 
 
 DepthDistribution = PointDepth | GaussianDepth | EvidentialDepth
+
+
+def split_batch(prediction: DepthPrediction, count: int) -> list[DepthPrediction]:
+    """The ``count`` predictions [B, H, W] that were computed as one batch [count B, H, W], in their order."""
+
+    def split(value: Tensor | None) -> tuple[Tensor, ...] | list[None]:
+        return [None] * count if value is None else value.chunk(count)
+
+    maps = (prediction.depth.chunk(count), split(prediction.aleatoric_variance), split(prediction.epistemic_variance))
+    return [DepthPrediction(depth, a, e) for depth, a, e in zip(*maps, strict=True)]

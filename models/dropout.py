@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.models.distribution import DepthDistribution, split_batch
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
@@ -23,7 +23,7 @@ class DecoderDropout(nn.Module):
     while ``sampling``. Without parameters, so that weights load with and without it.
 
     Each channel of each image has one draw, as in the decoder of Poggi et al. Draws for single values would speckle a
-    sample: neighbouring pixels differ by decimetres, and segmentation finds no surface in it.
+    sample: neighbouring pixels differ by decimetres, which segmentation cannot join to a surface.
 
     Args:
         p: probability in [0, 1); 0 does nothing.
@@ -61,10 +61,10 @@ def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None 
         generator: source of the random numbers, on the network's device; None: torch's global one.
 
     Returns:
-        How many layers there are.
+        The number of layers.
 
     Raises:
-        ValueError: there is none, so that nothing would be sampled.
+        ValueError: none, so that nothing would be sampled.
     """
     layers = [m for m in module.modules() if isinstance(m, DecoderDropout) and m.p > 0]
     if not layers:
@@ -129,14 +129,4 @@ class MonteCarloDropout(DepthNetwork):
         if not self.batched:
             return combine([self.network(image) for _ in range(self.samples)])
         together = self.network(image.repeat(self.samples, 1, 1, 1))
-        return combine(_passes(together, self.samples))
-
-
-def _passes(together: DepthPrediction, count: int) -> list[DepthPrediction]:
-    """The ``count`` predictions that lie behind each other in a batch."""
-
-    def split(value: Tensor | None) -> tuple[Tensor, ...] | list[None]:
-        return [None] * count if value is None else value.chunk(count)
-
-    maps = (together.depth.chunk(count), split(together.aleatoric_variance), split(together.epistemic_variance))
-    return [DepthPrediction(depth, a, e) for depth, a, e in zip(*maps, strict=True)]
+        return combine(split_batch(together, self.samples))

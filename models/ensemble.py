@@ -1,5 +1,5 @@
 """Ensembles (Lakshminarayanan et al. 2017): all members at once as the multi-inference baseline, and
-members that are loaded when their turn comes and need not stay on the device."""
+members that are loaded at their first call and need not stay on the device."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Ensemble(DepthNetwork):
     alternates them instead.
 
     Args:
-        members: networks that want the same input.
+        members: networks with the same preprocessing.
 
     Raises:
-        ValueError: fewer than two members, or they want different inputs.
+        ValueError: fewer than two members, or different preprocessing.
     """
 
     def __init__(self, members: Sequence[DepthNetwork]) -> None:
@@ -35,7 +35,7 @@ class Ensemble(DepthNetwork):
             raise ValueError(f"members must be at least two networks, got {len(members)}")
         wanted = [member.preprocess for member in members]
         if any(other != wanted[0] for other in wanted):
-            raise ValueError(f"members must want the same input, got {wanted}")
+            raise ValueError(f"members must have the same preprocessing, got {wanted}")
         self.members = nn.ModuleList(members)
         self.preprocess = wanted[0]
 
@@ -72,7 +72,7 @@ class LazyMember(DepthNetwork):
         self._load = load
         # In a dict, so that nn.Module does not count it among its parts.
         self._held: dict[str, DepthNetwork] = {}
-        self._loading, self._turn = threading.Lock(), threading.Lock()
+        self._loading, self._calling = threading.Lock(), threading.Lock()
         self.register_buffer("_where", torch.zeros(0), persistent=False)
         self.eval()
 
@@ -102,7 +102,9 @@ class LazyMember(DepthNetwork):
         if not isinstance(network, DepthNetwork):
             raise CheckpointError(f"{self.name} must be a DepthNetwork, got {type(network).__name__}")
         if network.preprocess != self.preprocess:
-            raise CheckpointError(f"{self.name} wants the input {network.preprocess}, declared was {self.preprocess}")
+            raise CheckpointError(
+                f"{self.name} has the preprocessing {network.preprocess}, declared was {self.preprocess}"
+            )
         return network.train(self.training)
 
     def forward(self, image: Tensor) -> DepthPrediction:
@@ -116,9 +118,9 @@ class LazyMember(DepthNetwork):
             return network(image)
         tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
         # Copies for this call: nothing has to be copied back, and none is left behind by an error.
-        there = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
-        with self._turn:  # the call puts them into the network while it lasts
-            return functional_call(network, there, (image,))
+        copies = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
+        with self._calling:  # the call puts them into the network while it lasts
+            return functional_call(network, copies, (image,))
 
     def train(self, mode: bool = True) -> LazyMember:
         """Also for a network that is loaded later."""
@@ -139,10 +141,10 @@ class LazyMember(DepthNetwork):
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies and pickles: without locks, and not loaded."""
-        return {**self.__dict__, "_held": {}, "_loading": None, "_turn": None}
+        return {**self.__dict__, "_held": {}, "_loading": None, "_calling": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__({**state, "_loading": threading.Lock(), "_turn": threading.Lock()})
+        super().__setstate__({**state, "_loading": threading.Lock(), "_calling": threading.Lock()})
 
     def extra_repr(self) -> str:
         """Whether it is loaded."""

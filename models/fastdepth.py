@@ -36,7 +36,7 @@ _SKIPS = {1: 5, 2: 3, 3: 1}
 INITIAL_DEPTH = 2.5
 # [1] Largest relative difference between ONNX Runtime's depth and ours that is rounding.
 _AGREEMENT = 1e-3
-# The last activation, and what it turns into INITIAL_DEPTH.
+# The last activation, and its input for INITIAL_DEPTH.
 _POSITIVE: dict[str, tuple[type[nn.Module], float]] = {
     "relu": (nn.ReLU, INITIAL_DEPTH),
     "softplus": (nn.Softplus, math.log(math.expm1(INITIAL_DEPTH))),
@@ -100,7 +100,7 @@ class FastDepthWidths:
         """The widths of a :class:`FastDepth`'s own state_dict.
 
         Raises:
-            ValueError: a weight that tells a width is missing.
+            ValueError: a weight of whose shape a width is read is missing.
         """
         keys = ["encoder.0.conv.weight", *(f"encoder.{i}.pointwise.conv.weight" for i in range(1, len(_STRIDES)))]
         decoder = [f"decoder.{i}.pointwise.conv.weight" for i in range(5)]

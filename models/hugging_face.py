@@ -12,51 +12,34 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from ufmstar_torch.checked import Checked
 from ufmstar_torch.models.aligned import AlignedNetwork
 from ufmstar_torch.models.alignment import KINDS, Alignment
+from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.hugging_face_files import Checkpoint, load_model, read_checkpoint
-from ufmstar_torch.models.network import DepthNetwork, require_image
+from ufmstar_torch.models.hugging_face_raw import CanonicalInverseDepth, PaddedDepth, RawDepth
+from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import METRIC
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 # Pillow's numbers, which the configurations use.
 _LINEAR, _CUBIC = 2, 3
+# The architectures whose output is covered, and how it is read. Others, such as models that need a second input or
+# predict no depth, are refused by name.
+_ARCHITECTURES: dict[str, type[RawDepth]] = {
+    "depth_anything": RawDepth,
+    "depth_pro": CanonicalInverseDepth,
+    "dpt": RawDepth,
+    "glpn": RawDepth,
+    "zoedepth": PaddedDepth,
+}
+# Architectures that always predict metric depth.
+_METRIC = ("depth_pro", "zoedepth")
 # "depth_estimation_type" in the terms of this package; "relative" is inverse depth in all of them.
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
-
-
-class RawDepth(nn.Module):
-    """A transformers depth model as an image-to-map network: its own units, the input's resolution, float32.
-
-    Args:
-        model: has ``predicted_depth`` [B, h, w] in what it returns for ``pixel_values``.
-        multiple: [px] what the input's sides have to be multiples of.
-    """
-
-    def __init__(self, model: nn.Module, multiple: int = 1) -> None:
-        super().__init__()
-        self.model = model
-        self.multiple = multiple
-
-    def forward(self, image: Tensor) -> Tensor:
-        """[B, H, W] of ``image`` [B, 3, H, W]; a smaller output is enlarged bilinearly.
-
-        Raises:
-            ValueError: the image has another shape, or sides that are no multiples of ``multiple``.
-        """
-        size = require_image(image, self.multiple)
-        dtype = next(self.model.parameters()).dtype
-        depth: Tensor = self.model(pixel_values=image.to(dtype)).predicted_depth
-        depth = depth if depth.dtype == torch.float64 else depth.float()
-        depth = depth[:, 0] if depth.dim() == 4 and depth.shape[1] == 1 else depth
-        if depth.shape[-2:] == size:
-            return depth
-        return F.interpolate(depth[:, None], size, mode="bilinear", align_corners=False)[:, 0]
 
 
 class HuggingFaceDepth(DepthNetwork):
@@ -96,9 +79,12 @@ class HuggingFaceDepth(DepthNetwork):
         dtype: torch.dtype = torch.float32,
     ) -> Self:
         """From a checkpoint that was read; arguments and errors as :func:`from_hugging_face`."""
-        meant = _kind(checkpoint, kind)
-        raw = RawDepth(load_model(checkpoint, dtype, allow_missing), patch_size(checkpoint))
-        return cls(raw, preprocess, meant, scale=scale, source=checkpoint.name).eval()
+        kind = _kind(checkpoint, kind)
+        model, reading = load_model(checkpoint, dtype, allow_missing), _ARCHITECTURES[checkpoint.model_type]
+        if reading is PaddedDepth and not checkpoint.processor.get("do_pad", True):
+            reading = RawDepth
+        raw = reading(model, patch_size(checkpoint))
+        return cls(raw, preprocess, kind, scale=scale, source=checkpoint.name).eval()
 
     @property
     def is_metric(self) -> bool:
@@ -153,27 +139,30 @@ def from_hugging_face(
     revision: str | None = None,
     local_files_only: bool = False,
 ) -> HuggingFaceDepth:
-    """Any model that ``AutoModelForDepthEstimation`` knows (DPT, ZoeDepth, GLPN, ...), in eval mode.
+    """A depth model of ``AutoModelForDepthEstimation`` in eval mode: DPT, GLPN, Depth Anything, Depth Pro, ZoeDepth.
+
+    Its depth is what the image processor's ``post_process_depth_estimation`` makes of its output: Depth Pro's inverse
+    depth becomes metric by the field of view that it estimates, ZoeDepth's padding is done and cut off again.
 
     Args:
         name_or_dir: "owner/name" on the hub, or a directory with config.json and weights.
-        kind: what it predicts: "metric" (ZoeDepth, GLPN, DPT trained on NYU or KITTI), "inverse" (DPT and MiDaS
-            otherwise) or "affine" (depth up to scale and shift). None = what the configuration says, if it does.
+        kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"
+            (DPT and MiDaS otherwise) or "affine" (depth up to scale and shift). None = as the configuration or the
+            architecture states, if it does.
         scale: [m] length of one unit of metric depth.
         size: (height, width) [px] of the input; None = that of preprocessor_config.json.
-        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration says.
+        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
         preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
         allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
             "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
         dtype: of the weights; what comes out is float32 in any case (float64 for float64).
         device: where they go; None = the CPU.
         revision: branch, tag or commit on the hub.
-        local_files_only: whether the hub may not be asked.
-
-    The image processor's padding (ZoeDepth) is not done.
+        local_files_only: do not access the hub.
 
     Raises:
-        ValueError: the kind is declared nowhere or contradicts the configuration, or a value is out of range.
+        ValueError: the kind is declared nowhere or contradicts the configuration, a Depth Pro without the part that
+            estimates the field of view, or a value is out of range.
         CheckpointError: a directory or checkpoint is damaged, incomplete or of another kind of model; named.
         FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
         ModuleNotFoundError: transformers is missing.
@@ -183,7 +172,7 @@ def from_hugging_face(
     if preprocess is None:
         preprocess = own_preprocess(checkpoint, size, keep_aspect)
     elif size is not None or keep_aspect is not None:
-        raise ValueError("preprocess excludes size and keep_aspect: it says both")
+        raise ValueError("preprocess excludes size and keep_aspect, which it contains")
     network = HuggingFaceDepth.of_checkpoint(
         checkpoint, preprocess, kind=kind, scale=scale, allow_missing=allow_missing, dtype=dtype
     )
@@ -269,6 +258,7 @@ def own_preprocess(
         value_range=255 * factor,
         mean=tuple(mean),
         std=tuple(std),
+        antialias=checkpoint.model_type != "depth_pro",
         cubic=resample == _CUBIC,
     )
 
@@ -280,23 +270,25 @@ def patch_size(checkpoint: Checkpoint) -> int:
 
 
 def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
-    """ "metric", "inverse" or "affine", from the configuration and the declaration."""
-    default = "relative" if checkpoint.model_type == "depth_anything" else None
-    stated = checkpoint.config.get("depth_estimation_type", default)
-    if stated is None and kind is None:
+    """The kind of depth, from the configuration, the architecture and the declaration."""
+    config, name, model_type = checkpoint.config, checkpoint.name, checkpoint.model_type
+    if model_type not in _ARCHITECTURES:
+        known = ", ".join(_ARCHITECTURES)
+        raise CheckpointError(f"{name} ({model_type}) cannot be loaded as a depth model: covered are {known}")
+    if model_type == "depth_pro" and not config.get("use_fov_model"):
+        raise ValueError(f"{name} predicts inverse depth per focal length, but not the field of view (use_fov_model)")
+    stated = config.get("depth_estimation_type", "relative" if model_type == "depth_anything" else None)
+    if stated is None and kind is None and model_type not in _METRIC:
         raise ValueError(
-            f"{checkpoint.name} ({checkpoint.model_type}) does not say whether its depth is metric: declare "
-            "kind='metric', 'inverse' (inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
+            f"{name} ({model_type}) does not say whether its depth is metric: declare kind='metric', 'inverse' "
+            "(inverse depth up to scale and shift) or 'affine' (depth up to scale and shift)"
         )
-    if stated is None:
-        return str(kind)
-    if stated not in _DECLARED:
-        raise ValueError(f"{checkpoint.name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
-    own = _DECLARED[stated]
-    if kind not in (None, own):
-        raise ValueError(
-            f"kind={kind!r}, but {checkpoint.name} says depth_estimation_type {stated!r}, which is {own!r}"
-        )
-    if own == METRIC and "max_depth" not in checkpoint.config:
-        raise ValueError(f"{checkpoint.name} says metric, but not the max_depth [m] that its output is a share of")
-    return own
+    if stated not in (None, *_DECLARED):
+        raise ValueError(f"{name}: depth_estimation_type must be one of {list(_DECLARED)}, got {stated!r}")
+    own = METRIC if model_type in _METRIC else _DECLARED.get(str(stated))
+    if own is not None and kind not in (None, own):
+        said = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
+        raise ValueError(f"kind={kind!r}, but {name} says {said}, which is {own!r}")
+    if stated == METRIC and "max_depth" not in config:
+        raise ValueError(f"{name} says metric, but not the max_depth [m] that its output is a share of")
+    return own or str(kind)

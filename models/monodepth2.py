@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.checkpoints import CheckpointError, fill, load_state_dict_file
+from ufmstar_torch.models.checkpoints import fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.network import Backbone, fits, require_image
 from ufmstar_torch.models.preprocess import Preprocess
@@ -44,7 +44,7 @@ class ResNetEncoder(nn.Module):
         layers: 18, 34 or 50.
         strides: where the bottlenecks that halve the resolution do so: "v1.5", in their 3x3 convolution, as in
             torchvision, or "v1", in the 1x1 before it, as in the original paper. Weights were trained for one of
-            the two and cannot tell which. Without bottlenecks (18, 34) there is no such difference.
+            the two and do not state which. Without bottlenecks (18, 34) there is no such difference.
 
     Raises:
         ValueError: other layers or strides.
@@ -195,10 +195,10 @@ class MonodepthResNet(Backbone):
 
 
 def shape_of_state_dict(state: Mapping[str, Tensor]) -> tuple[int, tuple[int, ...]]:
-    """(layers, decoder) of the :class:`MonodepthResNet` that a state_dict belongs to; strides it cannot tell.
+    """(layers, decoder) of the :class:`MonodepthResNet` that a state_dict belongs to; the strides do not show in it.
 
     Raises:
-        ValueError: a tensor that tells them is missing.
+        ValueError: a tensor from which they are read is missing.
     """
     decoder = [f"levels.{i}.before.weight" for i in range(LEVELS)]
     missing = [key for key in ("encoder.layer1.0.conv2.weight", *decoder) if key not in state]
@@ -226,29 +226,15 @@ def load_monodepth_resnet(
 
 
 def _fill_encoder(encoder: ResNetEncoder, state: Mapping[str, Tensor], source: str) -> None:
-    """Load every tensor of a classifier's weights but the classifier itself.
-
-    Raises:
-        CheckpointError: tensors are missing, unexpected, of another shape or not finite; the encoder is
-            unchanged then.
-    """
+    """Load every tensor of a classifier's weights but the classifier itself; errors as ``checkpoints.fill``."""
     state = {key: _within_half(key, value) for key, value in state.items() if not key.startswith("fc.")}
-    expected = encoder.state_dict()
     # Files older than PyTorch 0.4.1 do not count batches; nothing here reads the count.
-    missing = {key for key in expected if not key.endswith("num_batches_tracked")} - set(state)
-    wrong = sorted(missing | (set(state) - set(expected)))
-    wrong += [key for key in state if key in expected and state[key].shape != expected[key].shape]
-    wrong += [key for key in state if not torch.isfinite(state[key]).all()]
-    if wrong:
-        raise CheckpointError(
-            f"{source} does not fit the ResNet encoder: {len(wrong)} of its {len(expected)} tensors are missing, "
-            f"unexpected, of another shape or not finite, first {wrong[0]!r}"
-        )
-    encoder.load_state_dict(expected | state, strict=True)
+    counters = {key: value for key, value in encoder.state_dict().items() if key.endswith("num_batches_tracked")}
+    fill(encoder, counters | state, source)
 
 
 def _within_half(key: str, value: Tensor) -> Tensor:
-    """An overflowed variance as the largest one: as infinity it would turn its channel into a constant."""
+    """An overflowed variance as the largest one: as infinity it would make its channel constant."""
     if value.dtype != torch.float16 or not key.endswith("running_var"):
         return value
     return value.clamp(max=torch.finfo(torch.float16).max)

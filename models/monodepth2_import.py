@@ -44,7 +44,7 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     """Fill a network's encoder and decoder with published Monodepth2 weights, in place, where shapes allow.
 
     The result does not predict depth yet: Monodepth2's last convolutions give disparity without a metric
-    scale, so the depth head stays untrained and wants fine-tuning. The first convolution is rescaled from
+    scale, so the depth head stays untrained and needs fine-tuning. The first convolution is rescaled from
     Monodepth2's normalisation of colours to ImageNet's, exactly but for the border, which is padded with
     ImageNet's mean instead of its grey.
 

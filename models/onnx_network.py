@@ -64,7 +64,7 @@ class OnnxNetwork(DepthNetwork):
 
     Args:
         path: the .onnx file.
-        spec: what the file does not say.
+        spec: what the file does not state.
         threads: CPU threads of one run; 0 leaves it to ONNX Runtime.
         providers: ONNX Runtime's execution providers in order of preference.
 

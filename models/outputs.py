@@ -102,13 +102,7 @@ class OutputSpec(Checked):
         """[B, H, W] of one output, in its own units."""
         if name not in outputs:
             raise ValueError(f"the network has no output {name!r}; it has {list(outputs)}")
-        value = outputs[name]
-        shape = tuple(value.shape)
-        if value.dim() == 4 and 1 in (shape[1], shape[3]):
-            value = value[:, 0] if shape[1] == 1 else value[..., 0]
-        if value.dim() != 3:
-            raise ValueError(f"output {name!r} must be [B, 1, H, W], [B, H, W, 1] or [B, H, W], got {shape}")
-        value = value if torch.is_floating_point(value) else value.to(torch.get_default_dtype())
+        value = as_map(outputs[name], f"output {name!r}")
         if value.shape[-2:] == size:
             return value
         if not self.resize:
@@ -117,6 +111,22 @@ class OutputSpec(Checked):
                 "is used with; set resize to bring it there"
             )
         return F.interpolate(value[:, None], size, mode="nearest-exact")[:, 0]
+
+
+def as_map(value: Any, name: str) -> Tensor:
+    """[B, H, W] floating-point, of a tensor [B, 1, H, W], [B, H, W, 1] or [B, H, W]; half precision stays.
+
+    Raises:
+        ValueError: ``name`` is something else.
+    """
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be a tensor, got {type(value).__name__}")
+    shape = tuple(value.shape)
+    if value.dim() == 4 and 1 in (shape[1], shape[3]):
+        value = value[:, 0] if shape[1] == 1 else value[..., 0]
+    if value.dim() != 3:
+        raise ValueError(f"{name} must be [B, 1, H, W], [B, H, W, 1] or [B, H, W], got {shape}")
+    return value if value.is_floating_point() else value.to(torch.get_default_dtype())
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Preprocess(Checked):
-    """What a network wants to see; immutable, usable as a function.
+    """The input that a network needs; immutable, usable as a function.
 
     Attributes:
         resize_height: [px] height after the first step, None = no such step. Where the crop would not fit
@@ -50,7 +50,7 @@ class Preprocess(Checked):
         size: (height, width) [px] of the network's input, None = as it is by then.
         aspect_multiple: [px] keep the aspect: of the two factors that ``size`` asks for, both sides take the
             one that changes the image less, and the result is rounded to this multiple (a vision
-            transformer's patch). ``size`` then tells roughly how large the input is. None = exactly ``size``.
+            transformer's patch). ``size`` is then approximate. None = exactly ``size``.
         value_range: what white becomes: 1 for networks trained on [0, 1], 255 for those on bytes.
         mean, std: per channel (R, G, B), in units of ``value_range``: input = (value - mean) / std.
         antialias: whether shrinking averages over all pixels that fall into one.

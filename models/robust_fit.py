@@ -1,8 +1,8 @@
 """Linear least squares that survives outliers: minimal samples, then trimmed refits.
 
-Rousseeuw's least median of squares finds a start that up to half of the points may contradict (or, where
-the user knows how far an inlier may lie, Torr's MSAC does); least squares on the points near it, repeated,
-gives back the efficiency that a median lacks.
+Rousseeuw's least median of squares gives a start that up to half of the points may contradict (or Torr's MSAC, where
+the largest residual of an inlier is known); least squares on the points near it, repeated, restores the efficiency
+that a median lacks.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def save_trained(
         spec: what builds them again.
         half: weights in half precision. Tensors that it cannot hold (values beyond 65504; variances of a
             batch norm below 6e-5, where its resolution ends) stay as they are.
-        info: plain values (JSON) that say where the weights come from.
+        info: plain values (JSON) on the origin of the weights.
 
     Raises:
         ValueError: no network, one that does not fit ``spec``, another suffix, or weights that are not finite.
@@ -177,8 +177,8 @@ class _TrainedFile:
         """
         method = self.info.spec.method
         if method == "batch_ensemble":
-            index, turn = divmod(n, self.info.spec.members)
-            return self._batch_ensemble(index).member(turn)
+            index, member = divmod(n, self.info.spec.members)
+            return self._batch_ensemble(index).member(member)
         network = self.read(n)
         return MonteCarloDropout(network).eval() if method == "mc_dropout" else network
 

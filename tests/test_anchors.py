@@ -148,7 +148,7 @@ def rows(values, valid=None, pixel=None):
 
 
 @given(st.integers(0, 10**6), st.floats(0.5, 1.0), st.floats(0.5, 20.0))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_sums_and_means_by_hand(seed, memory, kappa):
     rng = np.random.default_rng(seed)
     n, k = 3, 3  # fewer than could support each other: all are taken

@@ -12,6 +12,8 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.given import Anchors
 
+pytestmark = pytest.mark.numerics
+
 ANCHORED = UfMStarConfig(segment=SPGF, regression="exact", anchored=True, anchor_shrinkage=3.0, anchor_half_life=4.0)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageEnhance
 from torch import Tensor
@@ -165,7 +165,6 @@ def test_holes_stay_holes():
     assert (new_depth[52:68, 62:98] == 0).all()
 
 
-@settings(max_examples=60, deadline=None)
 @given(seed=st.tuples(*[st.integers(0, 2**40)] * 3), crop=st.sampled_from(["centre", "random"]))
 def test_draws_stay_in_their_ranges_and_inside_the_image(seed, crop):
     config = AugmentationConfig(rotation=0.0, crop=crop)

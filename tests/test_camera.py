@@ -13,6 +13,8 @@ import oracle
 import scenes
 from ufmstar_torch import camera
 
+pytestmark = pytest.mark.numerics
+
 
 def pose(seed: int) -> torch.Tensor:
     rng = np.random.default_rng(seed)
@@ -84,7 +86,7 @@ def test_resize_refuses_empty_sizes():
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_relative_pose(seed):
     T_a, T_b = pose(seed), pose(seed + 1)
     R, t = camera.relative_pose(T_a, T_b)
@@ -104,7 +106,7 @@ def test_relative_pose_keeps_digits_far_from_the_world_origin():
 
 
 @given(st.integers(0, 10**6), st.floats(0, 0.01))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_nearest_rotation_is_the_polar_factor(seed, amount):
     R = pose(seed)[:3, :3]
     noise = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -120,7 +122,7 @@ def test_nearest_rotation_converges_at_the_greatest_tolerance():
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_projected_covariance(seed):
     from random_gaussians import covariances, means
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import torch
-from depth_anything_files import MEAN, STD, lively, write_depth_anything
+from depth_anything_files import MEAN, STD, lively, write_depth_anything, write_other
 from layouts import write_generic
 from runs import read_summary
 from safetensors.torch import load_file, save_file
@@ -417,17 +417,61 @@ def test_smaller_outputs_are_enlarged_to_the_input(other):
     torch.testing.assert_close(inner, ((torch.arange(1, 95) + 0.5) / 2 + 0.5).expand_as(inner))
 
 
-def test_models_that_predict_no_depth_are_refused(broken):
-    (broken / "config.json").write_text(json.dumps({"model_type": "bert"}))
-    with pytest.raises(CheckpointError, match=r"broken \(bert\) cannot be loaded as a depth model"):
-        from_hugging_face(broken, kind="metric")
-
-
 def test_weights_that_a_model_does_not_use_may_be_missing(broken):
     edit_weights(broken, lambda state: {k: v for k, v in state.items() if not k.startswith("head.conv3")})
     with pytest.raises(CheckpointError, match="name them in allow_missing"):
         from_hugging_face(broken, allow_missing=["head.conv2"])
     assert from_hugging_face(broken, allow_missing=["head.conv3"]).kind == "metric"
+
+
+# ---- what each architecture's output is ----
+
+
+@pytest.mark.parametrize("architecture", ["depth_anything", "depth_pro", "dpt", "glpn", "zoedepth"])
+def test_depth_is_what_transformers_own_post_processing_makes_of_it(architecture, tmp_path):
+    """Depth Pro's inverse depth with its field of view, ZoeDepth's padding; the others as they are."""
+    if architecture == "depth_anything":
+        folder, size = write_depth_anything(tmp_path / "model", "metric"), (70, 70)
+    else:
+        folder, size = write_other(tmp_path / "model", architecture), (64, 64)
+    kind = {"dpt": "inverse", "glpn": "metric"}.get(architecture)
+    network = from_hugging_face(folder, kind=kind, size=size)
+    images = photos(2, size)
+    processor = transformers.AutoImageProcessor.from_pretrained(folder, use_fast=True)
+    model = transformers.AutoModelForDepthEstimation.from_pretrained(folder).eval()
+    x = network.preprocess.apply_image(images)
+    options = {"target_sizes": [size] * 2}
+    with torch.no_grad():
+        raw = network.raw(x)
+        if architecture == "zoedepth":  # pads the images itself
+            x = processor(list(images), return_tensors="pt")["pixel_values"]
+            options = {"source_sizes": [size] * 2}
+        outputs = processor.post_process_depth_estimation(model(pixel_values=x), **options)
+    expected = torch.stack([output["predicted_depth"].squeeze() for output in outputs])
+    torch.testing.assert_close(raw, expected, rtol=1e-4, atol=1e-4)
+    assert float(raw.std() / raw.mean()) > 0.01
+    if network.is_metric:
+        with torch.no_grad():
+            assert torch.equal(network(network.preprocess.apply_image(images)).depth, raw)
+
+
+def test_architectures_that_are_always_metric_need_no_declaration(tmp_path):
+    for architecture in ("depth_pro", "zoedepth"):
+        folder = write_other(tmp_path / architecture, architecture)
+        assert from_hugging_face(folder).kind == "metric"
+        with pytest.raises(ValueError, match=f"says the architecture {architecture}, which is 'metric'"):
+            from_hugging_face(folder, kind="inverse")
+    folder = write_other(tmp_path / "no_field_of_view", "depth_pro", use_fov_model=False)
+    with pytest.raises(ValueError, match=r"not the field of view \(use_fov_model\)"):
+        from_hugging_face(folder)
+
+
+@pytest.mark.parametrize("architecture", ["prompt_depth_anything", "chmv2", "bert", None])
+def test_other_architectures_are_refused_by_name(broken, architecture):
+    """One needs a second input, one predicts no depth, one is no depth model."""
+    (broken / "config.json").write_text(json.dumps({"model_type": architecture}))
+    with pytest.raises(CheckpointError, match=rf"broken \({architecture}\) cannot be loaded as a depth model: covered"):
+        from_hugging_face(broken, kind="metric")
 
 
 # ---- by name, and on the command line ----

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import random_gaussians
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from test_ufmstar import HEIGHT, SPGF, WIDTH, oracle_settings
 
@@ -16,6 +16,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.gaussian import wasserstein_squared
 from ufmstar_torch.ufmstar import UfMStar
+
+pytestmark = pytest.mark.numerics
 
 
 def piece(centre, spans, thickness=0.0):
@@ -34,7 +36,6 @@ def on_plane(normal, offset, position, spans):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=40, deadline=None)
 def test_agrees_with_the_oracle(seed):
     mean_a, mean_b = (random_gaussians.means(1, seed + n)[0] + torch.tensor([0, 0, 2.0]) for n in (0, 1000))
     mean_a[2], mean_b[2] = mean_a[2].abs() + 0.3, mean_b[2].abs() + 0.3
@@ -56,7 +57,6 @@ extent = st.tuples(*[st.floats(-0.4, 0.4)] * 3)
     second=st.tuples(coordinate, coordinate),
     spans=st.tuples(extent, extent, extent, extent),
 )
-@settings(max_examples=100, deadline=None)
 def test_two_cuts_of_one_tilted_plane_agree(normal, first, second, spans):
     n = np.array([*normal, 1.0])
     a = on_plane(n, 2.0, first, spans[:2])
@@ -71,7 +71,6 @@ def test_two_cuts_of_one_tilted_plane_agree(normal, first, second, spans):
 
 
 @given(offset=st.floats(-0.5, 0.5), first=st.tuples(coordinate, coordinate), second=st.tuples(coordinate, coordinate))
-@settings(max_examples=50, deadline=None)
 def test_frontal_planes_disagree_by_their_squared_distance(offset, first, second):
     n = np.array([0.0, 0.0, 1.0])
     a = on_plane(n, 2.0, first, ((0.3, 0, 0), (0, 0.2, 0)))

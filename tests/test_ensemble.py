@@ -65,12 +65,12 @@ def image(batch=2):
 
 def test_an_ensemble_is_the_mixture_of_its_members():
     networks = [Gain(1.0), Gain(1.5), Gain(3.0)]
-    found = Ensemble(networks)(image())
+    mixture = Ensemble(networks)(image())
     depths = torch.stack([network(image()).depth for network in networks])
     mean = depths.sum(0) / 3
-    torch.testing.assert_close(found.depth, mean)
-    torch.testing.assert_close(found.aleatoric_variance, 0.01 * mean)
-    torch.testing.assert_close(found.epistemic_variance, (depths**2).sum(0) / 3 - mean**2)
+    torch.testing.assert_close(mixture.depth, mean)
+    torch.testing.assert_close(mixture.aleatoric_variance, 0.01 * mean)
+    torch.testing.assert_close(mixture.epistemic_variance, (depths**2).sum(0) / 3 - mean**2)
     assert Ensemble(networks).preprocess == INPUT
 
 
@@ -87,7 +87,7 @@ def test_impossible_ensembles():
         Ensemble([Gain(1.0)])
     other = Gain(1.0)
     other.preprocess = replace(INPUT, size=(8, 12))
-    with pytest.raises(ValueError, match="the same input"):
+    with pytest.raises(ValueError, match="the same preprocessing"):
         Ensemble([Gain(1.0), other])
 
 
@@ -157,11 +157,11 @@ def test_copies_for_a_turn_are_given_back():
     """After a call, nothing refers to the tensors that were on the device."""
     (member,), _ = lazy(1.0, offload=True)
     member.to("meta")
-    there = []
+    copies = []
 
     class Watched(Gain):
         def forward(self, image):
-            there.extend([weakref.ref(self.gain), weakref.ref(self.offset)])
+            copies.extend([weakref.ref(self.gain), weakref.ref(self.offset)])
             if image.shape[0] == 1:
                 raise RuntimeError("out of memory")
             return super().forward(image)
@@ -170,8 +170,8 @@ def test_copies_for_a_turn_are_given_back():
     member(image().to("meta"))
     with pytest.raises(RuntimeError, match="out of memory"):
         member(image(1).to("meta"))
-    assert len(there) == 4
-    assert all(ref() is None for ref in there[:2])
+    assert len(copies) == 4
+    assert all(ref() is None for ref in copies[:2])
     assert member.network().gain.device.type == "cpu"
 
 
@@ -200,6 +200,14 @@ def test_a_copy_loads_anew(copied):
     assert "loaded=True" in repr(other)
 
 
+def in_threads(count, work):
+    threads = [threading.Thread(target=work) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
 def test_threads_load_a_member_once():
     barrier, started = threading.Barrier(4), []
 
@@ -208,19 +216,15 @@ def test_threads_load_a_member_once():
         threading.Event().wait(0.05)
         return Gain(1.0)
 
-    member, found = LazyMember(slow, INPUT), []
+    member, depths = LazyMember(slow, INPUT), []
 
     def work():
         barrier.wait()
-        found.append(member(image()).depth)
+        depths.append(member(image()).depth)
 
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(4, work)
     assert len(started) == 1
-    assert len(found) == 4
+    assert len(depths) == 4
 
 
 def test_threads_take_turns_on_the_device():
@@ -232,11 +236,7 @@ def test_threads_take_turns_on_the_device():
         for _ in range(20):
             devices.append(member(image().to("meta")).depth.device.type)
 
-    threads = [threading.Thread(target=work) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(3, work)
     assert devices == ["meta"] * 60
     assert member.network().gain.device.type == "cpu"
 
@@ -269,7 +269,7 @@ def test_a_message_that_names_the_member_is_not_repeated():
 def test_a_loader_must_return_what_was_declared():
     with pytest.raises(CheckpointError, match="must be a DepthNetwork, got Linear"):
         LazyMember(lambda: nn.Linear(1, 1), INPUT)(image())
-    with pytest.raises(CheckpointError, match="wants the input"):
+    with pytest.raises(CheckpointError, match="has the preprocessing"):
         LazyMember(Loader(1.0), replace(INPUT, size=(8, 12)))(image())
 
 

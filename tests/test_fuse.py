@@ -15,6 +15,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.fuse import append, fuse
 
+pytestmark = pytest.mark.numerics
+
 
 def random_pairs(streams: int, previous, current, seed: int, density: float = 0.3) -> Correspondence:
     generator = torch.Generator().manual_seed(seed)
@@ -27,7 +29,7 @@ def random_pairs(streams: int, previous, current, seed: int, density: float = 0.
 
 @pytest.mark.parametrize("weighted", [False, True])
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_agrees_with_the_oracle(weighted, seed):
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, empty=1, features=2)
     pairs = random_pairs(2, previous, current, seed)
@@ -53,7 +55,7 @@ def test_agrees_with_the_oracle(weighted, seed):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_each_fusion_adds_exactly_its_weight(seed):
     previous, current = mixture(1, 8, seed), mixture(1, 6, seed + 50)
     previous = previous.replace(weight=previous.weight.round())

@@ -13,6 +13,8 @@ from random_gaussians import covariances, means
 import oracle
 from ufmstar_torch import gaussian
 
+pytestmark = pytest.mark.numerics
+
 seeds = st.integers(0, 2**20)
 
 
@@ -59,7 +61,7 @@ def test_degenerate_inputs_stay_finite():
 
 
 @given(seeds)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_wasserstein_agrees_with_oracle_and_pot(seed):
     a, b = covariances(2, seed)
     mean_a, mean_b = means(2, seed)
@@ -70,7 +72,7 @@ def test_wasserstein_agrees_with_oracle_and_pot(seed):
 
 
 @given(seeds)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_wasserstein_is_a_squared_metric(seed):
     cov, mean = covariances(3, seed), means(3, seed)
 
@@ -104,7 +106,7 @@ def test_wasserstein_of_commuting_covariances_is_the_difference_of_roots():
 
 
 @given(seeds, st.floats(0, 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_geodesic(seed, lam):
     (a, b), (mean_a, mean_b) = covariances(2, seed), means(2, seed)
     l = torch.tensor(lam, dtype=torch.float64)
@@ -144,7 +146,7 @@ def test_planar_gaussians_stay_positive_definite_over_a_thousand_fusions():
 
 
 @given(seeds)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_bhattacharyya(seed):
     generator = torch.Generator().manual_seed(seed)
     root = torch.randn(2, 2, 2, generator=generator, dtype=torch.float64)

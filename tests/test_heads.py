@@ -60,7 +60,6 @@ def test_point_has_no_variance() -> None:
     alpha=st.floats(1.05, 50),
     beta=st.floats(1e-4, 1e3),
 )
-@settings(max_examples=50, deadline=None)
 def test_evidential_variance_is_the_students_t(gamma: float, nu: float, alpha: float, beta: float) -> None:
     """Marginally depth is Student-t with 2 alpha degrees of freedom (Amini et al., Eq. 7), whose variance is A + E."""
     prediction = EvidentialDepth(pixel(gamma), pixel(nu), pixel(alpha), pixel(beta)).prediction()
@@ -86,14 +85,12 @@ def test_evidential_moments_by_integration() -> None:
 
 
 @given(st.floats(-1e4, 1e4), st.floats(0, 1e3))
-@settings(max_examples=200, deadline=None)
 def test_soft_range_is_monotone_and_bounded(x: float, more: float) -> None:
     a, b = (float(soft_range(torch.tensor(v, dtype=torch.float64), LOW, HIGH)) for v in (x, x + more))
     assert LOW - 1e-9 <= a <= b + 1e-9 <= HIGH + 2e-9
 
 
 @given(st.floats(-8, 8))
-@settings(max_examples=100, deadline=None)
 def test_soft_range_is_the_identity_inside(x: float) -> None:
     """From 6 inside on the error is below e^-5.8 (here: ends at +-13.8)."""
     bent = float(soft_range(torch.tensor(x, dtype=torch.float64), LOW, HIGH))
@@ -165,7 +162,7 @@ def test_evidence_against_its_closed_form() -> None:
 
 
 @given(st.integers(0, 2**31), st.floats(0.01, 100))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_predicted_variances_are_positive(seed: int, scale: float) -> None:
     generator = torch.Generator().manual_seed(seed)
     for method in ("aleatoric", "evidential"):

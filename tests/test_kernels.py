@@ -19,12 +19,14 @@ from ufmstar_torch.correspond import correspond
 from ufmstar_torch.fuse import fuse
 from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu
 
+pytestmark = pytest.mark.numerics
+
 SIZE = (48, 64)
 K = torch.tensor(scenes.intrinsics(*SIZE))
 
 
 @given(st.integers(0, 10**6), st.floats(0.05, 0.6), st.floats(0.05, 0.9))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_correspond(seed, eta, eta_occl):
     previous, current = mixture(2, 14, seed), mixture(2, 8, seed + 50)
     config = UfMStarConfig(eta=eta, eta_occlusion=eta_occl)
@@ -36,7 +38,7 @@ def test_correspond(seed, eta, eta_occl):
 
 @pytest.mark.parametrize("weighted", [False, True])
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_fuse(weighted, seed):
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, features=2)
     pairs = random_pairs(2, previous, current, seed)

@@ -353,7 +353,7 @@ class TestMasks:
 
 
 class TestStreaming:
-    @settings(max_examples=20, deadline=None)
+    @settings(max_examples=20)
     @given(cut=st.integers(0, 12), seed=st.integers(0, 99))
     def test_parts_add_up_to_the_whole(self, cut: int, seed: int) -> None:
         d, v, g = maps(12, 9, seed=seed, scale=1.5)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
 import torch
 
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
@@ -41,6 +42,7 @@ def frames(count=5):
     return drawn
 
 
+@pytest.mark.slow
 def test_two_processes_reduce_to_what_one_computes(tmp_path):
     path, alone, by_error = tmp_path / "frames.pt", SequenceMetrics(), NLLByError()
     torch.save(frames(), path)

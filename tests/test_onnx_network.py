@@ -197,16 +197,20 @@ def test_names_that_the_graph_does_not_have(tmp_path: Path) -> None:
         OnnxNetwork(path, OnnxSpec(OutputSpec("metric", "depth"), input="x"))
 
 
-def test_a_layout_that_the_graph_contradicts(tmp_path: Path) -> None:
-    path = write(tmp_path / "n.onnx", nhwc=True, shape=[1, 6, 8, 3])
-    with pytest.raises(ValueError, match=r"'image' has shape \[1, 6, 8, 3\], expected 4 dimensions with 3 channels"):
-        OnnxNetwork(path, OnnxSpec(METRIC))
-
-
-def test_an_integer_graph_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "n.onnx", kind=TensorProto.INT32)
-    with pytest.raises(ValueError, match=r"input 'image' is tensor\(int32\), expected one of"):
-        OnnxNetwork(path, OnnxSpec(METRIC))
+@pytest.mark.parametrize(
+    ("graph", "message"),
+    [
+        (
+            {"nhwc": True, "shape": [1, 6, 8, 3]},
+            r"'image' has shape \[1, 6, 8, 3\], expected 4 dimensions with 3 channels",
+        ),
+        ({"kind": TensorProto.INT32}, r"input 'image' is tensor\(int32\), expected one of"),
+    ],
+    ids=["layout", "integers"],
+)
+def test_inputs_that_are_no_images(tmp_path: Path, graph: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        OnnxNetwork(write(tmp_path / "n.onnx", **graph), OnnxSpec(METRIC))
 
 
 def test_images_that_do_not_fit(tmp_path: Path, image: Tensor) -> None:
@@ -238,17 +242,19 @@ def test_outputs_of_another_resolution(tmp_path: Path, image: Tensor) -> None:
     torch.testing.assert_close(got, small.repeat_interleave(2, -1).repeat_interleave(2, -2))
 
 
-def test_outputs_of_another_shape(tmp_path: Path, image: Tensor) -> None:
-    nodes = [helper.make_node("Identity", ["image"], ["depth"])]
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("Identity", {}, r"output 'depth' must be \[B, 1, H, W\].*got \(3, 3, 6, 8\)"),
+        ("ReduceMax", {"axes": [0, 1], "keepdims": 1}, "holds 1 maps for 3 images"),
+    ],
+)
+def test_outputs_of_another_shape(
+    tmp_path: Path, image: Tensor, kind: str, options: dict[str, Any], message: str
+) -> None:
+    nodes = [helper.make_node(kind, ["image"], ["depth"], **options)]
     path = save(tmp_path / "n.onnx", nodes, [], [("image", ["n", 3, "h", "w"])], [("depth", None)])
-    with pytest.raises(ValueError, match=r"output 'depth' must be \[B, 1, H, W\].*got \(3, 3, 6, 8\)"):
-        OnnxNetwork(path, OnnxSpec(METRIC))(image)
-
-
-def test_one_map_for_many_images(tmp_path: Path, image: Tensor) -> None:
-    nodes = [helper.make_node("ReduceMax", ["image"], ["depth"], axes=[0, 1], keepdims=1)]
-    path = save(tmp_path / "n.onnx", nodes, [], [("image", ["n", 3, "h", "w"])], [("depth", None)])
-    with pytest.raises(ValueError, match="holds 1 maps for 3 images"):
+    with pytest.raises(ValueError, match=message):
         OnnxNetwork(path, OnnxSpec(METRIC))(image)
 
 

@@ -76,7 +76,6 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(preprocess: Preproc
 
 @given(height=st.integers(1, 2000), width=st.integers(1, 2000))
 @example(height=480, width=640)
-@settings(max_examples=200, deadline=None)
 def test_the_crop_fits_into_every_image(height: int, width: int) -> None:
     """Aspect kept, crop inside and as large as the rule says, whatever the size."""
     g = NYU.geometry(height, width)
@@ -142,7 +141,7 @@ def test_depth_pixels_are_the_ones_seen() -> None:
 
 
 @given(size=st.sampled_from(SIZES), preset=st.sampled_from(PRESETS))
-@settings(deadline=None, max_examples=35)
+@settings(max_examples=35)
 def test_nearest_source_pixel_is_within_half_a_pixel(size: tuple[int, int], preset: Preprocess) -> None:
     """Maps of row and column numbers tell which pixel was taken; the intrinsics tell which it should be."""
     u = torch.arange(size[1], dtype=torch.float64).expand(1, *size)

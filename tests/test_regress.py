@@ -17,6 +17,8 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
 from ufmstar_torch.regress import distribute, regress, regress_image, sample_pixels, shares, smooth
 
+pytestmark = pytest.mark.numerics
+
 K = torch.tensor(scenes.intrinsics(40, 56))[None]
 EXACT = UfMStarConfig(prior_mean=0.3, prior_weight=2.0)
 NEAR = EXACT.replace(regression="neighbourhood")
@@ -30,7 +32,7 @@ def rendered(seed: int = 0) -> torch.Tensor:
 
 @pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_agrees_with_the_oracle(config, seed):
     m = mixture(2, 9, seed, features=2)
     generator = torch.Generator().manual_seed(seed)

@@ -193,7 +193,7 @@ class TestStrips:
 
 
 class TestCompare:
-    @settings(max_examples=20, deadline=None)
+    @settings(max_examples=20)
     @given(st.integers(0, 2**32 - 1), st.floats(0.1, 1.0))
     def test_largest_difference_by_brute_force(self, seed: int, share: float) -> None:
         rng = np.random.default_rng(seed)
@@ -239,7 +239,7 @@ class TestProjection:
         assert found.angle[0] == pytest.approx(30)
         np.testing.assert_allclose(found.axes, [[SIGMAS, 0.0]], atol=1e-7)
 
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(st.integers(0, 2**32 - 1))
     def test_the_ellipse_reaches_as_far_as_the_gaussian(self, seed: int) -> None:
         """In every direction n of the picture its extent is that of the marginal: sigmas sqrt(n^T P S P^T n)."""

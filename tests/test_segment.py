@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from segment_scenes import REFERENCES, TIERS, camera, clutter, reference, room, run_oracle
 
 from ufmstar_torch import segment, segment_fusion
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.mixture import GaussianMixture
+
+pytestmark = pytest.mark.numerics
 
 # Where Cholesky failed, upstream added 1e-5 (a float32) to the diagonal.
 JITTER = float(np.float32(1e-5)) * np.eye(3)
@@ -112,7 +114,6 @@ def test_pruning_of_the_reference_in_both_readings(tier):
 
 
 @given(st.integers(0, 10**6), configs, st.integers(1, 24), st.integers(1, 30), st.booleans())
-@settings(max_examples=40, deadline=None)
 def test_torch_and_numba_against_the_oracle(seed, config, height, width, with_options):
     depth, K = clutter(seed, height, width)
     rng = np.random.default_rng(seed)

@@ -12,7 +12,7 @@ import time
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from layouts import write_seven_scenes
 from suite_runs import NAMES, go, job_on, write_rooms
@@ -28,7 +28,6 @@ from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest,
 # ---- work list ----
 
 
-@settings(deadline=None, max_examples=40)
 @given(st.integers(0, 60), st.integers(1, 12))
 def test_shards_take_every_sequence_exactly_once_and_equally_many(count, parts):
     items = [WorkItem("d", f"s{n:03}", "p", "auto") for n in range(count)]
@@ -43,7 +42,6 @@ def test_impossible_shards(text):
         Shard.parse(text)
 
 
-@settings(deadline=None, max_examples=40)
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, unique=True))
 def test_sequences_of_any_name_have_folders_of_their_own(sequence_names):
     items = [WorkItem("d", name, "p", "auto") for name in sequence_names]
@@ -323,7 +321,6 @@ def test_differences_name_five():
     assert differences({}, {str(n): n for n in range(1, 8)}).endswith("and 2 more")
 
 
-@settings(deadline=None, max_examples=40)
 @given(st.integers(1, 90), st.sampled_from([torch.int64, torch.float64]), st.integers(0, 2**31))
 def test_packed_sums_are_the_same_to_the_last_bit(size, kind, seed):
     generator = torch.Generator().manual_seed(seed)

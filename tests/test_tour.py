@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ufmstar_torch.eval.check.check import check_sequence
@@ -144,7 +144,6 @@ def test_a_quad_is_seen_from_its_front_only():
     np.testing.assert_allclose(visible[0], np.where(within, 2.0, np.inf), rtol=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from([BOX, ELLIPSOID, FRUSTUM]), st.floats(0.05, 1.4))
 def test_entry_is_the_first_point_of_the_solid(seed, kind, taper):
     """Against bisection of the solid's own inequality along densely sampled rays."""

@@ -39,7 +39,6 @@ def world_points(count, seed):
 
 
 @given(st.integers(0, 10**6), st.integers(2, 10))
-@settings(max_examples=40, deadline=None)
 def test_exact_tracks_give_exact_points(seed, count):
     T, points = views(count, seed), world_points(7, seed)
     seen = np.random.default_rng(seed).random((7, count)) < 0.8
@@ -57,7 +56,7 @@ def test_exact_tracks_give_exact_points(seed, count):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_the_compiled_twin_agrees(seed):
     T, points = views(5, seed), world_points(9, seed)
     rng = np.random.default_rng(seed)

@@ -6,32 +6,33 @@ import json
 import math
 import re
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from shared_data import require_shared
 from torch import nn
-from trainings import RECIPE, SPEC, tiny_job, with_network, write_frames
+from trainings import RECIPE, SPEC, scenes, tiny_job, with_network, write_frames
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.commands.options import parse, parser_of
 from ufmstar_torch.models.batch_layer import BatchLayer
 from ufmstar_torch.models.checkpoints import CheckpointError, read_safetensors
 from ufmstar_torch.models.monodepth2 import MonodepthResNet
 from ufmstar_torch.models.spec import NetworkSpec, build_network
 from ufmstar_torch.models.trained import load_trained, read_info, save_trained
 from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.train.augment import AugmentationConfig
+from ufmstar_torch.train.command import TrainOptions
 from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.examples import camera_image
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.history import METRICS, read_rows
-from ufmstar_torch.train.member import WEIGHTS, Job, make_data, new_network
+from ufmstar_torch.train.member import WEIGHTS, make_data, new_network
 from ufmstar_torch.train.module import NonFiniteLossError, TrainingModule, move_average, share_of_rate, step_seed
-from ufmstar_torch.train.options import parse_train, recipe_from, train_parser
 from ufmstar_torch.train.presets import OURS, PRESETS, Recipe, preset, table
-from ufmstar_torch.train.progress import Sums, ValidationSums, constant_nll
-from ufmstar_torch.train.settings import FitSettings
+from ufmstar_torch.train.progress import Sums, Validation
+from ufmstar_torch.train.settings import FitSettings, Job
 from ufmstar_torch.train.start import starting_network, train_only
 
 ONE_STEP = replace(RECIPE, max_steps=1)
@@ -98,12 +99,12 @@ def test_recipes_survive_json(name):
     ("values", "told"),
     [
         ({"epoch": 3}, r"Recipe has no \['epoch'\]"),
-        ({"epochs": 0}, r"Recipe\.epochs must be in \[1"),
-        ({"epochs": 2.5}, r"Recipe\.epochs must be int"),
-        ({"learning_rate": 0}, r"Recipe\.learning_rate must be in \(0"),
-        ({"learning_rate": float("nan")}, r"Recipe\.learning_rate must be in"),
-        ({"beta2": 1.0}, r"Recipe\.beta2 must be in \[0, 1\)"),
-        ({"schedule": "linear"}, r"Recipe\.schedule must be one of cosine, constant"),
+        ({"epochs": 0}, r"Recipe\.epochs must lie in \[1"),
+        ({"epochs": 2.5}, r"Recipe\.epochs must be a whole number"),
+        ({"learning_rate": 0}, r"Recipe\.learning_rate must lie in \(0"),
+        ({"learning_rate": float("nan")}, r"Recipe\.learning_rate must be a number"),
+        ({"beta2": 1.0}, r"Recipe\.beta2 must lie in \[0, 1\)"),
+        ({"schedule": "linear"}, r"Recipe\.schedule must be one of \('cosine', 'constant'\)"),
         ({"network": {"width": 2}}, r"NetworkSpec has no \['width'\]"),
         ({"network": {"method": "batch_ensemble", "members": 4}, "members": 2}, r"members must be 1 for a batch"),
     ],
@@ -128,7 +129,7 @@ def test_ensembles_of_different_seeds_share_no_member(tmp_path):
     second, first = new_network(jobs[0], 1), new_network(jobs[1], 0)
     key = "backbone.encoder.0.conv.weight"
     assert not torch.equal(second.state_dict()[key], first.state_dict()[key])
-    with pytest.raises(ValueError, match=r"Recipe\.members must be in \[1, 1000\]"):
+    with pytest.raises(ValueError, match=r"Recipe\.members must lie in \[1, 1000\]"):
         Recipe(members=1001)
 
 
@@ -169,27 +170,26 @@ def test_the_yardstick_is_the_likelihood_of_one_variance():
     predicted = depth + torch.randn(2, 5, 7, generator=generator, dtype=torch.float64) / 3
     valid = torch.rand(2, 5, 7, generator=generator) < 0.6
     variance = torch.full_like(depth, 0.3)
-    prediction = DepthPrediction(predicted, 0.25 * variance, 0.75 * variance)
-    sums = ValidationSums()
+    validation, alone = Validation(), Validation()
     for n in range(2):
-        part = DepthPrediction(*(value[n : n + 1] for value in (predicted, 0.25 * variance, 0.75 * variance)))
-        sums = sums.plus(part, depth[n : n + 1], valid[n : n + 1])
-    assert sums.pixels == valid.sum()
+        maps = (value[n : n + 1] for value in (predicted, 0.25 * variance, 0.75 * variance))
+        validation.update(DepthPrediction(*maps), depth[n : n + 1], valid[n : n + 1])
     error, truth = (predicted - depth)[valid].numpy(), depth[valid].numpy()
-    figures = sums.figures(Sums(0.3 * 11, 11))
+    figures = validation.figures(Sums(0.3 * 11, 11))
     normal = torch.distributions.Normal(predicted[valid], 0.3**0.5)
     assert figures["val_nll"] == pytest.approx(-float(normal.log_prob(depth[valid]).mean()), rel=1e-12)
-    # With the variance that the head says everywhere, there is no gain.
+    # The head's variance is the same everywhere, so it gains nothing.
     assert figures["val_nll_constant"] == pytest.approx(figures["val_nll"], rel=1e-12)
     assert figures["val_rmse"] == pytest.approx(np.sqrt((error**2).mean()))
     assert figures["val_rel"] == pytest.approx((abs(error) / truth).mean())
     ratio = np.maximum((truth + error) / truth, truth / (truth + error))
     assert figures["val_delta1"] == pytest.approx(((ratio < 1.25) & (ratio > 0)).mean())
     # No constant does better than the mean squared error.
-    best = figures["val_nll_constant_best"]
-    assert all(best <= constant_nll((error**2).mean(), v) for v in np.geomspace(1e-3, 10, 200))
-    assert best == pytest.approx(constant_nll((error**2).mean(), (error**2).mean()))
-    alone = ValidationSums().plus(DepthPrediction(prediction.depth), depth, valid)
+    constants = [validation.figures(Sums(v, 1))["val_nll_constant"] for v in np.geomspace(1e-3, 10, 200)]
+    best = validation.figures(Sums((error**2).mean(), 1))["val_nll_constant"]
+    assert figures["val_nll_constant_best"] == pytest.approx(best)
+    assert best <= min(constants)
+    alone.update(DepthPrediction(predicted), depth, valid)
     assert "val_nll" not in alone.figures(Sums())
 
 
@@ -197,25 +197,45 @@ def test_invalid_pixels_count_for_nothing():
     depth = torch.tensor([[[1.0, 0.0, float("nan"), 2.0]]])
     valid = torch.tensor([[[True, True, True, False]]])
     prediction = DepthPrediction(torch.tensor([[[1.5, 9.0, 9.0, 9.0]]]), torch.ones(1, 1, 4))
-    sums = ValidationSums().plus(prediction, depth, valid)
-    assert (sums.pixels, sums.squared, sums.with_variance) == (1, 0.25, 1)
+    validation = Validation()
+    validation.update(prediction, depth, valid)
+    figures = validation.figures(Sums())
+    assert (figures["val_rmse"], figures["val_nll"]) == (0.5, pytest.approx(0.125 + math.log(2 * math.pi) / 2))
+    validation = Validation()
+    validation.update(prediction, depth, ~valid & (depth > 5))
+    assert validation.figures(Sums()) == {}
 
 
 # ---- trainings ----
 
 
-def test_it_learns_depth_and_the_head_beats_every_constant(frames, tmp_path):
-    recipe = replace(RECIPE, epochs=25, average=0.0)
-    summary = fit(tiny_job(frames, tmp_path / "out", recipe, augment=False, checkpoint_every=0))
+def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
+    """Twelve scenes, the red half of each with noise of .9 m, twice for training and once more for validation.
+
+    Over ten seeds, the likelihood's gain was .45 nat at least (.51 in the median), the error of the depth .56 of the
+    depth's deviation at most (.28), sigma's ratio 2.7 at least (4.1) and the fall of the loss .71 at least (.83).
+    """
+    size = (64, 64)
+    folders = [str(write_frames(tmp_path / f"walk{n}", 12, size, noise=0.9, seed=n)) for n in (1, 2, 3)]
+    recipe = replace(with_network(RECIPE, size=size), epochs=20, average=0.0)
+    job = tiny_job(folders[0], tmp_path / "out", recipe, augment=False, checkpoint_every=0)
+    parts = {"part": "0:", "validation_part": "0:", "validation_paths": (folders[1],)}
+    summary = fit(replace(job, data=replace(job.data, paths=(folders[0], folders[2]), **parts)))
     rows = read_rows(tmp_path / "out" / "member_0" / METRICS)
     first, last = ({name: float(value) for name, value in rows[i].items()} for i in (0, -1))
-    assert [int(row["epoch"]) for row in rows] == list(range(25))
-    assert last["step"] == 75
-    assert last["train_loss"] < first["train_loss"] - 0.8
-    assert last["val_rmse"] < 0.75 * first["val_rmse"]
-    assert last["val_nll"] < last["val_nll_constant_best"] - 0.2
+    assert [int(row["epoch"]) for row in rows] == list(range(20))
+    assert last["step"] == 120
+    assert last["train_loss"] < first["train_loss"] - 0.3
+    assert last["val_nll"] < last["val_nll_constant_best"] - 0.15
     assert last["val_nll_constant_best"] <= last["val_nll_constant"]
     assert summary["mean"]["val_nll"] == last["val_nll"]
+    (network,) = load_trained(tmp_path / "out" / WEIGHTS)
+    images, depths, _, red = scenes(12, size, noisy=True)
+    with torch.no_grad():
+        prediction = network(torch.from_numpy(images).permute(0, 3, 1, 2) / 255)
+    error, sigma = prediction.depth.numpy() - depths, prediction.variance.sqrt().numpy()
+    assert np.sqrt((error[~red] ** 2).mean()) < 0.85 * depths[~red].std()
+    assert np.median(sigma[red]) > 1.5 * np.median(sigma[~red])
 
 
 @pytest.fixture(scope="module")
@@ -285,7 +305,8 @@ def test_a_resnet_trains(frames, tmp_path):
 
 
 def test_bfloat16_trains_and_its_loss_is_in_single_precision(frames, tmp_path):
-    recipe = replace(RECIPE, epochs=1, average=0.0)
+    """The loss of the first step: later ones depend on the weights that the earlier ones reached."""
+    recipe = replace(ONE_STEP, average=0.0)
     losses = []
     for name, precision in (("full", "32-true"), ("mixed", "bf16-mixed")):
         fit(tiny_job(frames, tmp_path / name, recipe, precision=precision))
@@ -366,10 +387,8 @@ def test_an_encoder_that_starts_from_nothing_is_told(ufmstar, frames, tmp_path, 
     (tmp_path / "x").write_text("nothing is trained: the folder is refused")
     code, _, said = ufmstar("train", *words, "--data", "sequences", "--root", frames, "--out", tmp_path)
     assert code == cli.FAILED
-    remark = (
-        "ufmstar train: the ResNet50 encoder starts from nothing; the paper's starts from ImageNet: --init imagenet"
-    )
-    assert said.splitlines()[:-1] == [remark] * told
+    remark = "the ResNet50 encoder starts from random weights; the paper's starts from ImageNet: --init imagenet"
+    assert said.splitlines()[:-1] == [f"ufmstar train: {remark}"] * told
 
 
 def test_members_start_with_weights_of_their_own_and_the_same_again(frames, tmp_path):
@@ -545,7 +564,7 @@ def test_a_stopped_training_says_how_to_go_on(ufmstar, frames, tmp_path):
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (["--epochs", "0"], r"Recipe\.epochs must be in \[1"),
+        (["--epochs", "0"], r"Recipe\.epochs must lie in \[1"),
         (["--epochs", "two"], r"epochs"),
         (["--learning-speed", "2"], r"[Uu]nrecognized arguments: --learning-speed 2"),
         (["--network.widths", "wide"], r"NetworkSpec\.widths must be"),
@@ -578,19 +597,29 @@ def test_what_is_missing_is_named(ufmstar, frames, tmp_path, missing):
 def test_a_file_may_hold_the_options(tmp_path):
     file = tmp_path / "train.yaml"
     file.write_text("preset: fastdepth-ensemble\nmembers: 3\nlearning_rate: 0.002\nnetwork: {widths: 0.5}\n")
-    options = parse_train(train_parser(), ["--config", str(file), "--epochs", "7"])
-    recipe = recipe_from(options)
+    recipe = parse(TrainOptions, ["--config", str(file), "--epochs", "7"], "ufmstar train").recipe()
     expected = replace(preset("fastdepth-ensemble"), members=3, learning_rate=0.002, epochs=7)
     assert recipe == replace(expected, network=replace(expected.network, widths=0.5))
     file.write_text("preset: fastdepth-ensemble\nlearning_speed: 2\n")
-    from jsonargparse import ArgumentError
-
-    with pytest.raises(ArgumentError, match="learning_speed"):
-        parse_train(train_parser(), ["--config", str(file)])
+    with pytest.raises(ValueError, match="learning_speed"):
+        parse(TrainOptions, ["--config", str(file)], "ufmstar train")
 
 
-def test_every_value_of_a_recipe_has_an_option():
-    options = parse_train(train_parser(), [])
-    assert {f.name for f in fields(Recipe)} - {"network"} <= set(options)
-    assert {f.name for f in fields(NetworkSpec)} - {"members"} == set(options["network"])
-    assert Path(__file__).exists()
+@pytest.mark.parametrize(
+    ("config", "prefix", "without"),
+    [
+        (Recipe, "", {"network"}),
+        (NetworkSpec, "network.", {"members"}),
+        (DataConfig, "", {"kind", "paths", "batch_size", "seed", "augmentation"}),
+        (AugmentationConfig, "augment.", set()),
+        (FitSettings, "", {"progress", "tensorboard"}),
+    ],
+)
+def test_every_value_has_an_option_with_its_meaning(config, prefix, without):
+    actions = {
+        word: action for action in parser_of(TrainOptions, "ufmstar train")._actions for word in action.option_strings
+    }
+    names = [f.name if prefix else f.name.replace("_", "-") for f in fields(config) if f.name not in without]
+    for name in names:
+        assert len(actions[f"--{prefix}{name}"].help) > 8, name
+    assert actions["--beta1"].help.startswith("Adam's first momentum")

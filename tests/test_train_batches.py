@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from training_data import loader, numbers, truncated, write_nyu
 
@@ -18,7 +18,6 @@ from ufmstar_torch.train.samples import SampleDataset
 LENGTHS = {"length": st.integers(1, 200), "batch_size": st.integers(1, 9), "world": st.integers(1, 4)}
 
 
-@settings(max_examples=60, deadline=None)
 @given(**LENGTHS, seed=st.integers(0, 2**32), epoch=st.integers(0, 1000))
 def test_processes_share_each_batch_of_one_process(length, batch_size, world, seed, epoch):
     step = batch_size * world
@@ -40,7 +39,6 @@ def test_processes_share_each_batch_of_one_process(length, batch_size, world, se
     assert all(key.epoch == epoch for batch in whole for key in batch)
 
 
-@settings(max_examples=60, deadline=None)
 @given(**LENGTHS)
 def test_validation_takes_every_frame_once(length, batch_size, world):
     parts = [EpochBatches(length, batch_size, rank=r, world=world, shuffle=False) for r in range(world)]
@@ -119,6 +117,7 @@ def test_loading_leaves_the_global_generator_alone():
     assert torch.equal(torch.get_rng_state(), state)
 
 
+@pytest.mark.slow
 def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
     """Spawned; what they find broken is known here, and they know what epoch it is."""
     frames = NyuFrames(write_nyu(tmp_path), "train")

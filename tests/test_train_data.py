@@ -15,7 +15,8 @@ from training_data import PLAIN, TINY, Numbered, loader, numbers, nyu_frame, tru
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation, AugmentationConfig
 from ufmstar_torch.train.batches import EpochBatches
-from ufmstar_torch.train.data import DataConfig, DepthDataModule
+from ufmstar_torch.train.data import DepthDataModule
+from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.samples import RawSample, SampleDataset, SampleError, SampleKey, make_sample
 from ufmstar_torch.train.tour_data import tour_frames
 

@@ -73,6 +73,7 @@ def alone(frames, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_losses_of_one(frames, alone, tmp_path):
     job = tiny_job(frames, tmp_path / "two", PLAIN)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -123,6 +124,7 @@ def as_two_computers(rank):
     return {"NODE_RANK": str(rank)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("launch", "settings"), [(as_torchrun, {"devices": 2}), (as_two_computers, {"devices": 1, "nodes": 2})]
 )
@@ -162,6 +164,7 @@ def meeting(monkeypatch):
     return trainer
 
 
+@pytest.mark.slow
 def test_every_training_waits_for_its_own_preparation(meeting, tmp_path):
     for _ in range(2):
         with (
@@ -173,6 +176,7 @@ def test_every_training_waits_for_its_own_preparation(meeting, tmp_path):
             pass
 
 
+@pytest.mark.slow
 def test_all_processes_end_where_the_first_cannot_prepare(meeting, tmp_path):
     @contextmanager
     def refused():
@@ -192,6 +196,7 @@ def test_all_processes_end_where_the_first_cannot_prepare(meeting, tmp_path):
         pass
 
 
+@pytest.mark.slow
 def test_one_validation_frame_for_two_processes(frames, tmp_path):
     """With batch norm, whose statistics DistributedDataParallel sends around in the first validation batch."""
     job = tiny_job(frames, tmp_path / "out", replace(PLAIN, max_steps=2))
@@ -210,6 +215,7 @@ def test_one_validation_frame_for_two_processes(frames, tmp_path):
     assert float(read_rows(tmp_path / "out" / "member_0" / METRICS)[-1]["val_rmse"]) > 0
 
 
+@pytest.mark.slow
 def test_the_processes_above_had_unequal_numbers_of_valid_pixels(frames, tmp_path):
     """Otherwise a mean of the processes' means would pass as well."""
     data = make_data(tiny_job(frames, tmp_path, PLAIN), 0, 1)
@@ -233,6 +239,7 @@ def test_settings_that_cannot_be(tmp_path):
             FitSettings(out=tmp_path, **values)
 
 
+@pytest.mark.slow
 def test_members_side_by_side_are_those_of_one_after_another(frames, tmp_path):
     recipe = replace(RECIPE, members=2, max_steps=2)
     fit(tiny_job(frames, tmp_path / "one", recipe))

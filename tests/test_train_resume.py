@@ -76,6 +76,7 @@ def stop_after(steps):
 # ---- killed ----
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path):
     code = f"""
         import os, signal, sys

@@ -8,17 +8,18 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from layouts import write_generic, write_scannet, write_tum
 from training_data import PLAIN, TINY, truncated
 
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.train.parts import Part
+from ufmstar_torch.eval.sequences.generic import open_unposed
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.samples import SampleDataset, SampleError
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
 from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_files, tour_frames
-from ufmstar_torch.train.unposed import open_unposed
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,6 @@ def test_an_empty_part_is_named():
         Part.parse("50:60").frames(20)
 
 
-@settings(max_examples=100, deadline=None)
 @given(length=st.integers(1, 5000), edge=st.integers(1, 99))
 def test_two_parts_that_meet_divide_every_sequence(length, edge):
     covered = []
@@ -152,15 +152,15 @@ def test_what_is_missing_in_an_unposed_folder_is_named(tmp_path):
     (path / "poses.txt").unlink()
     shutil.move(path / "K.txt", tmp_path / "K.txt")
     with pytest.raises(ValueError, match="pass intrinsics"):
-        open_unposed(path)
-    np.testing.assert_allclose(open_unposed(path, tmp_path / "K.txt").intrinsics, scene.K)
+        open_unposed(path, Options())
+    np.testing.assert_allclose(open_unposed(path, Options(intrinsics=tmp_path / "K.txt")).intrinsics, scene.K)
     for i, file in enumerate(sorted((path / "depth").iterdir())):
         file.rename(file.with_name(f"map{i + 500}.png"))
-    with pytest.raises(ValueError, match="none of 6 depth maps is named like"):
-        open_unposed(path, tmp_path / "K.txt")
+    with pytest.raises(ValueError, match=r"no depth map .* is named like"):
+        open_unposed(path, Options(intrinsics=tmp_path / "K.txt"))
     shutil.rmtree(path / "depth")
     with pytest.raises(ValueError, match="must hold one of"):
-        open_unposed(path, tmp_path / "K.txt")
+        open_unposed(path, Options(intrinsics=tmp_path / "K.txt"))
 
 
 @pytest.fixture(scope="module")

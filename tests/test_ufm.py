@@ -450,7 +450,7 @@ def test_layouts_and_half_precision_depth():
 # ---- properties ----
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), world=st.integers(0, 10**6))
 def test_the_world_frame_does_not_matter(seed, world):
     """The same views, poses told in another world: the same variances."""
@@ -465,7 +465,7 @@ def test_the_world_frame_does_not_matter(seed, world):
     assert torch.isclose(a, b, atol=1e-8, equal_nan=True).double().mean() > 0.99  # roundings to a pixel may differ
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(1, 400), st.integers(0, 10**6))
 def test_the_cap_holds_and_covariances_stay_positive(cap, seed):
     rng = np.random.default_rng(seed)

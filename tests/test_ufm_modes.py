@@ -12,6 +12,8 @@ from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.pipeline import combine
 from ufmstar_torch.prediction import DepthPrediction
 
+pytestmark = pytest.mark.numerics
+
 H, W, FRAMES, MEMBERS = 15, 20, 16, 3
 DEPTHS, POSES, K = scenes.sequence(FRAMES, H, W, 0.0)
 

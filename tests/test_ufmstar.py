@@ -13,6 +13,8 @@ import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.given import Anchors
 
+pytestmark = pytest.mark.numerics
+
 HEIGHT, WIDTH = 30, 40
 SPGF = SPGFConfig(
     adaptive_thresh_scale=0.13, occlusion_gap=2, n_check=4, sparse=1, min_pixels=14, min_rows=5, scale_with_image=False

@@ -48,7 +48,7 @@ def full_disk(*_: object, **__: object) -> NoReturn:
 
 
 class TestPng:
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=30)
     @given(st.lists(st.floats(0.001, 65.535), min_size=1, max_size=40))
     def test_within_half_a_unit(self, values: list[float]) -> None:
         from tempfile import TemporaryDirectory

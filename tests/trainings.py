@@ -9,10 +9,9 @@ from layouts import write_depth_png, write_image
 
 from ufmstar_torch.models.spec import NetworkSpec
 from ufmstar_torch.train.augment import AugmentationConfig
-from ufmstar_torch.train.data import DataConfig
-from ufmstar_torch.train.member import Job
+from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.presets import Recipe
-from ufmstar_torch.train.settings import FitSettings
+from ufmstar_torch.train.settings import FitSettings, Job
 
 SIZE = (32, 32)
 SPEC = NetworkSpec(widths=0.05, positive="softplus", size=SIZE, preprocess="resize")
@@ -20,17 +19,32 @@ SPEC = NetworkSpec(widths=0.05, positive="softplus", size=SIZE, preprocess="resi
 RECIPE = Recipe(SPEC, epochs=3, batch_size=4, learning_rate=0.01, average=0.9, clip=5.0, warmup_steps=2)
 
 
-def write_frames(root, frames=16):
-    """A generic sequence: smooth depth from 1 to 3 m, grey 100 times the depth, a fifth of the depth missing."""
+def scenes(count, size=SIZE, noisy=False):
+    """Images [N, H, W, 3] uint8, their depth [N, H, W] [m], where it is missing, and which half of the image is red.
+
+    Depth is smooth, 1 to 3 m, the image's grey 80 times the depth; a fifth of the depth is missing. If ``noisy``, the
+    right half of even images and the left one of odd ones is red, the other half has no red.
+    """
     rng = np.random.default_rng(7)
-    rows, columns = np.mgrid[0 : SIZE[0], 0 : SIZE[1]] / SIZE[0]
+    rows, columns = np.mgrid[0 : size[0], 0 : size[1]] / size[0]
+    drawn = [(*rng.uniform(-1, 1, 3), rng.uniform(size=size) < rng.uniform(0, 0.4)) for _ in range(count)]
+    depths = np.stack([2 + np.tanh(a + 2 * b * (rows - 0.5) + 2 * c * (columns - 0.5)) for a, b, c, _ in drawn])
+    images = np.repeat((80 * depths).round().astype(np.uint8)[..., None], 3, axis=-1)
+    red = (columns >= 0.5) ^ (np.arange(count) % 2 == 1)[:, None, None]
+    if noisy:
+        images[..., 0] = np.where(red, 255, 0)
+    return images, depths, np.stack([hole for *_, hole in drawn]), red
+
+
+def write_frames(root, frames=16, size=SIZE, noise=0.0, seed=0):
+    """A generic sequence of :func:`scenes`. With ``noise`` [m], the stored depth of the red half is too large or too
+    small by that much, at random with ``seed``."""
+    images, depths, holes, red = scenes(frames, size, noisy=noise > 0)
+    sign = np.random.default_rng(seed).choice([-1, 1], depths.shape)
+    stored = np.where(holes, 0, depths + np.where(red, noise * sign, 0))
     for i in range(frames):
-        a, b, c = rng.uniform(-1, 1, 3)
-        depth = 2 + np.tanh(a + 2 * b * (rows - 0.5) + 2 * c * (columns - 0.5))
-        image = np.repeat((80 * depth).round().astype(np.uint8)[..., None], 3, axis=-1)
-        hole = rng.uniform(size=SIZE) < rng.uniform(0, 0.4)
-        write_image(root / "images" / f"{i:03}.png", image)
-        write_depth_png(root / "depth" / f"{i:03}.png", np.where(hole, 0, depth), 1000)
+        write_image(root / "images" / f"{i:03}.png", images[i])
+        write_depth_png(root / "depth" / f"{i:03}.png", stored[i], 1000)
     np.savetxt(root / "K.txt", [[30, 0, 15.5], [0, 30, 15.5], [0, 0, 1]])
     np.savetxt(root / "poses.txt", [np.eye(4).ravel()] * frames)
     return root

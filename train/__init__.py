@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.data_config import DataConfig as DataConfig
     from ufmstar_torch.train.losses import loss_of as loss_of
     from ufmstar_torch.train.losses import loss_sums as loss_sums
-    from ufmstar_torch.train.member import Job as Job
     from ufmstar_torch.train.module import NonFiniteLossError as NonFiniteLossError
     from ufmstar_torch.train.module import TrainingModule as TrainingModule
     from ufmstar_torch.train.nyu import NyuFrames as NyuFrames
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.train.samples import SampleError as SampleError
     from ufmstar_torch.train.sequence_data import SequenceFrames as SequenceFrames
     from ufmstar_torch.train.settings import FitSettings as FitSettings
+    from ufmstar_torch.train.settings import Job as Job
     from ufmstar_torch.train.start import starting_network as starting_network
     from ufmstar_torch.train.tour_data import TourSettings as TourSettings
     from ufmstar_torch.train.tour_data import tour_frames as tour_frames

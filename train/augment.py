@@ -10,71 +10,48 @@ depth along the optical axis stays one.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.checked import Checked, choice, number
+
 
 @dataclass(frozen=True)
-class AugmentationConfig:
-    """What is drawn, each uniformly.
+class AugmentationConfig(Checked):
+    """Ranges from which the changes of a frame are drawn, each uniformly.
 
     Attributes:
-        scale: [1] range of the zoom factor s, at least 1, so that no border comes into the image.
-        rotation: [degrees] the image rotates by up to this, either way, about its centre. Corners
-            from outside are black and have no depth.
+        scale: range of the zoom factor s, at least 1, so that no border comes into the image.
+        rotation: the image rotates by up to this, either way, about its centre. Corners from outside are black and
+            have no depth.
         flip: probability of a mirrored image.
         crop: which part of the zoomed image is kept: "centre", or anywhere, "random".
-        zoom: what a zoom means. "depth": the camera stays as it is and everything is s times
-            nearer, so depth is divided by s (FastDepth): right for a network that knows no intrinsics and
-            has to learn one camera's relation of size and depth. "focal": the camera's focal length is s
-            times as long and depth stays (exact optics, but another camera).
-        brightness, contrast, saturation: [1] factors from 1 - x to 1 + x, in random order.
+        zoom: meaning of a zoom. "depth": the camera stays as it is and everything is s times nearer, so depth is
+            divided by s (FastDepth): right for a network that has no intrinsics as input and has to learn one camera's
+            relation of size and depth. "focal": the camera's focal length is s times as long and depth stays (exact
+            optics, but another camera).
+        brightness, contrast, saturation: range x of the factor, 1 - x to 1 + x; applied in random order.
 
     Raises:
-        ValueError: a value out of range.
+        ValueError: a value is impossible; the message names the field.
     """
 
     scale: tuple[float, float] = (1.0, 1.5)
-    rotation: float = 5.0
-    flip: float = 0.5
-    crop: str = "centre"
-    zoom: str = "depth"
-    brightness: float = 0.4
-    contrast: float = 0.4
-    saturation: float = 0.4
+    rotation: float = number(5.0, "angle", "degrees", 0, 180)
+    flip: float = number(0.5, "p", "1", 0, 1)
+    crop: str = choice("centre", "random")
+    zoom: str = choice("depth", "focal")
+    brightness: float = number(0.4, "x", "1", 0, 1)
+    contrast: float = number(0.4, "x", "1", 0, 1)
+    saturation: float = number(0.4, "x", "1", 0, 1)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if len(self.scale) != 2 or not 1 <= self.scale[0] <= self.scale[1] < math.inf:
             raise ValueError(f"AugmentationConfig.scale must be (low, high), 1 <= low <= high, got {self.scale}")
-        limits = {"rotation": 180.0, "flip": 1.0, "brightness": 1.0, "contrast": 1.0, "saturation": 1.0}
-        for name, high in limits.items():
-            if not 0 <= getattr(self, name) <= high:
-                raise ValueError(f"AugmentationConfig.{name} must lie in [0, {high:g}], got {getattr(self, name)}")
-        for name, words in {"crop": ("centre", "random"), "zoom": ("depth", "focal")}.items():
-            if getattr(self, name) not in words:
-                raise ValueError(f"AugmentationConfig.{name} must be one of {words}, got {getattr(self, name)!r}")
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> AugmentationConfig:
-        """From JSON: a list becomes a tuple.
-
-        Raises:
-            ValueError: an unknown key, or a value out of range.
-        """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"AugmentationConfig has no {unknown}; it has {sorted(known)}")
-        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**plain)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The fields as plain values."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -192,6 +169,8 @@ def apply_colour(image: Tensor, colour: tuple[tuple[str, float], ...]) -> Tensor
     """Brightness, contrast and saturation [3, H, W] as torchvision and Pillow define them.
 
     Those are kornia's functions with the long names; its ``adjust_brightness`` adds instead of multiplying.
+    (torchvision.transforms.v2 cannot replace ``apply_geometry``: its affine transform has no mirror, and no rotation
+    for pixels that are not square.)
     """
     from kornia import enhance
 

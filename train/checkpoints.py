@@ -5,7 +5,7 @@ OUT/member_0/last.ckpt    Lightning's checkpoint: weights, optimizer, schedule, 
 ```
 The order of the samples, their augmentation and dropout are functions of seed, epoch and step (``train.batches``,
 ``train.module.step_seed``), so no state of a random number generator has to be kept: nothing else that draws
-numbers, nor a progress bar, nor another number of workers, can change what a continued training computes.
+numbers, nor a progress bar, nor another number of workers, changes the result of a continued training.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TIME, STEPS, SIGNAL = "time budget spent", "step budget spent", "stopped"
 
 
 class ResumeError(ValueError):
-    """There is nothing to go on from, or it does not fit; the message says what to do."""
+    """The checkpoint cannot be read or does not fit; the message names the option that helps."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -85,13 +85,12 @@ class Checkpoints(pl.Callback):
 
 
 class Stops(pl.Callback):
-    """Ends a training in good order: with its last step, by the clock, or when asked to; in each case after a
-    validation.
+    """Ends a training in good order, after a validation: with its last step, at a deadline, or when asked to.
 
     Args:
         total: steps of the whole training.
         deadline: ``time.monotonic()`` at which to stop, or None.
-        asked: whether somebody wants it to stop.
+        asked: returns whether to stop.
 
     Attributes:
         reason: why it was stopped, or None.
@@ -105,8 +104,8 @@ class Stops(pl.Callback):
         self._sigterm = signal.getsignal(signal.SIGTERM)
 
     def on_train_start(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        """SIGTERM stays with who asks for the stop: Lightning has just put a handler of its own before it, which
-        ends the program with success and without a result."""
+        """Restore the caller's SIGTERM handler: Lightning has just replaced it by its own, which ends the program with
+        success and without a result."""
         if self.asked is not None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self._sigterm)
 
@@ -119,8 +118,7 @@ class Stops(pl.Callback):
             code = torch.tensor(0 if reason is None else 2 if asked else 1, device=module.device)
             torch.distributed.all_reduce(code, torch.distributed.ReduceOp.MAX)
             reason = (None, TIME, SIGNAL)[int(code)]
-        if reason is not None:
-            self.reason = reason
+        self.reason = self.reason if reason is None else reason
         if reason is not None or trainer.global_step >= self.total:
             trainer.should_stop = True
 
@@ -129,7 +127,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     """A checkpoint that :class:`Checkpoints` wrote.
 
     Raises:
-        ResumeError: it cannot be read, or is none of those.
+        ResumeError: the file cannot be read, or is another program's.
     """
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)

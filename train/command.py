@@ -1,42 +1,146 @@
-"""``ufmstar train``: trains what its options say, and prints the results."""
+"""``ufmstar train``: its options, and what it prints."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar
 
-from ufmstar_torch.eval.commands.options import UsageError
+from ufmstar_torch.eval.commands.options import UsageError, fields_of, option, parse
+from ufmstar_torch.models.spec import NetworkSpec
+from ufmstar_torch.train.augment import AugmentationConfig
+from ufmstar_torch.train.data_config import KINDS, DataConfig
+from ufmstar_torch.train.presets import PRESETS, Recipe, preset, table
+from ufmstar_torch.train.settings import FitSettings, Job
 
 
-def read(words: Sequence[str]) -> dict[str, Any]:
-    """The options of a command line.
+@dataclass(frozen=True, kw_only=True)
+class RecipeOptions:
+    """Instead of the preset's values."""
 
-    Raises:
-        ValueError: an unknown option, or a value of the wrong kind.
-        SystemExit: help was asked for.
+    recipe: dict[str, Any] = fields_of(Recipe, without=("network", "members"), unset=True)
+    network: dict[str, Any] = fields_of(NetworkSpec, "network.", without=("members",), unset=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataOptions:
+    """Data.
+
+    Attributes:
+        data: what --root contains; tours need none.
+        root: folder of NYU Depth V2, or sequences.
+        no_augmentation: train on the frames as they are.
     """
-    from jsonargparse import ArgumentError
 
-    from ufmstar_torch.train.options import parse_train, train_parser
-
-    try:
-        return {**parse_train(train_parser(), words), "words": list(words)}
-    except ArgumentError as error:
-        raise ValueError(error) from error
+    data: str | None = option(None, choices=KINDS)
+    root: tuple[str, ...] = ()
+    config: dict[str, Any] = fields_of(DataConfig, without=("kind", "paths", "batch_size", "seed", "augmentation"))
+    no_augmentation: bool = False
+    augment: dict[str, Any] = fields_of(AugmentationConfig, "augment.")
 
 
-def main(options: Mapping[str, Any]) -> int:
+@dataclass(frozen=True, kw_only=True)
+class SessionOptions:
+    """Session.
+
+    Attributes:
+        trainable: train only parameters whose names begin with one of these.
+        no_progress: no progress bar.
+        no_tensorboard: no logs for TensorBoard.
+    """
+
+    settings: dict[str, Any] = fields_of(FitSettings, without=("out", "trainable", "progress", "tensorboard"))
+    trainable: tuple[str, ...] = ()
+    no_progress: bool = False
+    no_tensorboard: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """Train a depth network with an uncertainty head, or an ensemble of them.
+
+    A preset states everything but the data; options change single values of it. OUT/trained.safetensors contains all
+    members in the end, for `ufmstar run --model trained --weights OUT/trained.safetensors`.
+
+    Attributes:
+        list: print the presets and stop.
+        preset: what is trained and how.
+        members: number of members of the ensemble or BatchEnsemble.
+        out: folder for all results.
+        resume: go on with the training in --out.
+        overwrite: replace the training in --out.
+        threads: CPU threads; default: one for each core.
+        debug: show tracebacks.
+    """
+
+    USAGE: ClassVar[str] = "ufmstar train --preset NAME --data {nyu,sequences,tour} [--root DIR...] --out OUT [options]"
+
+    list: bool = False
+    preset: str | None = option(None, choices=tuple(PRESETS))
+    members: int | None = None
+    out: Path | None = None
+    resume: bool = False
+    overwrite: bool = False
+    threads: int | None = None
+    debug: bool = False
+    changes: RecipeOptions = field(default_factory=RecipeOptions)
+    source: DataOptions = field(default_factory=DataOptions)
+    session: SessionOptions = field(default_factory=SessionOptions)
+
+    def recipe(self) -> Recipe:
+        """The preset with the values that the options change.
+
+        Raises:
+            ValueError: no preset, or an impossible value.
+        """
+        if self.preset is None:
+            raise ValueError("--preset is missing; ufmstar train --help")
+        recipe = preset(self.preset)
+        network = replace(recipe.network, **self.changes.network)
+        recipe = replace(recipe, network=network, **self.changes.recipe)
+        return recipe if self.members is None else recipe.with_members(self.members)
+
+    def job(self) -> Job:
+        """The training that the options mean.
+
+        Raises:
+            ValueError: an option is missing, options contradict each other, or a value is impossible.
+        """
+        recipe, d, s = self.recipe(), self.source, self.session
+        if d.data is None or self.out is None:
+            raise ValueError(f"--{'data' if d.data is None else 'out'} is missing; ufmstar train --help")
+        if self.resume and self.overwrite:
+            raise ValueError("--resume and --overwrite contradict each other")
+        if (d.data == "tour") == bool(d.root):
+            raise ValueError(f"--data {d.data} {'takes no' if d.root else 'needs'} --root")
+        augmentation = None if d.no_augmentation else AugmentationConfig(**d.augment)
+        data = DataConfig(kind=d.data, paths=d.root, augmentation=augmentation, **d.config)
+        shown = {"progress": not s.no_progress, "tensorboard": not s.no_tensorboard}
+        return Job(recipe, data, FitSettings(out=self.out, trainable=s.trainable, **shown, **s.settings))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Command(TrainOptions):
+    """The options and the words that they were read from, for the summary."""
+
+    words: Sequence[str]
+
+
+def read(words: Sequence[str]) -> _Command:
+    """The options of a command line; errors as :func:`parse`."""
+    options = parse(TrainOptions, words, "ufmstar train")
+    return _Command(**{f.name: getattr(options, f.name) for f in fields(options)}, words=words)
+
+
+def main(options: _Command) -> int:
     """Train, and print the results; the exit code."""
-    from ufmstar_torch.train.options import job_from
-
-    if options["list"]:
-        from ufmstar_torch.train.presets import table
-
+    if options.list:
         print(table())
         return 0
     try:
-        job = job_from(options)
+        job = options.job()
     except (ImportError, OSError, ValueError) as error:
         raise UsageError(error) from error
     from lightning.pytorch.utilities import rank_zero_only
@@ -49,9 +153,9 @@ def main(options: Mapping[str, Any]) -> int:
     remark = missing_start(job.recipe.network, job.settings.init)
     if remark and process.rank == 0:
         print(f"ufmstar train: {remark}", file=sys.stderr)
-    how = {"resume": options["resume"], "overwrite": options["overwrite"]}
+    command = ["ufmstar", "train", *options.words]
     with stop_signals(lambda text: print(text, file=sys.stderr), "step") as stop:
-        summary = fit(job, asked=stop, command=["ufmstar", "train", *options["words"]], **how)
+        summary = fit(job, resume=options.resume, overwrite=options.overwrite, asked=stop, command=command)
     if "members" not in summary:
         return 0  # a further process of a distributed training: the first one reports
     print(report(summary))

@@ -10,9 +10,8 @@ from lightning.pytorch import LightningDataModule
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
 from ufmstar_torch.train.batches import EpochBatches, EpochLoader
-from ufmstar_torch.train.data_config import DataConfig as DataConfig
+from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.nyu import NyuFrames
-from ufmstar_torch.train.parts import Part
 from ufmstar_torch.train.samples import FrameSource, SampleDataset
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
 from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_frames

@@ -1,42 +1,98 @@
-"""Where training data come from and how they are served, as plain values."""
+"""Where training data come from and how they are loaded, as plain values."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+import re
+from dataclasses import dataclass, field
 
+from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.train.augment import AugmentationConfig
-from ufmstar_torch.train.parts import Part
 
 KINDS = ("nyu", "sequences", "tour")
+_PART = re.compile(r"(\d+(?:\.\d+)?)\s*(%?):(\d+(?:\.\d+)?)\s*(%?)")
 
 
 @dataclass(frozen=True)
-class DataConfig:
+class Part:
+    """A contiguous part of a sequence, from one edge up to, not including, another one: ``0:70%``, ``75%:``.
+
+    Neighbouring frames of a video show the same thing, so held-back frames must not be close in time to training
+    frames. A sequence is therefore divided into contiguous parts, best with a gap between them (``0:70%`` and
+    ``75%:``), never at random.
+
+    Attributes:
+        start, stop: a number of frames, or a percentage of them where ``start_share`` / ``stop_share``.
+    """
+
+    start: float
+    stop: float
+    start_share: bool
+    stop_share: bool
+
+    @classmethod
+    def parse(cls, text: str) -> Part:
+        """``START:STOP``, each a frame number or a percentage of the frames; left out: the first, the end.
+
+        Raises:
+            ValueError: anything else, a share above 100 %, or an empty part.
+        """
+        start, colon, stop = text.partition(":")
+        found = _PART.fullmatch(f"{start.strip() or '0'}:{stop.strip() or '100%'}") if colon else None
+        if found is None or _impossible(found[1], found[2]) or _impossible(found[3], found[4]):
+            raise ValueError(f"a part must be START:STOP in frames or percent (0:70%, 100:400), got {text!r}")
+        part = cls(float(found[1]), float(found[3]), bool(found[2]), bool(found[4]))
+        if part.start_share == part.stop_share and part.start >= part.stop:
+            raise ValueError(f"a part must end behind its start, got {text!r}")
+        return part
+
+    def frames(self, length: int) -> range:
+        """The frame numbers of a sequence of that length.
+
+        Raises:
+            ValueError: the part has no frame.
+        """
+        edges = [(self.start, self.start_share), (self.stop, self.stop_share)]
+        # Rounded to 1e-6 first: 70 % of 10 is 7, and not the integer part of 0.7 * 10.
+        numbers = [int(round(value * length / 100, 6)) if share else int(value) for value, share in edges]
+        part = range(min(length, numbers[0]), min(length, numbers[1]))
+        if not part:
+            raise ValueError(f"the part {self} of {length} frames is empty")
+        return part
+
+    def __str__(self) -> str:
+        return f"{self.start:g}{'%' * self.start_share}:{self.stop:g}{'%' * self.stop_share}"
+
+
+def _impossible(value: str, unit: str) -> bool:
+    """A share above 100 %, or a fraction of a frame."""
+    return float(value) > 100 if unit else "." in value
+
+
+@dataclass(frozen=True)
+class DataConfig(Checked):
     """Training and validation data.
 
     Attributes:
-        kind: "nyu" (FastDepth's h5 layout), "sequences" (whatever ``open_sequence`` reads, and folders of
-            images and depth maps without poses), or "tour" (rendered rooms).
+        kind: "nyu" (FastDepth's h5 layout), "sequences" (the layouts of ``open_sequence``, and folders of images and
+            depth maps without poses), or "tour" (rendered rooms).
         paths: nyu: the folder with ``train`` and ``val``; sequences: one or more; tour: none.
         validation_paths: sequences to validate on; empty = the held-back part of ``paths``.
-        part: what of each sequence is trained on, ``START:STOP`` in frames or percent.
-        validation_part: what of each sequence is held back. A gap behind ``part`` keeps frames that show the
+        part: part of each sequence to train on, ``START:STOP`` in frames or percent.
+        validation_part: part of each sequence that is held back. A gap behind ``part`` keeps frames that show the
             same thing out of both.
         tours: number of rendered tours to train on.
-        validation_tours: to validate on; others than those.
-        first_tour: seed of the first one, the others follow; the default leaves the small numbers, which a
-            user tries, to tours that training has never seen.
-        tour_frames: of each tour.
-        tour_stride: every how many steps of the walk a frame is taken; a step is about 12 cm or 5 degrees.
+        validation_tours: number of other tours to validate on.
+        first_tour: seed of the first tour, the others follow; the default leaves the small numbers, which users
+            try, to tours that training has never seen.
+        tour_frames: frames of each tour.
+        tour_stride: steps of the walk between two frames; a step is about 12 cm or 5 degrees.
         tour_style: "home", "hall" or "mixed".
         tour_size: (height, width) [px] of the rendered frames.
         tour_fov: horizontal field of view [degrees].
         cache: folder for rendered tours; empty = the user's cache folder.
-        render_workers: processes that render, at least 1.
+        render_workers: processes that render.
         batch_size: frames per step and process.
-        workers: processes that load frames; 0 = none but the training's own.
+        workers: processes that load frames; 0 = the training's own.
         seed: of the order and the augmentation.
         augmentation: of the training part, or None.
         on_bad_file: "raise" or "skip", see ``SampleDataset``.
@@ -45,39 +101,35 @@ class DataConfig:
         ValueError: a value is impossible; the message names the field.
     """
 
-    kind: str = "tour"
+    kind: str = choice("tour", "nyu", "sequences")
     paths: tuple[str, ...] = ()
     validation_paths: tuple[str, ...] = ()
     part: str = "0:80%"
     validation_part: str = "85%:100%"
-    tours: int = 100
-    validation_tours: int = 8
-    first_tour: int = 10_000
-    tour_frames: int = 40
-    tour_stride: int = 6
+    tours: int = number(100, "N", "tours", 1)
+    validation_tours: int = number(8, "N", "tours", 1)
+    first_tour: int = number(10_000, "seed", "1", 0)
+    tour_frames: int = number(40, "N", "frames", 1)
+    tour_stride: int = number(6, "N", "steps", 1)
     tour_style: str = "home"
     tour_size: tuple[int, int] = (160, 224)
     tour_fov: float = 70.0
     cache: str = ""
-    render_workers: int = 1
-    batch_size: int = 8
-    workers: int = 0
-    seed: int = 0
+    render_workers: int = number(1, "N", "processes", 1)
+    batch_size: int = number(8, "B", "frames", 1)
+    workers: int = number(0, "N", "processes", 0)
+    seed: int = number(0, "seed", "1", 0)
     augmentation: AugmentationConfig | None = field(default_factory=AugmentationConfig)
-    on_bad_file: str = "raise"
+    on_bad_file: str = choice("raise", "skip")
 
     def __post_init__(self) -> None:
-        lowest = {"tours": 1, "validation_tours": 1, "first_tour": 0, "tour_frames": 1, "tour_stride": 1}
-        for name, low in {**lowest, "render_workers": 1, "batch_size": 1, "workers": 0, "seed": 0}.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < low:
-                raise ValueError(f"DataConfig.{name} must be a whole number of at least {low}, got {value!r}")
-        for name, words in {"kind": KINDS, "on_bad_file": ("raise", "skip")}.items():
-            if getattr(self, name) not in words:
-                raise ValueError(f"DataConfig.{name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
-        wanted = {"nyu": "one folder", "sequences": "at least one sequence", "tour": "nothing"}[self.kind]
-        found = len(self.paths)
-        if not {"nyu": found == 1, "sequences": found >= 1, "tour": found == 0}[self.kind]:
+        super().__post_init__()
+        least, most, wanted = {
+            "nyu": (1, 1, "one folder"),
+            "sequences": (1, None, "at least one sequence"),
+            "tour": (0, 0, "nothing"),
+        }[self.kind]
+        if len(self.paths) < least or (most is not None and len(self.paths) > most):
             raise ValueError(f"DataConfig.paths must name {wanted} where kind is {self.kind!r}, got {self.paths}")
         if self.validation_paths and self.kind != "sequences":
             raise ValueError(f"DataConfig.validation_paths is for kind 'sequences', got kind {self.kind!r}")
@@ -86,22 +138,3 @@ class DataConfig:
                 Part.parse(getattr(self, name))
             except ValueError as error:
                 raise ValueError(f"DataConfig.{name}: {error}") from error
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> DataConfig:
-        """From JSON: lists become tuples, a mapping the augmentation.
-
-        Raises:
-            ValueError: an unknown key, or an impossible value.
-        """
-        known = {f.name for f in fields(cls)}
-        if unknown := sorted(set(values) - known):
-            raise ValueError(f"DataConfig has no {unknown}; it has {sorted(known)}")
-        plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        if isinstance(plain.get("augmentation"), Mapping):
-            plain["augmentation"] = AugmentationConfig.from_dict(plain["augmentation"])
-        return cls(**plain)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The fields as plain values."""
-        return asdict(self)

@@ -1,4 +1,4 @@
-"""The members of an ensemble: which are finished, and training those that are not, in turn or side by side."""
+"""The members of an ensemble: which are finished, and training of the others, in turn or side by side."""
 
 from __future__ import annotations
 
@@ -8,37 +8,20 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from ufmstar_torch.models.checkpoints import fill, read_safetensors
-from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.spec import build_network
-from ufmstar_torch.models.trained import read_info
-from ufmstar_torch.train.member import RESULT, Job, train_member
+from ufmstar_torch.train.member import RESULT, train_member
+from ufmstar_torch.train.settings import Job
 
 _POLL_SECONDS = 0.2
 
 
 def read_result(job: Job, member: int) -> dict[str, Any]:
-    """A member's result.json; empty where there is none."""
+    """The content of a member's result.json; empty where there is none."""
     file = job.folder(member) / RESULT
     return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
-
-
-def unfinished(job: Job) -> list[int]:
-    """The members that need training."""
-    return [member for member in range(job.recipe.members) if not read_result(job, member).get("finished")]
-
-
-def stored_network(path: Path) -> DepthNetwork:
-    """The one network in a member's file, in the form that it is trained in."""
-    network = build_network(read_info(path).spec)
-    state, _ = read_safetensors(path, prefix="member.0.")
-    fill(network, {k: value.float() if value.is_floating_point() else value for k, value in state.items()}, str(path))
-    return network
 
 
 def train_members(job: Job, *, end: float | None = None, asked: Callable[[], bool] | None = None) -> str | None:
@@ -46,32 +29,34 @@ def train_members(job: Job, *, end: float | None = None, asked: Callable[[], boo
 
     Args:
         job: what and how; ``settings.member_processes`` of them at the same time.
-        end: ``time.monotonic()`` at which all of it has to stop, or None. What is left of the time is divided evenly,
-            so that no member goes without.
-        asked: whether somebody wants it to stop.
+        end: ``time.monotonic()`` at which all training stops, or None. The remaining time is divided evenly among
+            the members.
+        asked: returns whether to stop.
 
     Returns:
         None when all are finished, otherwise why not.
     """
-    members = unfinished(job)
+    members = [member for member in range(job.recipe.members) if not read_result(job, member).get("finished")]
     if job.settings.member_processes > 1 and len(members) > 1:
         return _side_by_side(job, members, end, asked)
     reasons = []
     for turn, member in enumerate(members):
-        if asked is not None and asked():
+        stop = asked is not None and asked()
+        deadline = share_of_time(end, len(members) - turn)
+        reasons.append("stopped" if stop else train_member(job, member, deadline=deadline, asked=asked))
+        if stop:
             break
-        reasons.append(train_member(job, member, deadline=share_of_time(end, len(members) - turn), asked=asked))
-    return _why([*reasons, *([] if len(reasons) == len(members) else ["stopped"])])
+    return _first_reason(reasons)
 
 
 def share_of_time(end: float | None, turns: int) -> float | None:
-    """When the first of ``turns`` equal turns from now on to ``end`` is over, in ``time.monotonic()``'s seconds."""
+    """End of the first of ``turns`` equal turns from now to ``end``, in ``time.monotonic()``'s seconds."""
     now = time.monotonic()
     return None if end is None else now + max(0.0, end - now) / turns
 
 
 def _side_by_side(job: Job, members: Sequence[int], end: float | None, asked: Callable[[], bool] | None) -> str | None:
-    """Each member in a process of its own, on a GPU of its own where there are some."""
+    """Train each member in a process of its own, on a GPU of its own where there are several."""
     context = get_context("spawn")
     count = min(job.settings.member_processes, len(members))
     stop, slots = context.Event(), context.Queue()
@@ -80,22 +65,21 @@ def _side_by_side(job: Job, members: Sequence[int], end: float | None, asked: Ca
     job = replace(job, settings=replace(job.settings, progress=False))
     with ProcessPoolExecutor(count, context, _join, (stop, slots, count)) as pool:
         turns = [-(-(len(members) - i) // count) for i in range(len(members))]
-        waiting = [pool.submit(_in_worker, job, m, end, n) for m, n in zip(members, turns, strict=True)]
-        while not all(future.done() for future in waiting):
-            if asked is not None and asked():
-                stop.set()
-            if any(future.done() and future.exception() is not None for future in waiting):
+        futures = [pool.submit(_in_worker, job, m, end, n) for m, n in zip(members, turns, strict=True)]
+        while not all(future.done() for future in futures):
+            failed = any(future.done() and future.exception() is not None for future in futures)
+            if failed or (asked is not None and asked()):
                 stop.set()
             time.sleep(_POLL_SECONDS)
-    return _why([future.result() for future in waiting])
+    return _first_reason([future.result() for future in futures])
 
 
-def _why(reasons: Sequence[str | None]) -> str | None:
+def _first_reason(reasons: Sequence[str | None]) -> str | None:
     return next((reason for reason in reasons if reason is not None), None)
 
 
 class _Worker:
-    """What a worker process knows of its place."""
+    """State of a worker process: the event that asks it to stop, and its number."""
 
     stop: Any = None
     slot: int = 0

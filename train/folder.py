@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder
-from ufmstar_torch.train.member import WEIGHTS, Job
+from ufmstar_torch.train.member import WEIGHTS
+from ufmstar_torch.train.settings import Job
 
 SUMMARY = "summary.json"
 # Fields of the data's configuration that change how fast samples come, not which.

@@ -6,8 +6,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import lightning.pytorch as pl
@@ -18,47 +17,19 @@ from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import save_trained
 from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, Checkpoints, Stops, read_checkpoint
-from ufmstar_torch.train.data import DataConfig, DepthDataModule
+from ufmstar_torch.train.data import DepthDataModule
 from ufmstar_torch.train.examples import Examples
-from ufmstar_torch.train.history import METRICS, History, Start, read_rows
+from ufmstar_torch.train.history import METRICS, History, read_rows
 from ufmstar_torch.train.module import TrainingModule, step_seed
-from ufmstar_torch.train.presets import MOST_MEMBERS, Recipe
-from ufmstar_torch.train.settings import FitSettings
+from ufmstar_torch.train.settings import Job
 from ufmstar_torch.train.start import starting_network, train_only
 
 _LIGHTNINGS_OWN = r"`isinstance\(treespec, LeafSpec\)` is deprecated"
 WEIGHTS, RESULT = "trained.safetensors", "result.json"
 
 
-@dataclass(frozen=True)
-class Job:
-    """What is trained, on what, and how it is run; plain values that pickle.
-
-    Attributes:
-        recipe: decides the weights.
-        data: where samples come from; its batch size and seed are replaced by the recipe's and the member's.
-        settings: of this run.
-    """
-
-    recipe: Recipe
-    data: DataConfig
-    settings: FitSettings
-
-    def folder(self, member: int) -> Path:
-        """Of everything that belongs to one member."""
-        return self.settings.out / f"member_{member}"
-
-    def seed(self, member: int) -> int:
-        """Of a member's first weights, order of samples, augmentation and dropout.
-
-        Two trainings with different seeds share none: seed + member would give seeds 0 and 1 nine of ten members in
-        common.
-        """
-        return self.settings.seed * MOST_MEMBERS + member
-
-
 def new_network(job: Job, member: int) -> DepthNetwork:
-    """The network that a member starts with; the same for the same seed, whatever was drawn before."""
+    """The network that a member starts with; it depends on the seed alone."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_seed(job.seed(member), 0, -1))
         network = starting_network(job.recipe.network, job.settings.init, member)
@@ -69,16 +40,16 @@ def new_network(job: Job, member: int) -> DepthNetwork:
 def train_member(
     job: Job, member: int, *, deadline: float | None = None, asked: Callable[[], bool] | None = None
 ) -> str | None:
-    """Train one member, going on from its checkpoint where it has one.
+    """Train one member, from its checkpoint if it has one.
 
     Args:
         job: what and how.
         member: its number.
         deadline: ``time.monotonic()`` at which to stop, or None.
-        asked: whether somebody wants it to stop.
+        asked: returns whether to stop.
 
     Returns:
-        None when it is finished, otherwise why it was stopped; both times its weights are on disk.
+        None when it is finished, otherwise why it was stopped; in both cases its weights are on disk.
 
     Raises:
         NonFiniteLossError: the training has diverged.
@@ -88,27 +59,27 @@ def train_member(
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / NAME
     stored = read_checkpoint(checkpoint) if checkpoint.is_file() else None
-    history = History(folder, s.log_every, None if stored is None else Start.after(stored))
+    history = History(folder, s.log_every, stored)
     with quiet_lightning():
         trainer: Any = make_trainer(job, member)
         data = make_data(job, member, trainer.world_size)
-        total = total_steps(job, data)
+        total, epochs = training_length(job, data)
         stops = Stops(total, deadline, asked)
-        examples = [Examples(folder, data, s.examples, epochs(job, data))] if s.examples else []
-        # In this order: whether to stop is known before the checkpoint is written.
+        examples = [Examples(folder, data, s.examples, epochs)] if s.examples else []
+        # In this order: Stops decides before Checkpoints writes.
         trainer.callbacks[:0] = [*examples, stops, history, Checkpoints(checkpoint, s.checkpoint_every)]
         module = TrainingModule(new_network(job, member), job.recipe, total, job.seed(member))
         trainer.fit(module, data, ckpt_path=None if stored is None else checkpoint, weights_only=True)
-    # Who asks for a stop at the last step gets a finished training.
+    # A stop that is asked for at the last step leaves a finished training.
     reason = stops.reason if trainer.global_step < total else None
     if trainer.is_global_zero:
-        finish(job, member, module, history, trainer.global_step, reason)
+        _finish(job, member, module, history, trainer.global_step, reason)
     trainer.strategy.barrier("member is written")
     return reason
 
 
 def make_data(job: Job, member: int, world: int) -> DepthDataModule:
-    """The member's data, opened.
+    """The member's data, opened, for ``world`` processes.
 
     Raises:
         ValueError: the batch cannot be divided among the processes.
@@ -121,29 +92,21 @@ def make_data(job: Job, member: int, world: int) -> DepthDataModule:
     return data
 
 
-def total_steps(job: Job, data: DepthDataModule) -> int:
-    """Optimizer steps of the whole training.
+def training_length(job: Job, data: DepthDataModule) -> tuple[int, int]:
+    """Optimizer steps of the whole training, and the number of epochs that they begin.
 
     Raises:
         ValueError: an epoch has no full batch.
     """
-    return job.recipe.max_steps or job.recipe.epochs * _steps_per_epoch(job, data)
-
-
-def epochs(job: Job, data: DepthDataModule) -> int:
-    """How many epochs are begun."""
-    return -(-total_steps(job, data) // _steps_per_epoch(job, data))
-
-
-def _steps_per_epoch(job: Job, data: DepthDataModule) -> int:
     images, batch = len(data.train_set or ()), job.recipe.batch_size
     if images < batch:
         raise ValueError(f"the training part has {images} images, fewer than batch_size {batch}")
-    return images // batch
+    steps = job.recipe.max_steps or job.recipe.epochs * (images // batch)
+    return steps, -(-steps // (images // batch))
 
 
 def make_trainer(job: Job, member: int) -> pl.Trainer:
-    """Lightning's trainer; nothing of it writes checkpoints but :class:`Checkpoints`."""
+    """Lightning's trainer; only :class:`Checkpoints` writes checkpoints."""
     r, s = job.recipe, job.settings
     precision: Any = s.precision  # one of many literals, which Lightning checks
     return pl.Trainer(
@@ -155,7 +118,7 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
         max_epochs=-1 if r.max_steps else r.epochs,
         max_steps=r.max_steps or -1,
         gradient_clip_val=r.clip or None,
-        logger=tensorboard(job, member),
+        logger=_tensorboard(job, member) if s.tensorboard else False,
         callbacks=[TQDMProgressBar(leave=True)] if s.progress else [],
         sync_batchnorm=s.sync_batchnorm,
         plugins=[AtomicCheckpointIO()],
@@ -169,22 +132,25 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
     )
 
 
-def tensorboard(job: Job, member: int) -> Any:
-    """The logger for TensorBoard, or False."""
-    if not job.settings.tensorboard:
-        return False
+def _tensorboard(job: Job, member: int) -> Any:
     from lightning.pytorch.loggers import TensorBoardLogger
 
     return TensorBoardLogger(str(job.settings.out), name="tensorboard", version=f"member_{member}")
 
 
-def finish(job: Job, member: int, module: TrainingModule, history: History, step: int, reason: str | None) -> None:
-    """Write the weights, and then result.json, whose "finished" says that the member needs no more training."""
+def _finish(job: Job, member: int, module: TrainingModule, history: History, step: int, reason: str | None) -> None:
+    """Write the weights, and then result.json, whose "finished" states that the member needs no more training."""
     folder = job.folder(member)
     rows = read_rows(folder / METRICS)
-    figures: dict[str, Any] = {k: float(v) for k, v in rows[-1].items() if v} if rows else {}
-    told = {"member": member, "seed": job.seed(member), "steps": step, "seconds": round(history.seconds, 1)}
-    result = {**told, "finished": reason is None, "stopped": reason, "figures": figures}
+    result = {
+        "member": member,
+        "seed": job.seed(member),
+        "steps": step,
+        "seconds": round(history.seconds, 1),
+        "finished": reason is None,
+        "stopped": reason,
+        "figures": {k: float(v) for k, v in rows[-1].items() if v} if rows else {},
+    }
     info = {"recipe": job.recipe.to_dict(), **result}
     save_trained(folder / WEIGHTS, [module.result.eval()], job.recipe.network, info=info)
     write_json_atomic(folder / RESULT, result)

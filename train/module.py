@@ -1,10 +1,11 @@
-"""The Lightning module: loss, optimizer, schedule, and what is told of a network while it is trained."""
+"""The Lightning module: loss, optimizer, schedule, running mean of the weights, and the figures that are logged."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import astuple
 from typing import Any
 
 import lightning.pytorch as pl
@@ -20,7 +21,7 @@ from ufmstar_torch.models.distribution import DepthDistribution
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.train.losses import loss_sums
 from ufmstar_torch.train.presets import Recipe
-from ufmstar_torch.train.progress import Sums, ValidationSums
+from ufmstar_torch.train.progress import Sums, Validation
 
 Batch = Mapping[str, Any]
 
@@ -32,8 +33,8 @@ class NonFiniteLossError(RuntimeError):
 class TrainingModule(pl.LightningModule):
     """Trains one network.
 
-    Every random number of a step (dropout) follows from (seed, process, step) alone, so that a run that was killed
-    goes on as if nothing had happened, whatever else drew random numbers meanwhile.
+    Every random number of a step (dropout) follows from (seed, process, step) alone, so that a resumed training gives
+    the same weights as an uninterrupted one, whatever else draws random numbers.
 
     Args:
         network: an ``UncertaintyNetwork``, ``MonteCarloDropout`` or ``BatchEnsemble``: it has ``.distribution(image)``.
@@ -58,7 +59,7 @@ class TrainingModule(pl.LightningModule):
         self.averaged: Any = copy.deepcopy(network).requires_grad_(False) if recipe.average else None
         self.residuals = Sums()
         self.losses = Sums()
-        self.validation = ValidationSums()
+        self.validation = Validation()
         self._batch_idx = 0
 
     @property
@@ -70,18 +71,18 @@ class TrainingModule(pl.LightningModule):
     # ---- training ----
 
     def on_train_start(self) -> None:
-        """Parts that are not trained keep their batch norms' statistics as well."""
+        """Put the parts that are not trained into eval mode, so that their batch norms keep their statistics."""
         for part in self.network.modules():
             own = list(part.parameters(recurse=False))
             if own and not any(p.requires_grad for p in own):
                 part.eval()
 
     def on_train_epoch_start(self) -> None:
-        """The sums are those of one epoch."""
+        """Empty sums."""
         self.residuals, self.losses = Sums(), Sums()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Random numbers that depend on nothing but seed, process and step."""
+        """Seed torch's generator from seed, process and step."""
         self._batch_idx = batch_idx
         torch.manual_seed(step_seed(self.seed, self.global_rank, self.global_step))
 
@@ -118,10 +119,14 @@ class TrainingModule(pl.LightningModule):
             raise NonFiniteLossError(self._blame("gradient", self._batch_idx))
 
     def optimizer_step(self, *arguments: Any, **named: Any) -> None:
-        """A step, and the running mean after it (here, so that a checkpoint after the step holds both)."""
+        """A step, and the running mean after it (here, so that a checkpoint after the step contains both).
+
+        Not Lightning's ``WeightAveraging``: its mean begins with the first step's weights instead of the start's, it
+        averages batch norm's counters, and it exchanges the weights in checkpoints.
+        """
         super().optimizer_step(*arguments, **named)
         if self.averaged is not None:
-            # The start is not worth remembering: the first steps get a shorter memory.
+            # A shorter memory in the first steps, so that the mean forgets the random weights soon.
             decay = min(self.recipe.average, self.global_step / (self.global_step + 10))
             move_average(self.averaged, self.network, decay)
 
@@ -133,7 +138,7 @@ class TrainingModule(pl.LightningModule):
     def configure_optimizers(self) -> Any:
         """Adam and the schedule, step by step."""
         r = self.recipe
-        # Decay pulls to 0; the factors of a BatchEnsemble belong around 1.
+        # Weight decay pulls to 0, but the factors of a BatchEnsemble are multipliers around 1.
         factors = {id(p) for p in (self.network.factors() if isinstance(self.network, BatchEnsemble) else ())}
         trained = [p for p in self.network.parameters() if p.requires_grad]
         groups = [
@@ -147,30 +152,26 @@ class TrainingModule(pl.LightningModule):
     # ---- validation ----
 
     def on_validation_epoch_start(self) -> None:
-        """A fresh start."""
-        self.validation = ValidationSums()
+        """Empty sums."""
+        self.validation = Validation(self.device)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """Add a batch to the sums."""
-        prediction = self.result(batch["image"])
-        self.validation = self.validation.plus(prediction, batch["depth"], batch["valid"])
+        self.validation.update(self.result(batch["image"]), batch["depth"], batch["valid"])
 
     def on_validation_epoch_end(self) -> None:
         """Log the validation's figures, over all processes."""
-        sums = self.validation.over(lambda values: self._over_processes(values.to(self.device))[0])
-        if not sums.pixels:
-            return
-        for name, value in sums.figures(self.residuals).items():
+        for name, value in self.validation.figures(self.residuals).items():
             self.log(name, value, prog_bar=name in ("val_nll", "val_delta1"), sync_dist=True)
 
     # ---- state ----
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The epoch's sums, beside what Lightning keeps."""
-        checkpoint["ufmstar_sums"] = {"residuals": self.residuals.to_list(), "losses": self.losses.to_list()}
+        checkpoint["ufmstar_sums"] = {"residuals": [*astuple(self.residuals)], "losses": [*astuple(self.losses)]}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The same back."""
+        """Restore the epoch's sums."""
         self.residuals = Sums(*checkpoint["ufmstar_sums"]["residuals"])
         self.losses = Sums(*checkpoint["ufmstar_sums"]["losses"])
 

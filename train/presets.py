@@ -1,47 +1,48 @@
-"""The recipes: what is trained and how, one named table row each.
+"""Recipes: the settings that decide a training's weights, and the named presets.
 
 From the paper (Section V-A): 224 x 224, 50 epochs, Adam with betas (0.9, 0.999), weight decay 1e-4, dropout
 0.2 "for all ResNet50-Monodepth2 and FastDepth models", ten members. All methods are therefore trained with decoder
 dropout; at test time only mc_dropout samples by it. The paper does not state the learning rate, its schedule or the
-batch size; those are ours and stand in :data:`OURS`, nowhere else.
+batch size; those are ours (:data:`OURS`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, get_type_hints
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.spec import NetworkSpec
 
-# Of an encoder that starts from ImageNet, and of one that starts from nothing: small steps keep what the former
-# knows, the latter has nothing to lose. Eight images a step are what FastDepth was trained with.
+# An encoder that starts from ImageNet needs small steps to keep what it has learned; one with random weights takes
+# larger ones. FastDepth was trained with eight images a step.
 OURS: dict[str, dict[str, Any]] = {
     "monodepth2": {"learning_rate": 1e-4, "batch_size": 8, "schedule": "cosine"},
     "fastdepth": {"learning_rate": 1e-3, "batch_size": 8, "schedule": "cosine"},
 }
-SCHEDULES = ("cosine", "constant")
-# Of an ensemble; seeds of two trainings lie that far apart (``train.member.Job.seed``).
+# Of an ensemble; the seeds of two trainings lie that far apart (``train.settings.Job.seed``).
 MOST_MEMBERS = 1000
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """Everything that decides what weights come out, apart from the data and the seed.
+class Recipe(Checked):
+    """The settings that decide the weights, apart from the data and the seed.
 
     Attributes:
-        network: what is trained; its size is what the data are brought to.
-        members: of an ensemble, each trained for itself (those of a BatchEnsemble are the network's own).
+        network: what is trained; its size is the size of the samples.
+        members: of an ensemble, each trained by itself (those of a BatchEnsemble belong to the network).
         epochs: passes over the training part.
-        max_steps: optimizer steps of one member, with which the schedule then ends; 0 = all of the epochs.
+        max_steps: optimizer steps of one member, at which the schedule ends; 0 = all steps of the epochs.
         batch_size: images per step, over all processes together.
-        learning_rate: at the start, after the warm-up.
-        schedule: "cosine" (down to 0 at the last step) or "constant".
-        warmup_steps: over which the learning rate rises linearly from 0.
-        beta1, beta2: of Adam.
-        weight_decay: L2 penalty, as Adam adds it to the gradient.
-        clip: the gradient's largest norm, 0 = not clipped.
-        average: decay per step of the running mean of the weights, which then are the result; 0 = none.
+        learning_rate: Adam's step size after the warm-up.
+        schedule: of the learning rate: "cosine" (down to 0 at the last step) or "constant".
+        warmup_steps: number of steps in which the learning rate rises linearly from 0.
+        beta1: Adam's first momentum: the decay of the mean gradient.
+        beta2: Adam's second momentum: the decay of the mean squared gradient.
+        weight_decay: L2 penalty, which Adam adds to the gradient.
+        clip: largest norm of the gradient, 0 = not clipped.
+        average: decay per step of the running mean of the weights, which is the result then; 0 = no mean.
         half: whether the weights are stored in half precision at the end.
 
     Raises:
@@ -49,75 +50,36 @@ class Recipe:
     """
 
     network: NetworkSpec = field(default_factory=NetworkSpec)
-    members: int = 1
-    epochs: int = 50
-    max_steps: int = 0
-    batch_size: int = 8
-    learning_rate: float = 1e-3
-    schedule: str = "cosine"
-    warmup_steps: int = 0
-    beta1: float = 0.9
-    beta2: float = 0.999
-    weight_decay: float = 1e-4
-    clip: float = 0.0
-    average: float = 0.0
+    members: int = number(1, "M", "networks", 1, MOST_MEMBERS)
+    epochs: int = number(50, "N", "epochs", 1, 1e6)
+    max_steps: int = number(0, "N", "steps", 0, 1e9)
+    batch_size: int = number(8, "B", "images", 1, 1e5)
+    learning_rate: float = number(1e-3, "lr", "1", 0, 10, open_low=True)
+    schedule: str = choice("cosine", "constant")
+    warmup_steps: int = number(0, "N", "steps", 0, 1e9)
+    beta1: float = number(0.9, "beta_1", "1", 0, 1, open_high=True)
+    beta2: float = number(0.999, "beta_2", "1", 0, 1, open_high=True)
+    weight_decay: float = number(1e-4, "lambda", "1", 0, 10)
+    clip: float = number(0.0, "|g|", "1", 0, 1e6)
+    average: float = number(0.0, "d", "1", 0, 1, open_high=True)
     half: bool = False
 
     def __post_init__(self) -> None:
-        if self.schedule not in SCHEDULES:
-            raise ValueError(f"Recipe.schedule must be one of {', '.join(SCHEDULES)}, got {self.schedule!r}")
-        for name, (low, high, ends) in _RANGES.items():
-            value = getattr(self, name)
-            inside = low < value < high or (value == low and ends[0] == "[") or (value == high and ends[1] == "]")
-            if isinstance(value, bool) or not inside:
-                raise ValueError(f"Recipe.{name} must be in {ends[0]}{low:g}, {high:g}{ends[1]}, got {value}")
+        super().__post_init__()
         if self.network.method == "batch_ensemble" and self.members > 1:
             raise ValueError("Recipe.members must be 1 for a batch_ensemble: its members are Recipe.network.members")
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Recipe:
-        """From plain values, "network" being what ``NetworkSpec.from_dict`` takes.
-
-        Raises:
-            ValueError: an unknown key, a wrong type or an impossible value.
-        """
-        types = get_type_hints(cls)
-        if unknown := sorted(set(values) - set(types)):
-            raise ValueError(f"Recipe has no {unknown}; it has {sorted(types)}")
-        plain = dict(values)
-        if isinstance(plain.get("network"), Mapping):
-            plain["network"] = NetworkSpec.from_dict(plain["network"])
-        for name, value in plain.items():
-            wanted = types[name]
-            if not isinstance(value, wanted) and not (wanted is float and isinstance(value, int)):
-                raise ValueError(f"Recipe.{name} must be {wanted.__name__}, got {value!r}")
-        return cls(**plain)
-
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain values for JSON."""
-        return {**asdict(self), "network": self.network.to_dict()}
+        return {**super().to_dict(), "network": self.network.to_dict()}
 
     def with_members(self, count: int) -> Recipe:
-        """The same with another number of members, of the ensemble or of the BatchEnsemble."""
+        """The recipe with another number of members, of the ensemble or of the BatchEnsemble."""
         if self.network.method == "batch_ensemble":
             return replace(self, network=replace(self.network, members=count))
         return replace(self, members=count)
 
 
-# Field -> smallest and largest value, and whether each is allowed itself.
-_RANGES: dict[str, tuple[float, float, str]] = {
-    "members": (1, MOST_MEMBERS, "[]"),
-    "epochs": (1, 1e6, "[]"),
-    "max_steps": (0, 1e9, "[]"),
-    "batch_size": (1, 1e5, "[]"),
-    "learning_rate": (0, 10, "(]"),
-    "warmup_steps": (0, 1e9, "[]"),
-    "beta1": (0, 1, "[)"),
-    "beta2": (0, 1, "[)"),
-    "weight_decay": (0, 10, "[]"),
-    "clip": (0, 1e6, "[]"),
-    "average": (0, 1, "[)"),
-}
 # [1] Decoder dropout of every model that the paper trains.
 _DROPOUT = 0.2
 # Second half of a preset's name -> the network's fields, members of the ensemble.
@@ -129,7 +91,7 @@ _METHOD_ROWS: dict[str, tuple[dict[str, Any], int]] = {
     "ensemble": ({"method": "aleatoric"}, 10),
     "batch-ensemble": ({"method": "batch_ensemble", "members": 10}, 1),
 }
-# What trains the checkpoint that the package ships: small enough to be sent along, quick enough for two cores.
+# The recipe of the weights that the package contains: small enough for the package, fast enough for two cores.
 _DEMO = Recipe(
     network=NetworkSpec(
         architecture="fastdepth",
@@ -182,8 +144,11 @@ def table() -> str:
         widths = str(n.widths) if n.architecture == "fastdepth" else f"ResNet{n.layers}"
         training = (f"{r.epochs}", f"{r.batch_size}", f"{r.learning_rate:g} {r.schedule}", f"{r.weight_decay:g}")
         rows.append((name, n.method, f"{members}", widths, size, *training, f"{n.dropout:g}" if n.dropout else "-"))
-    spaces = [max(len(row[i]) for row in rows) for i in range(len(columns))]
-    return "\n".join("  ".join(cell.ljust(s) for cell, s in zip(row, spaces, strict=True)).rstrip() for row in rows)
+    return text_table(rows)
 
 
-FIELDS = tuple(f.name for f in fields(Recipe) if f.name not in ("network", "members"))
+def text_table(rows: Sequence[Sequence[str]], justify: Callable[[str, int], str] = str.ljust) -> str:
+    """Rows of equal length as lines with aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(justify, row, widths)).rstrip() for row in rows)
+    return "\n".join(lines)

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.generic import has_images_and_depth, open_unposed
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.layout import detect_layout, open_sequence
-from ufmstar_torch.train.parts import Part
+from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.samples import RawSample, SampleError
-from ufmstar_torch.train.unposed import is_unposed, open_unposed
 
 
 class SequenceFrames:
@@ -82,9 +83,9 @@ def open_rgbd(source: str | Path) -> FrameSequence:
         ValueError: neither of them, with what was looked for.
     """
     path = Path(source)
-    if is_unposed(path):
+    if has_images_and_depth(path):
         try:
             detect_layout(path)
         except ValueError:  # no layout with poses
-            return open_unposed(path)
+            return open_unposed(path, Options())
     return open_sequence(source)

@@ -1,26 +1,38 @@
-"""How a training is run: what may change between two sessions of the same training without changing its result."""
+"""How a training is run, and the job: recipe, data and settings together."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
+from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.train.data_config import DataConfig
+from ufmstar_torch.train.presets import MOST_MEMBERS, Recipe
 
-@dataclass(frozen=True)
-class FitSettings:
-    """Attributes:
-        out: folder for everything that is written.
-        seed: of the training; member n has 1000 seed + n, so that trainings with different seeds share none.
-        init: weights to start from, or None; see ``train.start.starting_network``.
-        trainable: only parameters whose names begin so are trained; empty = all of them.
-        accelerator, devices, nodes, strategy, precision: as Lightning's Trainer takes them; of the strategies,
-            those that start processes as scripts ("ddp", not "ddp_spawn").
+
+@dataclass(frozen=True, kw_only=True)
+class FitSettings(Checked):
+    """Where and how a training runs. Apart from seed, init, trainable and precision, the settings may change between
+    two sessions of one training without changing its result.
+
+    Attributes:
+        out: output folder.
+        seed: of the training; member n has the seed 1000 seed + n, so that trainings with different seeds share none.
+        init: weights to start from: a trained .safetensors, FastDepth's .onnx, a ResNet's .pth, Monodepth2's folder or
+            the word imagenet; see ``train.start.starting_network``.
+        trainable: train only parameters whose names begin with one of these; empty = all of them.
+        accelerator: cpu, gpu or auto.
+        devices: number of processes or GPUs, as Lightning takes it.
+        nodes: number of computers.
+        strategy: Lightning's name of how processes work together: auto, ddp, ...; those that start processes as
+            scripts ("ddp", not "ddp_spawn").
+        precision: 32-true, bf16-mixed or 16-mixed; the loss is in float32 always.
         member_processes: members that are trained at the same time, each in a process of its own.
         checkpoint_every: steps between checkpoints within an epoch, 0 = at the end of epochs only.
         log_every: steps between rows of steps.csv.
-        examples: validation images in the picture that every epoch leaves, 0 = no pictures.
-        max_minutes: after which this session stops in good order, over all members; 0 = never.
-        sync_batchnorm: whether batch norm uses the statistics of the batches of all processes (GPUs only).
+        examples: validation images in each epoch's picture, 0 = no pictures.
+        max_minutes: after which this session stops in good order, all members together; --resume goes on. 0 = never.
+        sync_batchnorm: whether batch norm uses the batches of all processes (GPUs only).
         tensorboard: whether to write logs for TensorBoard.
         progress: whether to show a progress bar.
 
@@ -29,29 +41,53 @@ class FitSettings:
     """
 
     out: Path
-    seed: int = 0
+    seed: int = number(0, "seed", "1", 0)
     init: Path | None = None
     trainable: tuple[str, ...] = ()
     accelerator: str = "auto"
     devices: int | str = 1
-    nodes: int = 1
+    nodes: int = number(1, "N", "computers", 1)
     strategy: str = "auto"
     precision: str = "32-true"
-    member_processes: int = 1
-    checkpoint_every: int = 500
-    log_every: int = 50
-    examples: int = 4
-    max_minutes: float = 0.0
+    member_processes: int = number(1, "N", "processes", 1)
+    checkpoint_every: int = number(500, "N", "steps", 0)
+    log_every: int = number(50, "N", "steps", 1)
+    examples: int = number(4, "N", "images", 0)
+    max_minutes: float = number(0.0, "t", "min", 0)
     sync_batchnorm: bool = False
     tensorboard: bool = True
     progress: bool = True
 
     def __post_init__(self) -> None:
-        lowest = {"seed": 0, "nodes": 1, "member_processes": 1, "checkpoint_every": 0, "log_every": 1, "examples": 0}
-        for name, low in {**lowest, "max_minutes": 0}.items():
-            if not getattr(self, name) >= low:
-                raise ValueError(f"FitSettings.{name} must be at least {low}, got {getattr(self, name)}")
+        super().__post_init__()
         if any(word in self.strategy for word in ("spawn", "fork", "notebook")):
             raise ValueError(f"FitSettings.strategy must start processes as scripts: 'ddp', not {self.strategy!r}")
         if self.member_processes > 1 and (self.devices != 1 or self.nodes != 1):
             raise ValueError("FitSettings.member_processes above 1 goes with devices = 1 and nodes = 1")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is trained, on what data, and how it is run; plain values that pickle.
+
+    Attributes:
+        recipe: decides the weights.
+        data: where samples come from; its batch size and seed are replaced by the recipe's and the member's.
+        settings: of this session.
+    """
+
+    recipe: Recipe
+    data: DataConfig
+    settings: FitSettings
+
+    def folder(self, member: int) -> Path:
+        """The folder of one member's files."""
+        return self.settings.out / f"member_{member}"
+
+    def seed(self, member: int) -> int:
+        """The seed of a member's first weights, order of samples, augmentation and dropout.
+
+        Trainings with different seeds share none: with seed + member, seeds 0 and 1 would have nine of ten members in
+        common.
+        """
+        return self.settings.seed * MOST_MEMBERS + member

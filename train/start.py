@@ -1,4 +1,4 @@
-"""Where a training starts: from nothing or from weights that are there, and which parameters may change."""
+"""Where a training starts: from random or given weights, and which parameters are trained."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WAYS = f"trained .safetensors, FastDepth's .onnx, ResNet weights (.pth, or {IMAG
 
 
 def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> DepthNetwork:
-    """The network of a spec with the weights of a file; what the file does not have comes from torch's generator.
+    """The network of a spec with the weights of a file; other weights are drawn from torch's generator.
 
     Args:
         spec: what to build.
@@ -36,7 +36,7 @@ def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> D
     Raises:
         FileNotFoundError: there is no such file.
         CheckpointError: the file is damaged or does not fit.
-        ValueError: the file holds another architecture than the spec's; the message says which options fit.
+        ValueError: the file contains another architecture than the spec's; the message names the options that fit.
     """
     if init is None:
         return build_network(spec)
@@ -48,20 +48,21 @@ def starting_network(spec: NetworkSpec, init: Path | None, member: int = 0) -> D
 
 
 def missing_start(spec: NetworkSpec, init: Path | None) -> str | None:
-    """What to tell of a start that is not the paper's, or None."""
+    """A remark on a start that is not the paper's, or None."""
     if spec.architecture != "monodepth2" or init is not None:
         return None
-    return f"the ResNet{spec.layers} encoder starts from nothing; the paper's starts from ImageNet: --init {IMAGENET}"
+    encoder = f"the ResNet{spec.layers} encoder starts from random weights"
+    return f"{encoder}; the paper's starts from ImageNet: --init {IMAGENET}"
 
 
 def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
     """Leave only the parameters whose names begin with one of ``prefixes`` to be trained, in place.
 
     Returns:
-        How many numbers that are.
+        The number of trained weights.
 
     Raises:
-        ValueError: a prefix fits no parameter; the message names the parts there are.
+        ValueError: a prefix fits no parameter; the message names the network's parts.
     """
     names = [name for name, _ in network.named_parameters()]
     for prefix in prefixes:
@@ -85,9 +86,8 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
     """The whole network where the spec is the file's but for input and dropout, otherwise its backbone."""
     info = read_info(path)
     state, _ = read_safetensors(path, prefix=f"member.{member % info.networks}.")
-    state = {key: value.float() if value.is_floating_point() else value for key, value in state.items()}
     source = build_network(info.spec)
-    fill(source, state, str(path))
+    fill(source, {k: v.float() if v.is_floating_point() else v for k, v in state.items()}, str(path))
     shared = ("size", "preprocess", "dropout", "method", "members")
     own = replace(info.spec, **{name: getattr(spec, name) for name in shared})
     if own != spec:

@@ -2,8 +2,8 @@
 
 A tour's files are ``<seed>.image.npy`` (uint8 [F, 3, H, W]), ``<seed>.depth.npy`` (uint16 [F, H, W] in
 millimetres, 0 = none) and ``<seed>.camera.npy`` (float64 [3, 3]), written atomically and the camera last, so
-that its presence says that the tour is complete. They lie in a folder whose name is a digest of everything that
-decides what they show, the renderer's source included: another setting or another version never finds them.
+that its presence means that the tour is complete. The name of their folder is a digest of everything that decides
+their content, the renderer's source included, so that other settings and other versions have folders of their own.
 """
 
 from __future__ import annotations
@@ -25,53 +25,51 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.results.files import write_together
 from ufmstar_torch.eval.tour.style import TourStyle, style_of
 from ufmstar_torch.train.samples import RawSample, SampleError
 
 _LOG = logging.getLogger(__name__)
-# [m] Half of it is the error of a stored depth; 65 m are the farthest.
+# [m] Twice the largest error of a stored depth; the largest depth is 65 m.
 _UNIT = 1e-3
 _FARTHEST = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True)
-class TourSettings:
-    """What a tour's stored frames show, apart from its seed.
+class TourSettings(Checked):
+    """What the stored frames of a tour show, apart from its seed.
 
     Attributes:
         frames: of each tour.
-        stride: every how many steps of the walk a frame is taken.
+        stride: steps of the walk between two frames.
         size: (height, width) [px].
         style: of the rooms.
-        fov: horizontal field of view [degrees].
+        fov: horizontal field of view.
 
     Raises:
         ValueError: a number out of range, or no such style.
     """
 
-    frames: int = 40
-    stride: int = 6
+    frames: int = number(40, "N", "frames", 1)
+    stride: int = number(6, "N", "steps", 1)
     size: tuple[int, int] = (160, 224)
     style: str | TourStyle = "home"
-    fov: float = 70.0
+    fov: float = number(70.0, "fov", "degrees", 20, 120)
 
     def __post_init__(self) -> None:
-        if min(self.frames, self.stride) < 1:
-            raise ValueError(f"frames and stride must be at least 1, got {self.frames} and {self.stride}")
+        super().__post_init__()
         if len(self.size) != 2 or min(self.size) < 8:
-            raise ValueError(f"size must be (height, width) of at least 8 px each, got {self.size}")
-        if not 20 <= self.fov <= 120:
-            raise ValueError(f"fov must be 20 to 120 degrees, got {self.fov}")
+            raise ValueError(f"TourSettings.size must be (height, width) of at least 8 px each, got {self.size}")
         style_of(self.style)
 
     def digest(self) -> str:
         """16 hexadecimal digits that change with every setting and with the renderer's source."""
         import ufmstar_torch.eval.tour as package
 
-        told = {**asdict(self), "style": asdict(style_of(self.style))}
+        settings = {**asdict(self), "style": asdict(style_of(self.style))}
         sources = sorted(Path(str(package.__file__)).parent.glob("*.py"))
-        digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
         for source in (*sources, Path(__file__)):
             digest.update(source.read_bytes())
         return digest.hexdigest()[:16]
@@ -133,17 +131,17 @@ def tour_frames(
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> TourFrames:
-    """The frames of tours, rendered where that has not been done before.
+    """The frames of tours, which are rendered if the cache does not have them.
 
-    Interrupted, it goes on with the tours that are missing. Several processes may call it at the same time
-    (those of a distributed run do): they render in different orders, and each leaves out what is there by then.
+    After an interruption it goes on with the missing tours. Several processes may call it at the same time (those of a
+    distributed run do): they render in different orders, and skip tours that another process has stored.
 
     Args:
         seeds: of the tours.
         settings: what is rendered.
         cache: folder; None = ``ufmstar_torch/tours`` in the user's cache folder.
         workers: processes that render; 1 = this one.
-        progress: called with the number of tours that are there and of all.
+        progress: called with the number of stored tours and of all.
 
     Raises:
         ValueError: no seed, or a number out of range.
@@ -178,7 +176,7 @@ def default_cache() -> Path:
 
 
 def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
-    """Renders one tour into its files, unless they are there by now."""
+    """Renders one tour into its files, unless they exist."""
     from ufmstar_torch.eval.tour import tour_sequence
 
     files = tour_files(folder, seed)

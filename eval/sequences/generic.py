@@ -7,6 +7,7 @@ frames`` or in the folder itself, or one video file; a trajectory ``poses.txt tr
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics, scale_intri
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.pairing import pair_by_name
 from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
+from ufmstar_torch.eval.sequences.tum import SCALE as TUM_SCALE
 from ufmstar_torch.eval.sequences.tum import read_file_list
 from ufmstar_torch.eval.sequences.video import VIDEO_SUFFIXES, Video
 
@@ -81,9 +83,7 @@ def open_generic(path: Path, options: Options) -> FrameSequence:
             continue
         load_depth = depth_loader(depth_files.get(name), options.depth_scale)
         frames.append(Entry(name, T, loaders[i], load_depth, None if times is None else float(times[i])))
-    K = read_intrinsics(
-        options.intrinsics if options.intrinsics is not None else _given_or_found(root, None, INTRINSICS, "intrinsics")
-    )
+    K = _intrinsics(root, options)
     depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
     return make_sequence(
         path.resolve().stem if path.is_file() else path.resolve().name,
@@ -94,6 +94,54 @@ def open_generic(path: Path, options: Options) -> FrameSequence:
         depth_intrinsics=_depth_intrinsics(options, K, size, depth_size),
         depth_size=depth_size,
     )
+
+
+def has_images_and_depth(path: Path) -> bool:
+    """Whether a folder has a folder of images and one of depth maps where :func:`open_unposed` looks for them."""
+    return path.is_dir() and all(any((path / name).is_dir() for name in names) for names in (IMAGES, DEPTHS))
+
+
+def open_unposed(path: Path, options: Options) -> FrameSequence:
+    """Opens images with depth maps for uses that need no poses, such as training.
+
+    As :func:`open_generic` without a trajectory. Images without a depth map are skipped. Without ``depth_scale``, maps
+    beside TUM's ``depth.txt`` are in 1/5000 m.
+
+    Returns:
+        A sequence with ``posed`` False; its poses are the identity and mean nothing.
+
+    Raises:
+        ValueError: images, depth maps or intrinsics are not found, or no depth map fits an image.
+    """
+    options.reject("unposed", "trajectory", "T_color_depth")
+    if not has_images_and_depth(path):
+        raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
+    first = next(name for name in IMAGES if (path / name).is_dir())
+    names, loaders, size, times = _images(path, replace(options, images=options.images or path / first))
+    files = _depth_files(path, names, times, options)
+    scale = options.depth_scale
+    if scale is None and (path / "depth.txt").is_file():
+        scale = TUM_SCALE
+    frames: list[Entry | Skipped] = [
+        Entry(name, np.eye(4), load, depth_loader(files[name], scale))
+        if name in files
+        else Skipped(name, "no depth map")
+        for name, load in zip(names, loaders, strict=True)
+    ]
+    return make_sequence(
+        path.resolve().name,
+        "unposed",
+        frames,
+        _intrinsics(path, options),
+        image_size=size,
+        depth_size=common_size(frame.load_depth for frame in frames if isinstance(frame, Entry)),
+        posed=False,
+    )
+
+
+def _intrinsics(root: Path, options: Options) -> np.ndarray:
+    given = options.intrinsics
+    return read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics") if given is None else given)
 
 
 def _images(path: Path, options: Options) -> tuple[list[str], list[Loader], Size | None, np.ndarray | None]:

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt"
-_SCALE = 1 / 5000
+SCALE = 1 / 5000
 _NATIVE_SIZE = (480, 640)
 # The colour cameras' published calibration, by robot; their distortion is left in the images.
 _INTRINSICS = {
@@ -61,7 +61,7 @@ def open_tum(path: Path, options: Options) -> FrameSequence:
         elif T is None:
             frames.append(Skipped(name, no_pose(options)))
         else:
-            load_depth = depth_loader(depth_files.get(i), options.depth_scale, _SCALE)
+            load_depth = depth_loader(depth_files.get(i), options.depth_scale, SCALE)
             frames.append(Entry(name, T, partial(read_color, path / file), load_depth, float(times[i])))
     size = first_image_size(path / file for file in color_files)
     K = _default_intrinsics(path, size) if options.intrinsics is None else read_intrinsics(options.intrinsics)
