@@ -398,7 +398,7 @@ class TestLoading:
         refused({}, "of the same row on the same sequence")
         refused({"format": 2}, r"Ensemble\.json is not a record of format 1")
         refused({"method": "Oracle"}, r"Ensemble\.json: no method is called 'Oracle'")
-        refused({"setting": {"skip": -1}}, r"Ensemble\.json: skip must be")
+        refused({"setting": {"skip": -1}}, r"Ensemble\.json: Setting\.skip must lie")
 
     def test_sums_that_are_gone_or_broken(self, tmp_path):
         write_evaluation(tmp_path, ENSEMBLE[:2], SCENES[:2])

@@ -18,10 +18,10 @@ from ufmstar_torch.eval.commands.run_job import job_from
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.report.outputs import Finished
 from ufmstar_torch.eval.report.panels import fit_scales, map_columns
+from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.journal import why_none
-from ufmstar_torch.eval.results.summary import table
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
@@ -132,7 +132,7 @@ def test_a_run_with_a_network_equals_a_loop_by_hand(tour, tmp_path):
 def test_without_anchors_nothing_is_said_of_them(tour, tmp_path):
     summary = run(map_job(tour, OFF, frames=slice(2)), tmp_path / "out")
     assert summary["anchors"] is None
-    assert "anchors" not in table(summary)
+    assert "anchors" not in run_table(summary)
     assert summary["time"]["median_ms"]["anchors"] is None
     assert not {"anchors", "mean_anchored", "mean_bias"} & records(tmp_path / "out")[0].keys()
     stored = read_frame(tmp_path / "out" / "frames" / f"{tour.names[0]}.npz")
@@ -153,8 +153,8 @@ def test_a_standing_camera_is_plain_ufm_star_and_the_summary_says_so(tour, tmp_p
         "no corner followed from the frame before": 1,
         "no parallax, or no track that fits the poses": 3,
     }
-    assert "without anchors: 4 of 4 frames (1 x no corner followed" in table(summary)
-    assert "; 4 before the first anchors: plain UfM*\n" in table(summary)
+    assert "without anchors: 4 of 4 frames (1 x no corner followed" in run_table(summary)
+    assert "; 4 before the first anchors: plain UfM*\n" in run_table(summary)
     for name in still.names:
         on, off = (read_frame(tmp_path / folder / "frames" / f"{name}.npz") for folder in ("on", "off"))
         np.testing.assert_array_equal(on["variance"], off["variance"])
@@ -170,10 +170,10 @@ def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
         assert 0.6 < record["mean_anchored"] / before["mean_anchored"] < 1.5
     before = summary["anchors"]["frames_before_the_first"]
     assert before < 6
-    assert "3 x no corner followed" in table(summary)
+    assert "3 x no corner followed" in run_table(summary)
     later = sum(summary["anchors"]["frames_without"].values()) - before
     told = f"; {before} before the first anchors: plain UfM*; {later} later: with what was learnt before"
-    assert told in table(summary)
+    assert told in run_table(summary)
 
 
 @pytest.mark.parametrize(

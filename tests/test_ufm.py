@@ -367,7 +367,7 @@ def test_impossible_settings_are_refused(change):
 def test_settings_go_through_a_dict_and_unknown_ones_are_refused():
     config = UfMConfig(max_points=300_000, add_epistemic=False)
     assert UfMConfig.from_dict(config.to_dict()) == config
-    with pytest.raises(TypeError, match="max_point"):
+    with pytest.raises(ValueError, match="max_point"):
         UfMConfig.from_dict({"max_point": 3})
     with pytest.raises(TypeError, match="config must be a UfMConfig"):
         UfM({"max_points": 3})

@@ -209,10 +209,11 @@ def _check_depth(options: Mapping[str, Any]) -> None:
 
 def _report(summary: Mapping[str, Any], out: str) -> int:
     """Print the table and where the outputs are; the exit code."""
-    from ufmstar_torch.eval.results.summary import FINISHED, INTERRUPTED, table
+    from ufmstar_torch.eval.report.text import run_table
+    from ufmstar_torch.eval.results.summary import FINISHED, INTERRUPTED
 
     if summary["frames"]["done"]:
-        print(table(summary))
+        print(run_table(summary))
     made = [name for name, reason in summary["outputs"].items() if reason is None]
     for name, reason in summary["outputs"].items():
         if reason is not None:

@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
+from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.config import UfMStarConfig
 
 TRACKED, TRUTH = "tracked", "truth"
-_ANCHORS = ("", TRACKED, TRUTH)
 _OF_POSES = ("rotation_noise", "translation_noise", "rotation_drift", "translation_drift")
 
 
 @dataclass(frozen=True)
-class Setting:
+class Setting(Checked):
     """One point of an ablation; the default is the row as the paper runs it.
 
     Attributes:
@@ -43,44 +42,29 @@ class Setting:
     """
 
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    rotation_noise: float = 0.0
-    translation_noise: float = 0.0
-    rotation_drift: float = 0.0
-    translation_drift: float = 0.0
-    skip: int = 0
-    seed: int = 0
-    anchors: str = ""
-    anchor_count: int | None = None
-    track_noise: float = 0.0
+    rotation_noise: float = number(0.0, "", "deg", 0.0, open_high=True)
+    translation_noise: float = number(0.0, "", "m", 0.0, open_high=True)
+    rotation_drift: float = number(0.0, "", "deg", 0.0, open_high=True)
+    translation_drift: float = number(0.0, "", "m", 0.0, open_high=True)
+    skip: int = number(0, "", "1", 0)
+    seed: int = number(0, "", "1", 0)
+    anchors: str = choice("", TRACKED, TRUTH)
+    anchor_count: int | None = number(None, "", "1", 0)
+    track_noise: float = number(0.0, "", "px", 0.0, open_high=True)
     corrected: bool = False
 
     def __post_init__(self) -> None:
-        for name in (*_OF_POSES, "track_noise"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
-        for name in ("skip", "seed"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise ValueError(f"{name} must be a whole number of at least 0, got {value!r}")
-        self._check_anchors()
-        object.__setattr__(self, "overrides", MappingProxyType(dict(sorted(self.overrides.items()))))
-
-    def _check_anchors(self) -> None:
-        if self.anchors not in _ANCHORS:
-            told = " or ".join(f'"{name}"' for name in _ANCHORS)
-            raise ValueError(f"anchors must be {told}, got {self.anchors!r}")
+        super().__post_init__()
         count = self.anchor_count
-        if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 0):
-            raise ValueError(f"anchor_count must be a whole number of at least 0, got {count!r}")
-        if not isinstance(self.corrected, bool):
-            raise ValueError(f"corrected must be true or false, got {self.corrected!r}")
+        if count is not None and not isinstance(count, int):
+            raise ValueError(f"Setting.anchor_count must be a whole number, got {count!r}")
         if not self.anchors and (count is not None or self.corrected):
             raise ValueError("anchor_count and corrected go with anchors")
         if self.track_noise and self.anchors != TRACKED:
             raise ValueError('track_noise goes with anchors = "tracked"')
         if "anchored" in self.overrides:
             raise ValueError('anchored follows from anchors: set anchors = "tracked" or "truth"')
+        object.__setattr__(self, "overrides", MappingProxyType(dict(sorted(self.overrides.items()))))
 
     def __hash__(self) -> int:
         return hash(self.slug)

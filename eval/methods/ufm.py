@@ -14,13 +14,46 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.camera import relative_pose
+from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.eval.methods.ufm_cloud import MOMENTS, Cloud, Taken, View, take_in
-from ufmstar_torch.eval.methods.ufm_config import UfMConfig as UfMConfig
 from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import raise_faults
 
 _STATE = ("moments", "count", "points", "T_world_first", "started", "frames", "skipped")
+
+
+@dataclass(frozen=True)
+class UfMConfig(Checked):
+    """The settings of UfM.
+
+    The modes of the paper differ only in what a network predicts. "Aleatoric": depth and A. "Ensemble" and
+    "MC-dropout": the members in turn, or one stochastic pass. "Depth only": no variance, s^2 = 0. "Full": mean
+    depth, A and E of several inferences.
+
+    Attributes:
+        max_points: points kept per stream; the paper's 100,000 at 224 x 224, 300,000 at 518 x 518. None = all.
+            With fewer than an image has pixels, points are dropped before they are seen again.
+        add_aleatoric: let A, where it is given, be part of s^2, the variance of a single observation.
+        add_epistemic: likewise E.
+        rotation_tolerance: max |R^T R - I| of a pose; less is removed by projection onto SO(3), more is a fault.
+        on_bad_frame: "raise" or "skip" (counted, NaN returned) for unusable poses and intrinsics.
+
+    Raises:
+        ValueError: an impossible value, or, from ``from_dict``, an unknown name.
+    """
+
+    max_points: int | None = 100_000
+    add_aleatoric: bool = True
+    add_epistemic: bool = True
+    rotation_tolerance: float = number(0.01, "", "1", 0.0, 0.1)
+    on_bad_frame: str = choice("raise", "skip")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        whole = isinstance(self.max_points, int) and not isinstance(self.max_points, bool) and self.max_points > 0
+        if self.max_points is not None and not whole:
+            raise ValueError(f"UfMConfig.max_points must be None or a positive whole number, got {self.max_points!r}")
 
 
 @dataclass(frozen=True)
