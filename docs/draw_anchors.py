@@ -29,10 +29,11 @@ from scipy.stats import spearmanr
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.report.outputs import field_of_view
-from ufmstar_torch.eval.sequences import FrameError, open_sequence
+from ufmstar_torch.eval.sequences import FrameError
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained

@@ -23,7 +23,7 @@ from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.journal import why_none
 from ufmstar_torch.eval.results.writers import read_frame
-from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:5?frames=8&size=120x160"

@@ -10,7 +10,7 @@ from layouts import quaternion_line
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.attach import frame_numbers, in_seconds
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate
+from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose
 
 FRAMES = 6
 # Frame numbers as the layouts' writers name them.
@@ -146,7 +146,7 @@ def test_whole_seconds_of_a_video_are_seconds(tmp_path):
     K = layouts.resized(500, 500, 320, 240, (480, 640))
     sequence = open_sequence(tmp_path / "walk.mkv", trajectory=tmp_path / "slam.txt", intrinsics=K, max_pose_gap=1.0)
     assert len(sequence) == 41
-    expected = interpolate(Trajectory(np.arange(5.0), np.stack([poses[10 * i] for i in range(5)])), 1.5, 1.0)
+    expected = interpolate_pose(Trajectory(np.arange(5.0), np.stack([poses[10 * i] for i in range(5)])), 1.5, 1.0)
     np.testing.assert_allclose(sequence.entries[15].T_world_cam, expected, atol=1e-9)
 
 

@@ -13,7 +13,7 @@ from scenes import look
 from ufmstar_torch.eval.check.alignment import alignment, depth_edges
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.register import register_depth
+from ufmstar_torch.eval.sequences.ground_truth import register_depth
 
 SIZE = (120, 160)
 

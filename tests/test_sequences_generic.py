@@ -10,7 +10,7 @@ import pytest
 from layouts import quaternion_line, truncate, write_depth_png, write_image, write_video
 
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
-from ufmstar_torch.eval.sequences.pairing import pair_by_name
+from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.video import Video
 
 
@@ -238,9 +238,10 @@ def test_broken_video(tmp_path, capfd):
     images = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(8)]
     write_video(tmp_path / "cut.avi", images)
     truncate(tmp_path / "cut.avi", 0.6)
-    (tmp_path / "noise.mp4").write_bytes(b"no video at all" * 10)
-    with pytest.raises(FrameError, match="cannot be opened as a video"):
-        Video(tmp_path / "noise.mp4")
+    for content in (b"", b"no video at all" * 10):
+        (tmp_path / "noise.mp4").write_bytes(content)
+        with pytest.raises(ValueError, match=r"noise\.mp4: cannot be opened as a video"):
+            Video(tmp_path / "noise.mp4")
     with pytest.raises(FileNotFoundError):
         Video(tmp_path / "absent.mp4")
     video = Video(tmp_path / "cut.avi")

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import struct
 import subprocess
+import zlib
 
 import numpy as np
 import pytest
 from layouts import truncate, write_depth_png, write_image
 from PIL import Image
 
-from ufmstar_torch.eval.sequences.exr import read_exr
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import list_files, read_color, read_depth
+from ufmstar_torch.eval.sequences.images import image_size, list_files, read_color, read_depth
 
 RNG = np.random.default_rng(0)
 
@@ -147,52 +147,65 @@ def test_exr_equals_what_ffmpeg_wrote(tmp_path, compression, pixel_type, smooth)
     if pixel_type == "half":
         values = values.astype(np.float16).astype(np.float32)  # exact in half, so that rounding plays no part
     encode_exr(tmp_path / "d.exr", values, compression, pixel_type)
-    np.testing.assert_array_equal(read_exr(tmp_path / "d.exr"), values)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), values)
 
 
-def handmade_exr(path, channels, compression=0, flags=0):
-    """Uncompressed scan lines; ``channels`` maps names to [H, W] float32, data window starting at (3, 5)."""
-    names = sorted(channels)
-    height, width = channels[names[0]].shape
-    chlist = b"".join(n.encode() + b"\0" + struct.pack("<iIii", 2, 0, 1, 1) for n in names) + b"\0"
-    window = struct.pack("<4i", 3, 5, 3 + width - 1, 5 + height - 1)
-    attributes = [
-        ("channels", "chlist", chlist),
-        ("compression", "compression", bytes([compression])),
-        ("dataWindow", "box2i", window),
-    ]
-    header = struct.pack("<II", 20000630, 2 | flags)
-    for name, kind, value in attributes:
-        header += name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
-    header += b"\0"
-    lines = []
-    for y in range(height):
-        data = b"".join(channels[n][y].astype("<f4").tobytes() for n in names)
-        lines.append(struct.pack("<ii", 5 + y, len(data)) + data)
-    first = len(header) + 8 * height
-    offsets = [first + y * len(lines[0]) for y in range(height)]
-    path.write_bytes(header + struct.pack(f"<{height}Q", *offsets) + b"".join(lines))
+def write_exr(path, channels, compression="ZIP", **header):
+    """A file with [H, W] arrays by channel's name."""
+    OpenEXR = pytest.importorskip("OpenEXR")
+    kind = OpenEXR.tiledimage if "tiles" in header else OpenEXR.scanlineimage
+    header |= {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": kind}
+    OpenEXR.File(header, dict(channels)).write(str(path))
 
 
 @pytest.mark.parametrize("names", [("B", "G", "R", "Z"), ("A", "View.Depth.Z"), ("A", "B", "R"), ("whatever",)])
 def test_the_depth_channel_is_found(tmp_path, names):
     wanted = next((n for n in names if n.endswith("Z")), "R" if "R" in names else names[0])
     channels = {name: RNG.uniform(1, 2, (4, 6)).astype(np.float32) for name in names}
-    handmade_exr(tmp_path / "d.exr", channels)
-    np.testing.assert_array_equal(read_exr(tmp_path / "d.exr"), channels[wanted])
+    write_exr(tmp_path / "d.exr", channels)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), channels[wanted])
 
 
-def test_exr_variants_that_are_not_read_say_so(tmp_path):
-    channels = {"Z": np.ones((4, 6), np.float32)}
-    handmade_exr(tmp_path / "d.exr", channels, compression=4)
-    with pytest.raises(FrameError, match="PIZ compression is not supported, save with ZIP"):
-        read_depth(tmp_path / "d.exr")
-    handmade_exr(tmp_path / "d.exr", channels, flags=0x200)
-    with pytest.raises(FrameError, match="tiled"):
-        read_depth(tmp_path / "d.exr")
-    handmade_exr(tmp_path / "d.exr", {"B": channels["Z"], "U": channels["Z"]})
+@pytest.mark.parametrize("compression", ["NO", "PIZ", "ZIPS"])
+@pytest.mark.parametrize("tiled", [False, True])
+def test_compressions_and_tiles(tmp_path, compression, tiled):
+    OpenEXR = pytest.importorskip("OpenEXR")
+    values = RNG.uniform(1, 2, (70, 90)).astype(np.float32)
+    tiles = {"tiles": OpenEXR.TileDescription()} if tiled else {}
+    write_exr(tmp_path / "d.exr", {"Z": values}, compression, **tiles)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), values)
+
+
+def test_what_is_no_depth_in_an_exr_is_named(tmp_path, capfd):
+    values = np.ones((4, 6), np.float32)
+    write_exr(tmp_path / "d.exr", {"B": values, "U": values})
     with pytest.raises(FrameError, match="no channel is the depth"):
         read_depth(tmp_path / "d.exr")
     (tmp_path / "d.exr").write_bytes(b"not an EXR file")
-    with pytest.raises(FrameError, match="wrong magic number"):
+    with pytest.raises(FrameError, match="cannot be decoded as OpenEXR"):
         read_depth(tmp_path / "d.exr")
+    write_exr(tmp_path / "d.exr", {"Z": RNG.uniform(1, 2, (70, 90)).astype(np.float32)})
+    truncate(tmp_path / "d.exr", 0.7)
+    with pytest.raises(FrameError, match="no pixels can be decoded"):
+        read_depth(tmp_path / "d.exr")
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("name", ["d.png", "d.exr"])
+def test_a_file_that_claims_a_huge_image_is_a_frame_error(tmp_path, name):
+    """The size is in the header, nothing behind it: it is refused before memory is allocated."""
+    path = tmp_path / name
+    if name == "d.png":
+        write_depth_png(path, np.ones((4, 5)), 1000)
+        data = bytearray(path.read_bytes())
+        data[16:24] = struct.pack(">2I", 60_000, 60_000)
+        data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    else:
+        write_exr(path, {"Z": np.ones((4, 6), np.float32)})
+        data = bytearray(path.read_bytes())
+        at = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+        data[at : at + 16] = struct.pack("<4i", 0, 0, 59_999, 59_999)
+    path.write_bytes(bytes(data))
+    for read in (read_depth, read_color, image_size) if name == "d.png" else (read_depth,):
+        with pytest.raises(FrameError, match="cannot be decoded"):
+            read(path)

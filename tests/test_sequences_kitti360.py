@@ -13,8 +13,8 @@ from layouts_more import DRIVE, T_car_rect, write_kitti360
 
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
-from ufmstar_torch.eval.sequences.laser import read_scan, unroll
-from ufmstar_torch.eval.sequences.register import project
+from ufmstar_torch.eval.sequences.ground_truth import project
+from ufmstar_torch.eval.sequences.kitti360 import read_scan, unroll
 
 NUMBERS = (3, 4, 6, 7, 8)
 NAMES = tuple(f"{n:010d}" for n in NUMBERS)

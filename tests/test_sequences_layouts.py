@@ -12,7 +12,7 @@ from layouts import truncate, write_depth_png, write_image
 
 from ufmstar_torch.eval import sequences
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
-from ufmstar_torch.eval.sequences.register import register_depth
+from ufmstar_torch.eval.sequences.ground_truth import register_depth
 
 K_TUM_FR3 = [[535.4, 0, 320.1], [0, 539.2, 247.6], [0, 0, 1]]
 

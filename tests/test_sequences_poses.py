@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.sequences.poses import associate, interpolate, read_pose, read_trajectory
+from ufmstar_torch.eval.sequences.poses import associate, interpolate_pose, read_pose, read_trajectory
 
 QUARTER = np.sqrt(0.5)
 # 90 degrees about z: x -> y, y -> -x.
@@ -17,7 +17,7 @@ R_QUARTER_Z = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 def write(tmp_path, text):
     path = tmp_path / "trajectory.txt"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
 
 
@@ -65,6 +65,7 @@ def test_rounded_quaternions_are_normalised(tmp_path):
         ("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2\n", r"txt:1: a pose's bottom row must be 0 0 0 1"),
         ("nan 0 0 0 0 0 0 1\n", r"txt:1: the timestamp must be finite"),
         ("# nothing\n", r"no pose found"),
+        (b"\x89PNG\r\n\x1a\n\0\xff", r"txt: expected a text file"),
     ],
 )
 def test_a_bad_line_is_named(tmp_path, text, message):
@@ -84,9 +85,9 @@ def test_non_finite_poses_stay_as_nan(tmp_path, token):
     text = f"0 0 0 0 0 0 0 1\n1 {token} 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n"
     trajectory = read_trajectory(write(tmp_path, text))
     assert np.isfinite(trajectory.T_world_cam).all(axis=(1, 2)).tolist() == [True, False, True]
-    assert np.isnan(interpolate(trajectory, 0.5, max_gap=2)).all()
-    assert np.isnan(interpolate(trajectory, 1.0, max_gap=2)).all()
-    assert np.isfinite(interpolate(trajectory, 2.0, max_gap=2)).all()
+    assert np.isnan(interpolate_pose(trajectory, 0.5, max_gap=2)).all()
+    assert np.isnan(interpolate_pose(trajectory, 1.0, max_gap=2)).all()
+    assert np.isfinite(interpolate_pose(trajectory, 2.0, max_gap=2)).all()
 
 
 def test_scannet_writes_minus_infinity_everywhere(tmp_path):
@@ -103,7 +104,7 @@ def test_pose_file_of_another_shape(tmp_path):
 
 def test_interpolation_is_linear_and_turns_evenly(tmp_path):
     trajectory = read_trajectory(write(tmp_path, f"0 8 0 -4 0 0 0 1\n0.1 0 2 4 0 0 {QUARTER} {QUARTER}\n"))
-    T = interpolate(trajectory, 0.025, max_gap=0.1)
+    T = interpolate_pose(trajectory, 0.025, max_gap=0.1)
     np.testing.assert_allclose(T[:3, 3], [6.0, 0.5, -2.0], rtol=1e-12)
     np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("z", 22.5, degrees=True).as_matrix(), atol=1e-12)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
@@ -111,20 +112,22 @@ def test_interpolation_is_linear_and_turns_evenly(tmp_path):
 
 def test_interpolation_needs_samples_around(tmp_path):
     trajectory = read_trajectory(write(tmp_path, "0 0 0 0 0 0 0 1\n0.2 1 0 0 0 0 0 1\n"))
-    assert interpolate(trajectory, 0.1, max_gap=0.1) is None
-    assert interpolate(trajectory, 0.1, max_gap=0.2)[0, 3] == pytest.approx(0.5)
-    assert interpolate(trajectory, -0.002, max_gap=0.2) is None
-    assert interpolate(trajectory, 0.202, max_gap=0.2) is None
+    assert interpolate_pose(trajectory, 0.1, max_gap=0.1) is None
+    assert interpolate_pose(trajectory, 0.1, max_gap=0.2)[0, 3] == pytest.approx(0.5)
+    assert interpolate_pose(trajectory, -0.006, max_gap=0.2) is None
+    assert interpolate_pose(trajectory, 0.206, max_gap=0.2) is None
+    # outside, or in a gap, a sample within 5 ms is taken as it is
+    assert [interpolate_pose(trajectory, t, max_gap=0.1)[0, 3] for t in (-0.0048, 0.0048, 0.196, 0.204)] == [0, 0, 1, 1]
     # a sample at the image's own time needs no neighbour
-    assert interpolate(trajectory, 0.2005, max_gap=0.1)[0, 3] == 1
+    assert interpolate_pose(trajectory, 0.2005, max_gap=0.1)[0, 3] == 1
     without_times = read_trajectory(write(tmp_path, "0 0 0 0 0 0 1\n"))
     with pytest.raises(ValueError, match="no timestamps"):
-        interpolate(without_times, 0.0, 1.0)
+        interpolate_pose(without_times, 0.0, 1.0)
 
 
 def test_a_returned_pose_is_a_copy(tmp_path):
     trajectory = read_trajectory(write(tmp_path, "0 0 0 0 0 0 0 1\n"))
-    interpolate(trajectory, 0.0, 0.1)[:] = 5
+    interpolate_pose(trajectory, 0.0, 0.1)[:] = 5
     np.testing.assert_array_equal(trajectory.T_world_cam[0], np.eye(4))
 
 

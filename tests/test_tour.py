@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ufmstar_torch.eval.check.check import check_sequence
-from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.tour import Tour, TourStyle, make_tour, render, tour_path, tour_sequence
 from ufmstar_torch.eval.tour.box_room import intrinsics, look
 from ufmstar_torch.eval.tour.intersect import entry
+from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.eval.tour.sensor import develop
 from ufmstar_torch.eval.tour.sequence import export_tour
 from ufmstar_torch.eval.tour.shapes import BOX, ELLIPSOID, FRUSTUM, QUAD, Finish, ball, box, part, surfaces, tube, turn

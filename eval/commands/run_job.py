@@ -14,9 +14,10 @@ from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.results.machine import require_device
-from ufmstar_torch.eval.sequences import FrameSequence, open_sequence
+from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.eval.tour.open import open_sequence
 
 
 def job_from(chosen: RunOptions) -> RunJob:

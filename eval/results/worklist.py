@@ -54,7 +54,7 @@ class WorkItem:
         Raises:
             FileNotFoundError, ValueError: it cannot be opened.
         """
-        from ufmstar_torch.eval.sequences.layout import open_sequence
+        from ufmstar_torch.eval.tour.open import open_sequence
 
         return open_sequence(self.path, self.layout, **dict(self.opening))
 

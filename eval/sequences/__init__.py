@@ -16,5 +16,8 @@ if TYPE_CHECKING:
     from ufmstar_torch.eval.sequences.frame import FrameSequence as FrameSequence
     from ufmstar_torch.eval.sequences.frame import Skipped as Skipped
     from ufmstar_torch.eval.sequences.layout import open_sequence as open_sequence
+    from ufmstar_torch.eval.sequences.poses import Trajectory as Trajectory
+    from ufmstar_torch.eval.sequences.poses import interpolate_pose as interpolate_pose
+    from ufmstar_torch.eval.sequences.poses import read_trajectory as read_trajectory
 else:
     __getattr__, __dir__ = lazy_names(__name__)

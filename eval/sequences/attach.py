@@ -1,13 +1,14 @@
-"""Poses of another program attached to images: ORB-SLAM3, BundleFusion, COLMAP, in TUM or KITTI format.
+"""Poses and depth maps of other programs, attached to the images of a sequence.
 
-A pose belongs to an image by its time, or by its frame number, or, where the file has neither, by its place. What has
-no partner is skipped and counted; nothing is moved to the next image.
+A pose (ORB-SLAM3, BundleFusion, COLMAP; TUM or KITTI format) belongs to an image by its time, by its frame number, or,
+where the file has neither, by its position in the file. A map belongs to an image by its name. What has no partner is
+skipped and counted; nothing is moved to the next image.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, Skipped
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate, read_trajectory
+from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose, read_trajectory
 
 # Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
 _NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14
@@ -60,14 +61,15 @@ def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajector
             )
         return list(trajectory.T_world_cam)
     times, trajectory = _comparable(names, times, trajectory, options)
-    poses = [interpolate(trajectory, float(time), options.max_pose_gap) for time in times]
+    poses = [interpolate_pose(trajectory, float(time), options.max_pose_gap) for time in times]
     if all(T is None for T in poses):
         known = trajectory.timestamps
         assert known is not None
+        gap = f", {np.median(np.diff(known)):.3g} s apart in the median" if len(known) > 1 else ""
         raise ValueError(
             f"no image has a pose: images lie at {times[0]:.3f} to {times[-1]:.3f} s, the trajectory's "
-            f"{len(known)} poses at {known[0]:.3f} to {known[-1]:.3f} s, used where they lie at most "
-            f"{options.max_pose_gap:g} s apart; see fps, time_offset and max_pose_gap"
+            f"{len(known)} poses at {known[0]:.3f} to {known[-1]:.3f} s{gap}, used where they lie at most "
+            f"{options.max_pose_gap:g} s apart; see --max-pose-gap, --time-offset and --fps"
         )
     return poses
 
@@ -147,7 +149,7 @@ def attach_given(
 
 def no_pose(options: Options) -> str:
     """Why an image without a pose is skipped."""
-    return f"no pose within {options.max_pose_gap:g} s around the image"
+    return f"no pose within {options.max_pose_gap:g} s around the image"  # see `interpolate_pose`; --max-pose-gap
 
 
 def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
@@ -181,3 +183,32 @@ def in_seconds(trajectory: Trajectory, times: np.ndarray) -> Trajectory:
 
 def _meet(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(first.min() <= second.max() and second.min() <= first.max())
+
+
+def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]:
+    """The file of each frame name, where there is one.
+
+    A file belongs to a name if their stems are equal, or else if all numbers in them are
+    (``frame-000012.color`` and ``000012_depth``; leading zeros do not count, decimals do). Numbers that
+    occur twice among the files or among the names pair nothing.
+    """
+    files = list(files)
+    by_stem = {file.stem: file for file in files}
+    file_of = _unique({file: _numbers(file.stem) for file in files})
+    name_of = _unique({name: _numbers(name) for name in names})
+    pairs = {name_of[key]: file for key, file in file_of.items() if key in name_of}
+    return {name: by_stem.get(name) or pairs[name] for name in names if name in by_stem or name in pairs}
+
+
+def _numbers(stem: str) -> tuple[int | str, ...]:
+    """Digit groups by value; those behind a decimal point as text, since 1.05 is not 1.5."""
+    groups = re.findall(r"((?<=\d)\.)?(\d+)", stem)
+    return tuple(digits if point else int(digits) for point, digits in groups)
+
+
+def _unique(numbers_of: dict) -> dict:
+    """The inverse of a mapping, without the keys () and those that several items share."""
+    inverse: dict = {}
+    for item, key in numbers_of.items():
+        inverse.setdefault(key, []).append(item)
+    return {key: items[0] for key, items in inverse.items() if len(items) == 1 and key}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
@@ -17,7 +18,6 @@ from ufmstar_torch.eval.sequences.images import (
     read_depth,
     read_map,
 )
-from ufmstar_torch.eval.sequences.pairing import pair_by_name
 
 _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 

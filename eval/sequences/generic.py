@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import attach, no_pose, stem_times
+from ufmstar_torch.eval.sequences.attach import attach, no_pose, pair_by_name, stem_times
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
@@ -26,7 +26,6 @@ from ufmstar_torch.eval.sequences.images import (
 )
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.pairing import pair_by_name
 from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 from ufmstar_torch.eval.sequences.tum import SCALE as TUM_SCALE
 from ufmstar_torch.eval.sequences.tum import read_file_list

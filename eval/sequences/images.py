@@ -23,7 +23,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Loader, Size
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
 # Pillow's plugins raise these for broken files, beside OSError (SyntaxError: bad PNG chunk).
-_BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError)
+_BROKEN_IMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
 # Key of a PNG's text chunk: metres per unit of its 16-bit values.
 SCALE_KEY = "depth_scale"
 _MILLIMETRE = 1e-3

@@ -4,6 +4,13 @@
 rectified camera 00) or ``poses.txt`` (the car), by frame number, ``calibration/``, and
 ``data_3d_raw/DRIVE/velodyne_points/data/*.bin``. Frames without a pose, where the car stood still, are skipped.
 image_02 and image_03 are fisheye cameras, which a pinhole model does not describe. https://www.cvlibs.net/datasets/kitti-360/documentation.php
+
+Calibration: ``perspective.txt`` has for each camera NN of the stereo pair ``P_rect_NN`` (3x4), ``R_rect_NN`` (3x3, from
+the camera as it is mounted to the rectified one) and ``S_rect_NN`` (width, height); ``calib_cam_to_pose.txt`` has the
+mounted cameras in the car (``image_NN:`` and 3x4 numbers), ``calib_cam_to_velo.txt`` camera 00 as mounted in the laser.
+
+Laser: a scan is ``f32`` x y z (forward, left, up [m]) and reflectance. The head turns clockwise, seen from above, and
+looks forward at the scan's time: a point at azimuth a was measured a / 2 pi of a turn earlier, from elsewhere.
 """
 
 from __future__ import annotations
@@ -16,9 +23,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given, pair_by_name
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.ground_truth import project
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
     IMAGE_SUFFIXES,
@@ -29,17 +38,19 @@ from ufmstar_torch.eval.sequences.images import (
     read_color,
 )
 from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics, scale_intrinsics
-from ufmstar_torch.eval.sequences.kitti360_calibration import Calibration
-from ufmstar_torch.eval.sequences.laser import LaserDepth, Scan
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.pairing import pair_by_name
-from ufmstar_torch.eval.sequences.poses import read_trajectory
+from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix, read_trajectory
 
 LOOKED_FOR = "data_2d_raw/DRIVE/image_00/data_rect (the root, the drive's folder or the camera's)"
 _RAW = "data_2d_raw"
 _CAMERAS = ("image_00", "image_01")
 _CAMERA = re.compile(r"image_0\d")
 _SCALE = 1 / 256  # [m] per unit of 16-bit depth maps, as KITTI's
+PERSPECTIVE = "perspective.txt"
+CAM_TO_POSE = "calib_cam_to_pose.txt"
+CAM_TO_LASER = "calib_cam_to_velo.txt"
+_COLUMNS = 4
+_MIN_RANGE = 2.0  # [m] nearer returns are the car's own roof
 
 
 @dataclass(frozen=True)
@@ -173,7 +184,7 @@ def _times(path: Path, numbers: list[int]) -> np.ndarray | None:
     """[N] times of the frames [s since 1970], of lines ``2013-05-28 08:46:02.904546304``; None if not known."""
     if not path.is_file():
         return None
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = [text for _, text in numbered_lines(path)]
     if max(numbers) >= len(lines):
         return None
     try:
@@ -259,3 +270,171 @@ def _depth_intrinsics(options: Options, K: np.ndarray, size: Size | None, depth_
     if options.depth is None or size is None or depth_size is None or size == depth_size:
         return None
     return scale_intrinsics(K, size, depth_size)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The folder ``calibration``, for one camera.
+
+    Attributes:
+        folder: it.
+        camera: "00" or "01".
+    """
+
+    folder: Path
+    camera: str
+
+    def intrinsics(self) -> tuple[np.ndarray, Size]:
+        """K [3, 3] of the rectified images [px], and (H, W) for which it holds.
+
+        Raises:
+            FileNotFoundError, ValueError: as :func:`read_values`.
+        """
+        file = self.folder / PERSPECTIVE
+        width, height = read_values(file, f"S_rect_{self.camera}", 2)
+        return read_values(file, f"P_rect_{self.camera}", 12).reshape(3, 4)[:, :3].copy(), (int(height), int(width))
+
+    def T_rect0_rect(self) -> np.ndarray:
+        """[4, 4] from this rectified camera into the rectified camera 00."""
+        if self.camera == "00":
+            return np.eye(4)
+        return np.linalg.inv(self._T_car_rect("00")) @ self._T_car_rect(self.camera)
+
+    def T_car_rect0(self) -> np.ndarray:
+        """[4, 4] from the rectified camera 00 into the car, whose poses poses.txt holds."""
+        return self._T_car_rect("00")
+
+    def T_rect_laser(self) -> np.ndarray:
+        """[4, 4] from the laser into this rectified camera."""
+        T_laser_mounted = _affine(read_matrix(_existing(self.folder / CAM_TO_LASER)), self.folder / CAM_TO_LASER)
+        T_rect0_laser = self._T_rect_mounted("00") @ np.linalg.inv(T_laser_mounted)
+        return np.linalg.inv(self.T_rect0_rect()) @ T_rect0_laser
+
+    def has_laser(self) -> bool:
+        """Whether the laser's place is known."""
+        return (self.folder / CAM_TO_LASER).is_file()
+
+    def _T_rect_mounted(self, camera: str) -> np.ndarray:
+        T = np.eye(4)
+        T[:3, :3] = read_values(self.folder / PERSPECTIVE, f"R_rect_{camera}", 9).reshape(3, 3)
+        return T
+
+    def _T_car_rect(self, camera: str) -> np.ndarray:
+        file = self.folder / CAM_TO_POSE
+        T_car_mounted = _affine(read_values(file, f"image_{camera}", 12), file)
+        return T_car_mounted @ np.linalg.inv(self._T_rect_mounted(camera))
+
+
+def read_values(path: Path, key: str, count: int) -> np.ndarray:
+    """[count] the numbers behind ``key:`` in a calibration file.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no such line, or not as many numbers in it.
+    """
+    for number, line in numbered_lines(_existing(path)):
+        name, _, rest = line.partition(":")
+        if name.strip() != key:
+            continue
+        try:
+            values = [float(word) for word in rest.split()]
+        except ValueError:
+            values = []
+        if len(values) != count or not np.isfinite(values).all():
+            raise ValueError(f"{path}:{number}: expected {count} numbers behind {key!r}, got {rest.strip()!r}")
+        return np.array(values)
+    raise ValueError(f"{path}: no line {key!r}")
+
+
+def _affine(values: np.ndarray, path: Path) -> np.ndarray:
+    """[4, 4] of 3x4 numbers."""
+    if values.size != 12 or not np.isfinite(values).all():
+        raise ValueError(f"{path}: expected the 12 numbers of a 3x4 matrix, got {values.size}")
+    T = np.eye(4)
+    T[:3] = values.reshape(3, 4)
+    return T
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise FileNotFoundError(f"KITTI-360's calibration is missing: no file {path}")
+    return path
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A scan's file and what turns its points into the camera's frame.
+
+    Attributes:
+        path: the ``.bin`` file.
+        T_cam_laser: [4, 4] from the laser at this scan's time into the camera that looks [m].
+        T_laser_before: [4, 4] from the laser one scan earlier into it now [m]; None = not known, or standing still:
+            its points are taken as they are.
+    """
+
+    path: Path
+    T_cam_laser: np.ndarray
+    T_laser_before: np.ndarray | None = None
+
+    def points(self) -> np.ndarray:
+        """[3, N] float64 in the camera's frame [m].
+
+        Raises:
+            FrameError: the file is missing, or no scan.
+        """
+        points = read_scan(self.path)
+        if self.T_laser_before is not None:
+            points = unroll(points, self.T_laser_before)
+        return self.T_cam_laser[:3, :3] @ points + self.T_cam_laser[:3, 3:]
+
+
+@dataclass(frozen=True, eq=False)
+class LaserDepth:
+    """Loads the depth map that the scans give: each pixel takes the nearest point that falls on it.
+
+    Attributes:
+        scans: the frame's own, and neighbours if they are accumulated.
+        K: [3, 3] of the camera [px].
+        size: (H, W) of its images.
+    """
+
+    scans: tuple[Scan, ...]
+    K: np.ndarray
+    size: Size
+
+    def __call__(self) -> np.ndarray:
+        """[H, W] float32 [m], 0 = no point.
+
+        Raises:
+            FrameError: a scan is missing or broken.
+        """
+        return project(np.concatenate([scan.points() for scan in self.scans], axis=1), self.K, self.size)
+
+
+def read_scan(path: Path) -> np.ndarray:
+    """[3, N] float64 points of a scan in the laser's frame [m], without the car's own and those that are not finite.
+
+    Raises:
+        FrameError: the file is missing, or its size is not that of a scan.
+    """
+    try:
+        values = np.fromfile(path, "<f4")
+    except OSError as error:
+        raise FrameError(path, f"cannot be read: {error}") from error
+    if values.size == 0 or path.stat().st_size % (4 * _COLUMNS):
+        raise FrameError(path, f"is no scan: its size must be a multiple of {4 * _COLUMNS} bytes, and not 0")
+    points = values.reshape(-1, _COLUMNS)[:, :3].T.astype(np.float64)
+    distance = np.linalg.norm(points, axis=0)
+    return points[:, np.isfinite(distance) & (distance > _MIN_RANGE)]
+
+
+def unroll(points: np.ndarray, T_laser_before: np.ndarray) -> np.ndarray:
+    """Points [3, N] of one turn as if all had been measured at the scan's time, when the head looks forward.
+
+    The motion of one turn, ``T_laser_before`` [4, 4], is taken as even: a point measured a share s of a turn earlier
+    is moved by that share of it (rotation vector and translation).
+    """
+    share = np.arctan2(points[1], points[0]) / (2 * np.pi)
+    turn = Rotation.from_matrix(T_laser_before[:3, :3]).as_rotvec()
+    moved = Rotation.from_rotvec(share[:, None] * turn).apply(points.T).T
+    return moved + share * T_laser_before[:3, 3:]

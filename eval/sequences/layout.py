@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,6 @@ _READERS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, Options], Fram
     "generic": (generic.detect, generic.open_generic, generic.LOOKED_FOR),
 }
 LAYOUTS = ("auto", *_READERS)
-_TOUR = "tour:"
 
 
 def open_sequence(
@@ -51,8 +49,7 @@ def open_sequence(
     """Opens a sequence of posed images; nothing but headers and text files is read before it is indexed.
 
     Args:
-        path: the sequence's folder, or a video file; or ``tour:SEED``, rooms rendered from a seed, with the options
-            of ``ufmstar_torch.eval.tour.name.open_tour``.
+        path: the sequence's folder, or a video file (``ufmstar_torch.eval.tour.open`` also takes rendered tours).
         layout: ``auto``, ``tum``, ``7scenes``, ``scannet``, ``sens``, ``tartanair``, ``kitti360``, ``nyu`` or
             ``generic``.
         intrinsics: instead of the layout's own [px]: a file, a 3x3 matrix, or fx, fy, cx, cy.
@@ -85,8 +82,8 @@ def open_sequence(
         ValueError: unknown or ambiguous layout (with what was looked for), an option out of range or of no
             use for the layout, malformed files (named by file and line), or no usable frame.
     """
-    is_tour, path = str(path).startswith(_TOUR), Path(path)
-    if not is_tour and not path.exists():
+    path = Path(path)
+    if not path.exists():
         raise FileNotFoundError(f"path: no such file or folder: {path}")
     options = Options(
         intrinsics=intrinsics,
@@ -106,8 +103,6 @@ def open_sequence(
     )
     if poses not in CONVENTIONS:
         raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
-    if is_tour:
-        return convert_poses(_open_tour(str(path), layout, options), poses)
     if layout == "auto":
         layout = detect_layout(path, explicit=images is not None or trajectory is not None)
     if layout not in _READERS:
@@ -118,25 +113,6 @@ def open_sequence(
     if layout != "kitti360":
         options.reject(layout, "drive", "scans")
     return convert_poses(open_reader(path, options), poses)
-
-
-def _open_tour(name: str, layout: str, options: Options) -> FrameSequence:
-    """A tour, which nothing can be said about but in its name.
-
-    Raises:
-        ValueError: another layout, an option, or a malformed name.
-    """
-    from ufmstar_torch.eval.tour.name import open_tour
-
-    if layout != "auto":
-        raise ValueError(f"layout must be auto for {name!r}, got {layout!r}")
-    values = {f.name: (getattr(options, f.name), f.default) for f in fields(options)}
-    given = [
-        n for n, (value, default) in values.items() if value is not default and (default is None or value != default)
-    ]
-    if given:
-        raise ValueError(f"{name!r} takes no {', '.join(given)}: a tour's options stand in its name")
-    return open_tour(name)
 
 
 def detect_layout(path: Path, explicit: bool = False) -> str:

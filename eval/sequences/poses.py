@@ -27,6 +27,9 @@ _QUATERNION_TOLERANCE = 0.02
 # An image this close to a sample takes its pose as it is, whatever the gap around it [s]: timestamps are
 # printed with four to six decimals, and at 1 m/s the camera moves 1 mm in that time.
 _SAME_TIME = 1e-3
+# An image between samples that are too far apart, or outside the trajectory, takes a sample this close as it is [s]:
+# a camera at 1 m/s is 5 mm away from it.
+_NEAREST = 5e-3
 # printf on Windows writes NaN and infinity as 1.#IND, 1.#QNAN, 1.#INF.
 _WINDOWS_NON_FINITE = re.compile(r"[+-]?1\.?#(IND|QNAN|SNAN|INF)\d*", re.IGNORECASE)
 
@@ -59,7 +62,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     """
     rows: list[list[float]] = []
     lines: list[str] = []
-    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in numbered_lines(path):
         content = _strip_comment(text)
         if content:
             where = f"{path}:{number}"
@@ -82,13 +85,15 @@ def read_trajectory(path: str | Path) -> Trajectory:
     return Trajectory(timestamps, T_world_cam)
 
 
-def interpolate(trajectory: Trajectory, time: float, max_gap: float) -> np.ndarray | None:
-    """The pose [4, 4] at ``time`` [s]: position linear, rotation by slerp between the bracketing samples.
+def interpolate_pose(trajectory: Trajectory, time: float, max_gap: float = 0.1) -> np.ndarray | None:
+    """The camera-to-world pose [4, 4] at ``time`` [s], between the samples before and after it.
 
-    A sample within 1 ms is taken as it is. NaN where a sample that is needed is not finite.
+    The position is interpolated linearly, the rotation along the shortest arc (slerp). A sample within 1 ms is taken as
+    it is; and where the samples before and after lie more than ``max_gap`` [s] apart, or one of them is missing at the
+    end of the trajectory, one within 5 ms. NaN where a sample that is needed is not finite.
 
     Returns:
-        None where the bracketing samples lie more than ``max_gap`` [s] apart, or ``time`` lies outside.
+        The pose; None where there is none.
 
     Raises:
         ValueError: the trajectory has no timestamps.
@@ -102,7 +107,7 @@ def interpolate(trajectory: Trajectory, time: float, max_gap: float) -> np.ndarr
     if abs(times[nearest] - time) <= _SAME_TIME:
         return trajectory.T_world_cam[nearest].copy()
     if len(around) < 2 or times[after] - times[after - 1] > max_gap:
-        return None
+        return trajectory.T_world_cam[nearest].copy() if abs(times[nearest] - time) <= _NEAREST else None
     first, second = trajectory.T_world_cam[after - 1], trajectory.T_world_cam[after]
     if not (np.isfinite(first).all() and np.isfinite(second).all()):
         return np.full((4, 4), np.nan)
@@ -143,7 +148,7 @@ def read_matrix(path: str | Path) -> np.ndarray:
         ValueError: a line holds something else than numbers, or lines differ in length.
     """
     rows: list[list[float]] = []
-    for number, text in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in numbered_lines(path):
         where = f"{path}:{number}"
         row = [_number(token, where) for token in _strip_comment(text).split()]
         if row and rows and len(row) != len(rows[0]):
@@ -171,6 +176,18 @@ def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) ->
     T[:, :3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
     T[:, :3, 3] = position
     return T
+
+
+def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
+    """Line numbers from 1, and the lines of a text file.
+
+    Raises:
+        ValueError: it is no text file (UTF-8).
+    """
+    try:
+        return list(enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: expected a text file, got bytes that are none: {error.reason}") from error
 
 
 def _poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:

@@ -17,11 +17,11 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.ground_truth import register_depth
 from ufmstar_torch.eval.sequences.images import common_size, first_image_size, natural_key, read_color, read_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import read_pose
-from ufmstar_torch.eval.sequences.register import register_depth
 
 LOOKED_FOR = "frame-NNNNNN.pose.txt files"
 _NATIVE_SIZE = (480, 640)

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipp
 from ufmstar_torch.eval.sequences.images import common_size, depth_loader, first_image_size, read_color
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
+from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt"
 SCALE = 1 / 5000
@@ -76,7 +76,7 @@ def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
         ValueError: a line (named by file and number) has another form.
     """
     times, files = [], []
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, text in numbered_lines(path):
         words = text.split(maxsplit=1)
         if not words or words[0].startswith("#"):
             continue
@@ -100,7 +100,7 @@ def _paired_depth(path: Path, color_times: np.ndarray, max_difference: float) ->
 
 def _default_intrinsics(path: Path, size: Size | None) -> np.ndarray:
     """The camera's K, known from ``freiburgN`` in the folder's name or in the header of rgb.txt."""
-    header = (path / "rgb.txt").read_text(encoding="utf-8")[:500]
+    header = "\n".join(text for _, text in numbered_lines(path / "rgb.txt"))[:500]
     for text in (path.resolve().name, header):
         found = re.search(r"freiburg([123])", text)
         if found:

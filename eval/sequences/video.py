@@ -25,7 +25,7 @@ class Video:
 
     Raises:
         FileNotFoundError: no such file.
-        FrameError: the file cannot be opened as a video.
+        ValueError: the file is no video, or one without a frame.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -34,7 +34,10 @@ class Video:
         self.path = Path(path)
         if not self.path.is_file():
             raise FileNotFoundError(f"no such video: {self.path}")
-        capture = self._open()
+        try:
+            capture = self._open()
+        except FrameError as error:
+            raise ValueError(error) from error
         self._capture: Any = capture
         self._next = 0
         self.fps = float(capture.get(cv2.CAP_PROP_FPS))
@@ -44,6 +47,8 @@ class Video:
         )
         named = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self._length = named if named > 0 else self._count()
+        if self._length == 0 or 0 in self.size:
+            raise ValueError(f"{self.path}: the video has no frame that can be decoded")
 
     def __len__(self) -> int:
         """Frames that the file says it has; a truncated one ends earlier, with :class:`FrameError`."""
@@ -81,7 +86,7 @@ class Video:
 
         capture = cv2.VideoCapture(str(self.path))
         if not capture.isOpened():
-            raise FrameError(self.path, "cannot be opened as a video")
+            raise FrameError(self.path, "cannot be opened as a video: empty, truncated, or of an unknown format")
         return capture
 
     def __getstate__(self) -> dict[str, Any]:
