@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.tracker import LandmarkTracker
+from ufmstar_torch.anchors import LandmarkTracker
 from ufmstar_torch.eval.report.outputs import field_of_view
 from ufmstar_torch.eval.sequences import FrameError
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence

@@ -17,7 +17,7 @@ import torch
 from clips import Clip, add_sources, clips, judge, line, shown
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
+from ufmstar_torch.anchors import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour.open import open_sequence
 

@@ -21,7 +21,8 @@ from torch import Tensor
 from ufmstar_torch.camera import crop_intrinsics, resize_intrinsics
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.kernels.segment_cpu import spgf
+from ufmstar_torch.kernels.segment_cpu import segment
+from ufmstar_torch.segment_input import SegmentInput
 
 SEQUENCES = {
     "fr1/xyz": "rgbd_dataset_freiburg1_xyz",
@@ -53,7 +54,7 @@ def row(frames: list[tuple[Tensor, Tensor]], config: SPGFConfig) -> str:
     """Median (least) number of Gaussians and median (least) share of the usable pixels they cover."""
     counts, shares = [], []
     for depth, K in frames:
-        mixture, labels = spgf(depth, K, config)
+        mixture, labels = segment(SegmentInput.checked(depth, K, config))
         usable = (depth > 0) & (depth <= config.max_depth)
         counts.append(int(mixture.components[0]))
         shares.append(100 * float((labels >= 0).sum() / usable.sum().clamp_min(1)))

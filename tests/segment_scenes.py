@@ -16,8 +16,16 @@ from ufmstar_torch.camera import resize_intrinsics, unproject
 from ufmstar_torch.config import SPGFConfig
 from ufmstar_torch.kernels import segment_cpu
 from ufmstar_torch.segment import spgf as torch_spgf
+from ufmstar_torch.segment_input import SegmentInput
 
-TIERS = {"torch": torch_spgf, "numba": segment_cpu.spgf}
+
+def numba_spgf(depth, intrinsics, config=None, *, variance=None, valid=None, features=None, before_pruning=False):
+    """The compiled kernel with the reference's arguments."""
+    given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
+    return segment_cpu.segment(given, before_pruning=before_pruning)
+
+
+TIERS = {"torch": torch_spgf, "numba": numba_spgf}
 REFERENCES = ("spgf_224_tum", "spgf_224_tartanair_indoor", "spgf_vga_tum")
 
 

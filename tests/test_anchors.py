@@ -14,7 +14,7 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
 from ufmstar_torch.anchors.given import AnchorInput, Anchors
-from ufmstar_torch.read_out import anchored_term
+from ufmstar_torch.anchors.hook import anchored_term
 
 HEIGHT, WIDTH = 48, 64
 ON = UfMStarConfig(anchored=True)

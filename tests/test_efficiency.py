@@ -79,7 +79,7 @@ def test_a_row_is_what_the_module_makes_of_the_networks_turns(race, sequence):
 
 def test_the_stages_are_those_of_the_same_step_and_add_up(race):
     staged, whole = race.staged["UfM*-Ensemble"], race.multiview["UfM*-Ensemble"].module
-    assert torch.equal(staged.state.mixture.mean, whole.mean)
+    assert torch.equal(staged.module.mixture.mean, whole.mean)
     stages = staged.clock.stages
     assert {len(times) for times in stages.values()} == {6}
     sums = np.sum(list(stages.values()), axis=0)

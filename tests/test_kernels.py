@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,10 +15,11 @@ from random_gaussians import covariances, mixture
 from test_fuse import random_pairs
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig, backend, gaussian
+from ufmstar_torch import UfMStar, UfMStarConfig, gaussian
 from ufmstar_torch.correspond import correspond
 from ufmstar_torch.fuse import fuse
-from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu
+from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu, select
+from ufmstar_torch.step import REFERENCE
 
 pytestmark = pytest.mark.numerics
 
@@ -32,7 +34,7 @@ def test_correspond(seed, eta, eta_occl):
     config = UfMStarConfig(eta=eta, eta_occlusion=eta_occl)
     reference = correspond(previous, current, K.expand(2, 3, 3), SIZE, config)
     fast = correspond_cpu.correspond(previous, current, K.expand(2, 3, 3), SIZE, config)
-    torch.testing.assert_close(fast.overlap, reference.overlap, rtol=1e-11, atol=1e-300)
+    torch.testing.assert_close(fast.overlap, reference.overlap, rtol=1e-11, atol=1e-100)
     assert torch.equal(fast.match, reference.match)
 
 
@@ -65,31 +67,36 @@ def test_floor_covariance():
 
 
 def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
-    for name in [n for n in sys.modules if n.startswith("ufmstar_torch.kernels.") or n == "numba"]:
+    for name in [
+        n for n in sys.modules if (n.startswith("ufmstar_torch.kernels.") and n.endswith("_cpu")) or n == "numba"
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delattr("ufmstar_torch.kernels.regress_cpu")
+    select._numba.cache_clear()
     for name in ("correspond_cpu", "fuse_cpu", "segment_cpu", "segment_image_cpu"):
         monkeypatch.delattr(f"ufmstar_torch.kernels.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)
-    backend._numba_or_none.cache_clear()
+    select._numba_or_none.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba cannot be imported .* torch reference serves") as caught:
-            chosen = [backend.select("auto", "cpu") for _ in range(2)]
+            chosen = [select.select_kernels("auto", "cpu") for _ in range(2)]
         assert len(caught) == 1
-        assert chosen == [backend.TORCH] * 2
+        assert chosen == [REFERENCE] * 2
         with pytest.raises(ImportError):
-            backend.select("numba", "cpu")
+            select.select_kernels("numba", "cpu")
     finally:
-        backend._numba_or_none.cache_clear()
+        select._numba_or_none.cache_clear()
 
 
 def test_seam():
-    assert backend.select("auto", "cpu").name == "numba"
-    assert backend.select("torch", "cpu") is backend.TORCH
-    assert backend.select("auto", "cuda").name == "torch, host segmentation"
-    assert backend.select("torch", "cuda") is backend.TORCH
+    compiled = select.select_kernels("numba", "cpu")
+    assert select.select_kernels("auto", "cpu") is compiled is not REFERENCE
+    assert select.select_kernels("torch", "cpu") is select.select_kernels("torch", "cuda") is REFERENCE
+    mixed = select.select_kernels("auto", "cuda")
+    assert mixed.spgf is not REFERENCE.spgf, "on the host"
+    assert replace(mixed, spgf=REFERENCE.spgf) == REFERENCE
     with pytest.raises(ValueError, match="needs CPU tensors"):
-        backend.select("numba", "cuda")
+        select.select_kernels("numba", "cuda")
 
 
 def test_whole_sequence_fast_and_slow():
@@ -146,7 +153,7 @@ def test_threads_share_the_image_and_leave_torchs_number_alone(config):
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            results.append(regress_cpu.regress_image(m, depth, K, config))
+            results.append(regress_cpu.regress_image(m, depth, K, depth > 0, config))
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)

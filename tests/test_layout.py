@@ -17,7 +17,7 @@ HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetr
 HEAVY += ("numba",)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "disagree", "fuse", "regress", "mixture", "step", "frame")
-REFERENCE += ("anchors", "evidence", "read_out", "output", "stateful")
+REFERENCE += ("anchors", "evidence", "hook", "output", "state", "fixed_order")
 
 
 def layer_of(path: Path) -> str:
@@ -101,6 +101,7 @@ def test_kernels_import_back_only_plain_types():
         "Regression",
         "regress",
         "distribute",
+        "regress_pixels",
         "Correspondence",
         "PIXEL_VARIANCE",
         "UfMStarConfig",
@@ -109,7 +110,7 @@ def test_kernels_import_back_only_plain_types():
         "DAMPING",
         "STEPS",
     }
-    for path in (ROOT / "ufmstar_torch" / "kernels").glob("*.py"):
+    for path in (ROOT / "ufmstar_torch" / "kernels").glob("*_cpu.py"):
         for module, names in imported(path):
             if module.startswith("ufmstar_torch.") and not module.startswith("ufmstar_torch.kernels"):
                 own = {n for n in names if n in plain or module == "ufmstar_torch.segment_input"}

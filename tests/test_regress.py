@@ -77,8 +77,8 @@ def test_shares_make_up_the_regression(config):
 def test_the_kernel_agrees_with_the_reference(config, dtype, tolerance):
     m = mixture(2, 40, 3, features=2)
     depth = torch.cat([rendered(0), rendered(3)])
-    reference = regress_image(m, depth, K.expand(2, 3, 3), config)
-    fast = regress_cpu.regress_image(m, depth.to(dtype), K.expand(2, 3, 3), config)
+    reference = regress_image(m, depth, K.expand(2, 3, 3), depth > 0, config)
+    fast = regress_cpu.regress_image(m, depth.to(dtype), K.expand(2, 3, 3), depth > 0, config)
     assert fast.disagreement.dtype == dtype
     assert torch.equal(fast.disagreement.isnan(), reference.disagreement.isnan())
     assert fast.disagreement.isnan().sum() == 2
@@ -94,9 +94,11 @@ def test_culling_keeps_its_bound(monkeypatch, epsilon):
     m = mixture(1, 60, 5)
     config = UfMStarConfig(prior_mean=0.7)
     depth = rendered(2)
-    exact = regress_image(m, depth, K, config).disagreement
+    exact = regress_image(m, depth, K, depth > 0, config).disagreement
     monkeypatch.setitem(regress_cpu.EPSILON, torch.float64, epsilon)
-    error = (regress_cpu.regress_image(m, depth, K, config).disagreement - exact).abs().nan_to_num().max().item()
+    error = (
+        (regress_cpu.regress_image(m, depth, K, depth > 0, config).disagreement - exact).abs().nan_to_num().max().item()
+    )
     assert error <= 2 * epsilon * max(m.disagreement.max().item(), 0.7)
     if epsilon == 0.5:
         assert error > 1e-9  # something was left out, or the test tests nothing
@@ -142,7 +144,8 @@ def test_far_away_the_prior_rules():
     far = torch.full((1, 3, 3), 50.0, dtype=torch.float64)
     for config in (EXACT, NEAR):
         assert regress(m, far, config).disagreement.tolist() == [[0.3, 0.3, 0.3]]
-    image = regress_cpu.regress_image(m, torch.full((1, 40, 56), 50.0, dtype=torch.float64), K, EXACT)
+    depth = torch.full((1, 40, 56), 50.0, dtype=torch.float64)
+    image = regress_cpu.regress_image(m, depth, K, depth > 0, EXACT)
     torch.testing.assert_close(image.disagreement, torch.full_like(image.disagreement, 0.3), rtol=1e-12, atol=0)
 
 
@@ -150,7 +153,7 @@ def test_an_empty_mixture_is_the_prior_everywhere():
     m = mixture(1, 3, 1, empty=3)
     for function in (regress_image, regress_cpu.regress_image):
         for config in (EXACT, NEAR):
-            out = function(m, rendered(), K, config).disagreement
+            out = function(m, rendered(), K, rendered() > 0, config).disagreement
             assert torch.equal(out[~out.isnan()].unique(), torch.tensor([0.3], dtype=torch.float64))
 
 
@@ -214,6 +217,6 @@ def test_a_far_outlier_in_a_tile_spoils_no_neighbour():
     m = mixture(1, 30, 3)
     depth = rendered(1).nan_to_num(2.0)
     depth[0, 10, 10] = 1e30
-    reference = regress_image(m, depth, K, EXACT).disagreement
-    fast = regress_cpu.regress_image(m, depth.float(), K, EXACT).disagreement
+    reference = regress_image(m, depth, K, depth > 0, EXACT).disagreement
+    fast = regress_cpu.regress_image(m, depth.float(), K, depth > 0, EXACT).disagreement
     torch.testing.assert_close(fast.double(), reference, rtol=0, atol=5e-5)

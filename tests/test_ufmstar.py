@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+
 import numpy as np
 import oracle_spgf
 import pytest
@@ -193,6 +195,41 @@ class Products(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+class Trace:
+    """An observer that writes down what it is called with."""
+
+    def __init__(self):
+        self.events = []
+
+    def stage(self, name):
+        self.events.append(name)
+
+    @contextmanager
+    def kernel(self, name):
+        self.events.append(f"{name}(")
+        yield
+        self.events.append(")")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_an_observer_follows_the_stages_and_changes_no_bit(backend):
+    config = UfMStarConfig(segment=SPGF, backend=backend, anchored=True)
+    watched, plain = UfMStar(config), UfMStar(config)
+    watched.observer = Trace()
+    for depth, pose, K, anchors in walks(2, 3):
+        a, b = (m(depth, pose, K, anchors=anchors) for m in (watched, plain))
+        assert same_bits(a.variance, b.variance)
+        assert " ".join(watched.observer.events) == (
+            "check spgf( ) floor_covariance( ) segment correspond( ) correspond fuse( ) fuse "
+            "distribute( ) append regress_image( ) regress smooth( ) average"
+        )
+        watched.observer.events.clear()
+    for name, value in plain.state_dict().items():
+        assert same_bits(value, watched.state_dict()[name])
+    watched.mean_uncertainty(depth, pose, K)
+    assert watched.observer.events[-2:] == ["regress", "average"]
+
+
 BLAS = {"mm", "bmm", "addmm", "baddbmm", "addbmm", "addmv", "addr", "mv", "dot", "vdot", "matmul", "einsum", "int_mm"}
 ELEMENTWISE = {"linalg_vector_norm", "linalg_cross"}
 
@@ -336,8 +373,8 @@ def test_identical_near_and_fine_views_do_not_disagree():
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_thin_wide_plates_survive_a_thousand_fusions_in_float32(backend):
     """A plate 2000 times wider than thick: rounding to float32 alone would make it indefinite."""
-    from ufmstar_torch.backend import select
     from ufmstar_torch.correspond import Correspondence
+    from ufmstar_torch.kernels.select import select_kernels
     from ufmstar_torch.mixture import GaussianMixture
 
     generator = torch.Generator().manual_seed(0)
@@ -353,7 +390,7 @@ def test_thin_wide_plates_survive_a_thousand_fusions_in_float32(backend):
         )
 
     mixture = plate().to(torch.float32)
-    fuse = select(backend, "cpu").fuse
+    fuse = select_kernels(backend, "cpu").fuse
     pairs = Correspondence(torch.ones(1, 1, 1, dtype=torch.bool), torch.ones(1, 1, 1, dtype=torch.float64))
     for _ in range(1000 if backend == "numba" else 200):
         mixture = fuse(mixture, plate(), pairs, UfMStarConfig(), rounds=1)

@@ -31,6 +31,23 @@ def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
     return depth_to_3d_v2(depth, intrinsics.to(depth.dtype))
 
 
+def unproject_at(depth: Tensor, index: Tensor, width: int, intrinsics: Tensor) -> Tensor:
+    """:func:`unproject` at some pixels, in the dtype of ``depth``.
+
+    Args:
+        depth: [B, N] at those pixels [m].
+        index: [B, N] of the pixels in the flattened image.
+        width: of the image [px].
+        intrinsics: [B, 3, 3] [px].
+
+    Returns:
+        [B, N, 3] points in the camera frame [m].
+    """
+    fx, fy, cx, cy = (value.to(depth.dtype)[:, None] for value in focal_and_centre(intrinsics))
+    u, v = index % width, index.div(width, rounding_mode="floor")
+    return torch.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], dim=-1)
+
+
 def focal_and_centre(intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """fx, fy, cx, cy [px], each with the leading dimensions of ``intrinsics`` [..., 3, 3]."""
     return intrinsics[..., 0, 0], intrinsics[..., 1, 1], intrinsics[..., 0, 2], intrinsics[..., 1, 2]

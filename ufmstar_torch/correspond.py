@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ufmstar_torch.camera import project_gaussian
 from ufmstar_torch.config import UfMStarConfig
@@ -33,6 +34,14 @@ class Correspondence:
     match: Tensor
     overlap: Tensor
     distance: Tensor | None = None
+
+    def padded(self, capacity: int) -> Correspondence:
+        """The pairs for a mixture that has grown to ``capacity`` slots: the new ones match nothing."""
+        missing = capacity - self.match.shape[2]
+        if not missing:
+            return self
+        distance = None if self.distance is None else pad(self.distance, (0, missing))
+        return Correspondence(pad(self.match, (0, missing)), pad(self.overlap, (0, missing)), distance)
 
 
 def correspond(

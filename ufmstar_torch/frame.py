@@ -7,6 +7,7 @@ raises or skips. What is wrong with single pixels becomes ``valid = False`` and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -76,7 +77,7 @@ def check_frame(
         TypeError: an argument is no tensor or has the wrong kind of dtype.
         ValueError: an argument has the wrong shape or lies on another device than ``depth``.
     """
-    _require_float("depth", depth)
+    require_float("depth", depth)
     shape = tuple(depth.shape)
     if not (len(shape) == 3 or (len(shape) == 4 and shape[1] == 1)) or 0 in shape:
         raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}")
@@ -105,7 +106,22 @@ def check_frame(
     return FrameInput(safe_depth, T_safe, K_safe, a, e, extra, use, fault, _moved(deviation, plain.device))
 
 
-def _require_float(name: str, value: object) -> None:
+def raise_faults(faults: Sequence[int]) -> None:
+    """Raise a ValueError that names every stream at fault.
+
+    Args:
+        faults: of every stream, index into ``FRAME_FAULTS``.
+
+    Raises:
+        ValueError: an entry of ``faults`` is not 0.
+    """
+    bad = [f"stream {b}: {FRAME_FAULTS[code]}" for b, code in enumerate(faults) if code]
+    if bad:
+        raise ValueError("; ".join(bad))
+
+
+def require_float(name: str, value: object) -> None:
+    """Raise a TypeError unless ``value`` is a tensor of a floating-point dtype."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
     if not value.is_floating_point():
@@ -120,7 +136,7 @@ def _on_device(name: str, value: Tensor, depth: Tensor) -> None:
 def _like_depth(name: str, value: Tensor | None, depth: Tensor, plain: Tensor) -> Tensor | None:
     if value is None:
         return None
-    _require_float(name, value)
+    require_float(name, value)
     _on_device(name, value, depth)
     if value.shape not in (depth.shape, plain.shape):
         raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
@@ -143,7 +159,7 @@ def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | No
         if count:
             raise ValueError(f"features must be given with shape {expected}: the config asks for {count}")
         return None
-    _require_float("features", features)
+    require_float("features", features)
     _on_device("features", features, plain)
     if tuple(features.shape) != expected:
         raise ValueError(
@@ -154,7 +170,7 @@ def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | No
 
 def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
     """[B, n, n] float64 on the device where it was given (a pose on the CPU is checked without waiting)."""
-    _require_float(name, value)
+    require_float(name, value)
     if value.shape[-2:] != (n, n) or value.dim() not in (2, 3):
         raise ValueError(f"{name} must be [B, {n}, {n}] or [{n}, {n}], got {tuple(value.shape)}")
     if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):

@@ -97,6 +97,13 @@ class GaussianMixture:
             mean=torch.where(self.valid[..., None], mean, torch.zeros_like(mean)), covariance=covariance
         )
 
+    def grown(self, needed: int, limit: int | None) -> GaussianMixture:
+        """The same mixture with its capacity doubled until ``needed`` slots fit, or to the ``limit``."""
+        capacity = self.capacity
+        while capacity < needed:
+            capacity *= 2
+        return self.padded(capacity if limit is None else min(capacity, limit))
+
     def padded(self, capacity: int) -> GaussianMixture:
         """The same mixture with at least ``capacity`` slots, new ones empty."""
         missing = capacity - self.capacity

@@ -1,4 +1,4 @@
-"""What UfM* returns for one image."""
+"""What a step and what UfM* returns for one image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,60 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.step import FrameStatistics
+
+
+@dataclass(frozen=True)
+class FrameStatistics:
+    """What happened to one frame, per stream [B].
+
+    Attributes:
+        components: K, occupied components after the frame.
+        segments: C, Gaussians segmented from the frame.
+        matched: segments fused with at least one earlier component.
+        pairs: fused (c, k) pairs.
+        new: segments appended to the mixture.
+        dropped: segments not remembered: ``max_components`` was reached, or nearer than the near plane.
+        valid_pixels: pixels used.
+        fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
+        rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
+        anchors: given and usable; 0 for a standing camera, say.
+        anchors_used: of those, no gross outliers. 0 = nothing new was learnt: M + A + E is plain UfM*'s and B what had
+            been learnt before, which at the start is nothing.
+    """
+
+    components: Tensor
+    segments: Tensor
+    matched: Tensor
+    pairs: Tensor
+    new: Tensor
+    dropped: Tensor
+    valid_pixels: Tensor
+    fault: Tensor
+    rotation_deviation: Tensor
+    anchors: Tensor
+    anchors_used: Tensor
+
+
+@dataclass(frozen=True)
+class StepOutput:
+    """The regressed disagreement and what led to it.
+
+    Attributes:
+        disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid; [B, n] on a subset.
+        features: regressed features [B, H, W, F] or [B, n, F].
+        residual: [B, H, W, 2] or [B, n, 2] from anchors, the mean relative error r and mean square excess e expected at
+            each pixel (``anchors.evidence``); None unless ``config.anchored``.
+        labels: [B, H, W] int64 the segment of every pixel, -1 = none.
+        current_cam: C_i in the camera frame.
+        statistics: of this frame.
+    """
+
+    disagreement: Tensor
+    features: Tensor
+    residual: Tensor | None
+    labels: Tensor
+    current_cam: GaussianMixture
+    statistics: FrameStatistics
 
 
 @dataclass(frozen=True)

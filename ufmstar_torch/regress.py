@@ -7,12 +7,13 @@ average of m_k with weights w_k(x), a weak prior (pi_0, mu_0) taking over where 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.camera import unproject
+from ufmstar_torch.camera import unproject, unproject_at
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.gaussian import cholesky3, inverse_lower3
@@ -61,20 +62,48 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
     return Regression(torch.cat([p.disagreement for p in parts], 1), torch.cat([p.features for p in parts], 1))
 
 
-def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig) -> Regression:
-    """:func:`regress` at every pixel of a depth map: disagreement [B, H, W], features [B, H, W, F].
+def regress_image(
+    mixture_cam: GaussianMixture,
+    depth: Tensor,
+    intrinsics: Tensor,
+    valid: Tensor,
+    config: UfMStarConfig,
+    pixels: Tensor | None = None,
+) -> Regression:
+    """:func:`regress` at every pixel of a depth map, [B, H, W] and [B, H, W, F], or at some, [B, n] and [B, n, F].
 
     Args:
         mixture_cam: [B, K] in the camera frame.
-        depth: [B, H, W] [m]; pixels that are not finite and positive give NaN.
+        depth: [B, H, W] [m].
         intrinsics: [B, 3, 3] [px].
+        valid: [B, H, W] bool; NaN elsewhere.
+        config: as :func:`regress`.
+        pixels: [B, n] indices into the flattened image; None = every pixel.
     """
-    b, height, width = depth.shape
+    if pixels is not None:
+        return regress_pixels(mixture_cam, depth, intrinsics, valid, config, pixels, regress)
     result = regress(mixture_cam, unproject(depth, intrinsics).flatten(1, 2), config)
-    shape = (b, height, width)
-    seen = (depth > 0) & (depth < torch.inf)
-    disagreement = torch.where(seen, result.disagreement.view(shape), torch.nan)
-    return Regression(disagreement, torch.where(seen[..., None], result.features.view(*shape, -1), torch.nan))
+    return _where(valid, result.disagreement.view(valid.shape), result.features.view(*valid.shape, -1))
+
+
+def regress_pixels(
+    mixture_cam: GaussianMixture,
+    depth: Tensor,
+    intrinsics: Tensor,
+    valid: Tensor,
+    config: UfMStarConfig,
+    pixels: Tensor,
+    at_points: Callable[[GaussianMixture, Tensor, UfMStarConfig], Regression],
+) -> Regression:
+    """:func:`regress_image` at some pixels, by any implementation of :func:`regress`."""
+    chosen = torch.gather(depth.flatten(1), 1, pixels)
+    result = at_points(mixture_cam, unproject_at(chosen, pixels, depth.shape[2], intrinsics), config)
+    return _where(torch.gather(valid.flatten(1), 1, pixels), result.disagreement, result.features)
+
+
+def _where(valid: Tensor, disagreement: Tensor, features: Tensor) -> Regression:
+    """NaN where not valid."""
+    return Regression(torch.where(valid, disagreement, torch.nan), torch.where(valid[..., None], features, torch.nan))
 
 
 def shares(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Tensor:
@@ -172,6 +201,35 @@ def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Ten
     mixed = (1 - alpha) * previous + alpha * now
     memory = torch.where(now.isnan(), previous, torch.where(previous.isnan(), now, mixed))
     return memory, torch.where(now.isnan(), torch.nan, memory).to(current.dtype)
+
+
+def moving_average(
+    memory: Tensor,
+    disagreement: Tensor,
+    size: tuple[int, int],
+    alpha: float,
+    pixels: Tensor | None,
+    kernel: Callable[[Tensor, Tensor, float], tuple[Tensor, Tensor]] = smooth,
+) -> tuple[Tensor, Tensor]:
+    """The moving average of a frame: the new memory [B, H, W], and the map to show.
+
+    The memory keeps its dtype, so that a saved run goes on as it was, and restarts when the image size changes.
+
+    Args:
+        memory: [B, h, w] of the frame before [m^2].
+        disagreement: [B, H, W], or [B, n] at ``pixels``, where the dense map serves as memory.
+        size: H and W.
+        alpha: in (0, 1].
+        pixels: [B, n] indices into the flattened image, or None.
+        kernel: an implementation of :func:`smooth`.
+    """
+    if memory.shape[1:] != size:
+        memory = memory.new_full((memory.shape[0], *size), torch.nan)
+    if pixels is None:
+        return kernel(memory, disagreement, alpha)
+    flat = memory.flatten(1)
+    mixed, shown = kernel(torch.gather(flat, 1, pixels), disagreement, alpha)
+    return flat.scatter(1, pixels, mixed).view(memory.shape), shown
 
 
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,6 @@ from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.segment_scanline import Frame, Segments, scanlines
 
 
-@torch.no_grad()
 def spgf(
     depth: Tensor,
     intrinsics: Tensor,
@@ -61,11 +60,19 @@ def spgf(
         ValueError: an argument has the wrong shape or lies on another device than depth; on the CPU also
             intrinsics that are not finite with fx, fy > 0 (elsewhere such a stream's result means nothing).
     """
-    given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
-    if compute_dtype is None:
-        compute_dtype = torch.float32 if depth.device.type == "mps" else torch.float64
-    elif compute_dtype not in (torch.float32, torch.float64):
+    if compute_dtype not in (None, torch.float32, torch.float64):
         raise ValueError(f"compute_dtype must be torch.float32 or torch.float64, got {compute_dtype}")
+    given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
+    return segment(given, before_pruning=before_pruning, compute_dtype=compute_dtype)
+
+
+@torch.no_grad()
+def segment(
+    given: SegmentInput, *, before_pruning: bool = False, compute_dtype: torch.dtype | None = None
+) -> tuple[GaussianMixture, Tensor]:
+    """:func:`spgf` of checked input."""
+    if compute_dtype is None:
+        compute_dtype = torch.float32 if given.depth.device.type == "mps" else torch.float64
     frame = Frame.of(given, compute_dtype)
     segments = scanlines(frame)
     return _output(frame, segments, *fuse_segments(frame, segments), before_pruning)

@@ -1,4 +1,4 @@
-"""What both implementations of SPGF are given, checked once: shapes, dtypes, and thresholds for this image."""
+"""The input of every implementation of SPGF, checked once: shapes, dtypes, and thresholds for this image."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
+from ufmstar_torch.frame import FrameInput, require_float
 
 # Bins are walked one by one; more than this would be a mistake in the units, not a wish.
 MAX_DEPTH_BINS = 10_000
@@ -17,7 +18,7 @@ MAX_DEPTH_BINS = 10_000
 
 @dataclass(frozen=True)
 class SegmentInput:
-    """Checked arguments of ``spgf``, detached from any graph.
+    """Checked arguments of SPGF, detached from any graph.
 
     Attributes:
         depth: [B, H, W] [m], float32 or float64 (float64 where half or bfloat16 was given).
@@ -42,10 +43,10 @@ class SegmentInput:
         cls,
         depth: Tensor,
         intrinsics: Tensor,
-        config: SPGFConfig | UfMStarConfig | None,
-        variance: Tensor | None,
-        valid: Tensor | None,
-        features: Tensor | None,
+        config: SPGFConfig | UfMStarConfig | None = None,
+        variance: Tensor | None = None,
+        valid: Tensor | None = None,
+        features: Tensor | None = None,
     ) -> SegmentInput:
         """Check the arguments of ``spgf``; see there.
 
@@ -54,7 +55,7 @@ class SegmentInput:
             ValueError: a wrong shape, another device than depth's, or (CPU tensors only, elsewhere the check
                 would wait for the device) intrinsics that are not finite with fx, fy > 0.
         """
-        _require_float("depth", depth)
+        require_float("depth", depth)
         if depth.dim() != 3 or 0 in depth.shape:
             raise ValueError(f"depth must be [B, H, W] with no empty dimension, got {tuple(depth.shape)}")
         b, height, width = depth.shape
@@ -79,6 +80,15 @@ class SegmentInput:
             dtype=depth.dtype if stored else torch.float32,
         )
 
+    @classmethod
+    def of_frame(cls, frame: FrameInput, config: UfMStarConfig) -> SegmentInput:
+        """The input of step 2 from a checked frame, whose depth is 0 where a pixel is not valid."""
+        variance = None
+        if config.aleatoric_in_moments and frame.aleatoric is not None:
+            variance = frame.aleatoric.detach()
+        thresholds = _scaled(config.segment, *frame.size)
+        return cls(frame.depth, frame.intrinsics, thresholds, variance, None, frame.features, frame.depth.dtype)
+
     @property
     def segments_per_row(self) -> int:
         """Most segments that one row can hold: each has more than ``sparse`` pixels. At least 1."""
@@ -92,33 +102,26 @@ class SegmentInput:
 
 @functools.lru_cache(maxsize=16)  # a frame's worth of checks, for a value that never changes
 def _scaled(config: SPGFConfig, height: int, width: int) -> SPGFConfig:
-    return config.scaled_to(height, width)
-
-
-def _spgf_config(config: SPGFConfig | UfMStarConfig | None) -> SPGFConfig:
-    if config is None:
-        config = SPGFConfig()
-    elif isinstance(config, UfMStarConfig):
-        config = config.segment
-    elif not isinstance(config, SPGFConfig):
-        raise TypeError(f"config must be an SPGFConfig, a UfMStarConfig or None, got {type(config).__name__}")
     if config.max_depth > MAX_DEPTH_BINS * config.min_gaussian_length:
         raise ValueError(
             f"config.min_gaussian_length = {config.min_gaussian_length} m would cut config.max_depth = "
             f"{config.max_depth} m into more than {MAX_DEPTH_BINS} bins; are both in metres?"
         )
+    return config.scaled_to(height, width)
+
+
+def _spgf_config(config: SPGFConfig | UfMStarConfig | None) -> SPGFConfig:
+    if config is None:
+        return SPGFConfig()
+    if isinstance(config, UfMStarConfig):
+        return config.segment
+    if not isinstance(config, SPGFConfig):
+        raise TypeError(f"config must be an SPGFConfig, a UfMStarConfig or None, got {type(config).__name__}")
     return config
 
 
-def _require_float(name: str, value: object) -> None:
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
-    if not value.is_floating_point():
-        raise TypeError(f"{name} must have a floating-point dtype, got {value.dtype}")
-
-
 def _require_like(name: str, value: object, shape: tuple[object, ...], depth: Tensor) -> None:
-    _require_float(name, value)
+    require_float(name, value)
     assert isinstance(value, Tensor)
     if tuple(value.shape) != shape:
         expected = "[" + ", ".join(str(n) for n in shape) + "]"

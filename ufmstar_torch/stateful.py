@@ -6,7 +6,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor, nn
@@ -36,10 +36,14 @@ class StatefulModule(nn.Module):
     ALWAYS_FLOAT64: ClassVar[tuple[str, ...]] = ("T_world_first",)
     config: Config
 
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Tensor:
+            """The buffers are the only attributes that are not in ``__dict__``."""
+
     def _store(self, state: Mapping[str, Tensor]) -> None:
         """Exchange all buffers."""
-        for name in self.STATE:
-            setattr(self, name, state[name])
+        self._buffers.update({name: state[name] for name in self.STATE})
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """``.to()`` and friends, with the exceptions that the class states."""

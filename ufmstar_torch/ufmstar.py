@@ -7,25 +7,20 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ufmstar_torch.anchors.evidence import Evidence
-from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors
-from ufmstar_torch.backend import select
+from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, check_anchors
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
-from ufmstar_torch.frame import FrameInput, check_frame
+from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
+from ufmstar_torch.kernels.select import select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
+from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
-from ufmstar_torch.read_out import anchored_term
 from ufmstar_torch.regress import Regression, regress, sample_pixels
+from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
-from ufmstar_torch.step import StepOutput, UfMStarState, step
-
-_MIXTURE = ("mean", "covariance", "weight", "disagreement", "count", "features")
-_STATE = (*_MIXTURE, "T_world_first", "started", "frames", "skipped", "smoothed", "evidence", "overall_evidence")
-# What ``reset(keep_evidence=True)`` leaves.
-_LASTING = "overall_evidence"
+from ufmstar_torch.step import StepObserver
 
 
 class UfMStar(StatefulModule):
@@ -42,6 +37,9 @@ class UfMStar(StatefulModule):
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; it follows the first frame otherwise.
 
+    Attributes:
+        observer: follows the stages of every step (``ufmstar_torch.step.StepObserver``), to time them; None = nobody.
+
     Example::
 
         ufm = UfMStar()
@@ -50,21 +48,9 @@ class UfMStar(StatefulModule):
             trust = out.std                              # [m]
     """
 
-    STATE = _STATE
+    STATE = UfMStarState.names()
     config: UfMStarConfig
-    mean: Tensor
-    covariance: Tensor
-    weight: Tensor
-    disagreement: Tensor
-    count: Tensor
-    features: Tensor
-    T_world_first: Tensor
-    started: Tensor
-    frames: Tensor
-    skipped: Tensor
-    smoothed: Tensor
-    evidence: Tensor
-    overall_evidence: Tensor
+    observer: StepObserver | None = None
 
     def __init__(
         self,
@@ -79,7 +65,7 @@ class UfMStar(StatefulModule):
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
-        for name, value in _to_buffers(UfMStarState.initial(0, self.config, dtype, device or "cpu")).items():
+        for name, value in UfMStarState.initial(0, self.config, dtype, device or "cpu").tensors().items():
             self.register_buffer(name, value)
 
     # ---- the algorithm ----
@@ -120,27 +106,17 @@ class UfMStar(StatefulModule):
                 a pose that is not rigid or bad intrinsics (``config.on_bad_frame == "skip"``: counted instead);
                 anchors without ``config.anchored``.
         """
-        frame = self._check(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        out = self._advance(frame, anchors=self._anchors(anchors, frame))
+        frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
+        out, variance, anchored = self._observe(frame, anchors)
         shape = depth.shape
-        disagreement = out.disagreement.reshape(shape)
-        bias, anchored = (None, None) if out.residual is None else out.residual.unbind(-1)
-        if anchored is not None:
-            anchored = anchored_term(frame.depth, anchored, out.disagreement).reshape(shape)
-        variance = self._total(
-            disagreement,
-            None if frame.aleatoric is None else frame.aleatoric.reshape(shape),
-            None if frame.epistemic is None else frame.epistemic.reshape(shape),
-            anchored,
-        )
         return UfMStarOutput(
             depth=depth,
-            variance=variance,
-            disagreement=disagreement,
+            variance=variance.reshape(shape),
+            disagreement=out.disagreement.reshape(shape),
             aleatoric=aleatoric,
             epistemic=epistemic,
-            anchored=anchored,
-            bias=None if bias is None else bias.reshape(shape),
+            anchored=None if anchored is None else anchored.reshape(shape),
+            bias=None if out.residual is None else out.residual[..., 0].reshape(shape),
             features=out.features,
             valid=frame.valid.reshape(shape),
             labels=out.labels,
@@ -176,18 +152,9 @@ class UfMStar(StatefulModule):
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
-        frame = self._check(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
+        frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
-        out = self._advance(frame, pixels=index, average=average, anchors=self._anchors(anchors, frame))
-
-        def chosen(value: Tensor | None) -> Tensor | None:
-            return None if value is None else torch.gather(value.flatten(1), 1, index)
-
-        anchored = None
-        if out.residual is not None:
-            at = torch.gather(frame.depth.flatten(1), 1, index)
-            anchored = anchored_term(at, out.residual[..., 1], out.disagreement)
-        variance = self._total(out.disagreement, chosen(frame.aleatoric), chosen(frame.epistemic), anchored)
+        out, variance, _ = self._observe(frame, anchors, index, average=average)
         count = used.sum(1)
         value = torch.where(used, variance, torch.zeros_like(variance))
         mean = total(value, 1) / count  # 0/0 = NaN where no pixel is valid
@@ -232,16 +199,12 @@ class UfMStar(StatefulModule):
     @property
     def mixture(self) -> GaussianMixture:
         """M_i, [B, K], in the frame of each stream's first camera (``T_world_first`` takes it to the world)."""
-        return GaussianMixture(**{name: getattr(self, name) for name in _MIXTURE})
+        return self.state.mixture
 
     @property
     def state(self) -> UfMStarState:
-        """The state as the pure function :func:`ufmstar_torch.step.step` takes it."""
-        smoothed = self.smoothed if self.smoothed.shape[-1] else None
-        evidence = Evidence(self.evidence, self.overall_evidence) if self.config.anchored else None
-        return UfMStarState(
-            self.mixture, self.T_world_first, self.started, self.frames, self.skipped, smoothed, evidence
-        )
+        """The state as a step (``ufmstar_torch.step``) takes it."""
+        return UfMStarState(**{name: getattr(self, name) for name in self.STATE})
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
@@ -262,24 +225,17 @@ class UfMStar(StatefulModule):
             self._reset(streams, keep_evidence)
 
     def _reset(self, streams: Sequence[int] | Tensor | None, keep_evidence: bool) -> None:
-        dtype, device, b = self.mean.dtype, self.mean.device, self.mean.shape[0]
+        old, b = self.state, self.mean.shape[0]
         if streams is None:
-            fresh = _to_buffers(UfMStarState.initial(b if keep_evidence else 0, self.config, dtype, device))
-            self._store({**fresh, _LASTING: self.overall_evidence} if keep_evidence else fresh)
-            return
-        chosen = torch.as_tensor(streams, device=device)
-        if chosen.dtype == torch.bool and chosen.shape != (b,):
-            raise ValueError(f"streams as a mask must have shape ({b},), got {tuple(chosen.shape)}")
-        keep = torch.ones(b, dtype=torch.bool, device=device)
-        keep[chosen if chosen.numel() else chosen.long()] = False
-        start = {"T_world_first": torch.eye(4, dtype=torch.float64, device=device), "smoothed": torch.nan}
-        for name in _STATE:
-            if keep_evidence and name == _LASTING:
-                continue
-            old = getattr(self, name)
-            mask = keep.view(-1, *[1] * (old.dim() - 1))
-            value = torch.as_tensor(start.get(name, 0), dtype=old.dtype, device=device)
-            setattr(self, name, torch.where(mask, old, value))
+            new = UfMStarState.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
+        else:
+            chosen = torch.as_tensor(streams, device=old.mean.device)
+            if chosen.dtype == torch.bool and chosen.shape != (b,):
+                raise ValueError(f"streams as a mask must have shape ({b},), got {tuple(chosen.shape)}")
+            again = torch.zeros(b, dtype=torch.bool, device=old.mean.device)
+            again[chosen if chosen.numel() else chosen.long()] = True
+            new = old.restarted(again)
+        self._store(new.tensors() | ({"overall_evidence": old.overall_evidence} if keep_evidence else {}))
 
     def _anchors(self, anchors: Anchors | None, frame: FrameInput) -> AnchorInput | None:
         """Checked, with what the network itself claims where they lie.
@@ -291,30 +247,63 @@ class UfMStar(StatefulModule):
             return None
         if not self.config.anchored:
             raise ValueError("anchors need UfMStarConfig(anchored=True)")
-        own = [(frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)]
-        claimed = [value for value, counts in own if value is not None and counts]
-        return check_anchors(anchors, frame, torch.stack(claimed).sum(0) if claimed else None)
+        own = self._own(frame)
+        return check_anchors(anchors, frame, torch.stack(own).sum(0) if own else None)
 
-    def _advance(
-        self,
-        frame: FrameInput,
-        pixels: Tensor | None = None,
-        average: bool = True,
-        anchors: AnchorInput | None = None,
-    ) -> StepOutput:
-        """Run the pure step and keep its state. Normal tensors also under inference_mode: they must
-        outlive it."""
-        with (
-            torch.inference_mode(False),
-            torch.no_grad(),
-            full_precision(frame.depth.device),
-        ):
-            backend = select(self.config.backend, frame.depth.device.type)
+    def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
+        aleatoric, epistemic, valid, features = optional
+        return check_frame(
+            depth, pose, intrinsics, aleatoric, epistemic, valid, features,
+            feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
+        )  # fmt: skip
+
+    def _observe(
+        self, frame: FrameInput, anchors: Anchors | None, pixels: Tensor | None = None, *, average: bool = True
+    ) -> tuple[StepOutput, Tensor, Tensor | None]:
+        """Take in a frame: run the step and keep its state.
+
+        Args:
+            frame: checked.
+            anchors: as given.
+            pixels: [B, n] indices into the flattened image to read the variance at; None = every pixel.
+            average: apply the moving average.
+
+        Returns:
+            The step's output, V and B (None unless ``config.anchored``) [m^2], at every pixel [B, H, W] or [B, n].
+        """
+        checked_anchors = self._anchors(anchors, frame)
+        # Normal tensors also under the caller's inference_mode: the state must outlive it.
+        with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
+            state = self._state_for(frame)
+            if self.config.on_bad_frame == "raise":
+                raise_faults(frame.fault.tolist())
+            if self.observer is not None:
+                self.observer.stage("check")
+            step = select_step(self.config.backend, frame.depth.device.type)
             state, out = step(
-                self._state_for(frame), frame, self.config, backend, pixels=pixels, smooth=average, anchors=anchors
-            )
-            self._store(_to_buffers(state))
-        return out
+                state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
+                observer=self.observer,
+            )  # fmt: skip
+            self._store(state.tensors())
+
+        def chosen(value: Tensor) -> Tensor:
+            return value if pixels is None else torch.gather(value.flatten(1), 1, pixels)
+
+        # V = M + A + E (+ B), at least the floor (section "Uncertainty Regression"); NaN stays NaN.
+        variance, anchored = out.disagreement, None
+        if out.residual is not None:
+            anchored = anchored_term(chosen(frame.depth), out.residual[..., 1], out.disagreement)
+            variance = variance + anchored
+        for own in self._own(frame):
+            variance = variance + chosen(own)
+        if self.config.variance_floor:
+            variance = variance.clamp_min(self.config.variance_floor)
+        return out, variance, anchored
+
+    def _own(self, frame: FrameInput) -> list[Tensor]:
+        """The network's own variances A and E as far as they count [m^2]."""
+        both = [(frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)]
+        return [value for value, counts in both if value is not None and counts]
 
     def _state_for(self, frame: FrameInput) -> UfMStarState:
         streams, device = frame.depth.shape[0], frame.depth.device
@@ -328,38 +317,9 @@ class UfMStar(StatefulModule):
             raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
         return self.state
 
-    def _check(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
-        aleatoric, epistemic, valid, features = optional
-        return check_frame(
-            depth, pose, intrinsics, aleatoric, epistemic, valid, features,
-            feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
-        )  # fmt: skip
-
-    def _total(
-        self, disagreement: Tensor, aleatoric: Tensor | None, epistemic: Tensor | None, anchored: Tensor | None
-    ) -> Tensor:
-        """V = M + A + E (+ B), at least the floor (section "Uncertainty Regression"); NaN stays NaN."""
-        total = disagreement if anchored is None else disagreement + anchored
-        if aleatoric is not None and self.config.add_aleatoric:
-            total = total + aleatoric
-        if epistemic is not None and self.config.add_epistemic:
-            total = total + epistemic
-        return total.clamp_min(self.config.variance_floor) if self.config.variance_floor else total
-
     def extra_repr(self) -> str:
         """Streams and components."""
         return f"streams={self.mean.shape[0]}, capacity={self.mean.shape[1]}, backend={self.config.backend!r}"
-
-
-def _to_buffers(state: UfMStarState) -> dict[str, Tensor]:
-    """The state as named tensors; an absent moving average is a map of size 0 x 0."""
-    mean = state.mixture.mean
-    smoothed = state.smoothed if state.smoothed is not None else mean.new_zeros(mean.shape[0], 0, 0)
-    rest = {name: getattr(state, name) for name in ("T_world_first", "started", "frames", "skipped")}
-    # Without anchors nothing is kept: rows for no slot.
-    learnt = state.evidence or Evidence.empty(mean.shape[0], 0, dtype=mean.dtype, device=mean.device)
-    evidence = {"evidence": learnt.component, "overall_evidence": learnt.overall}
-    return {**state.mixture.tensors(), **rest, "smoothed": smoothed, **evidence}
 
 
 def _sample_size(frame: FrameInput, pixels: int | None, fraction: float | None) -> int:

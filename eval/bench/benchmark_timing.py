@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -18,10 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ufmstar_torch.backend import Backend
 from ufmstar_torch.eval.engine.clock import spread
 
-# Every moment of a step belongs to one of these; see StageClock.stages.
+# Every moment of a step belongs to one of these; see ``ufmstar_torch.step.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _TIMED = ("spgf", "floor_covariance", "correspond", "fuse", "regress_image")
 
@@ -52,58 +50,46 @@ def pinned_threads(count: int) -> Iterator[None]:
 
 
 class StageClock:
-    """Times the stages of one step after the other by wrapping a backend's functions.
+    """Times the stages of one step after the other: an observer of the step (``ufmstar_torch.step.StepObserver``).
 
-    Use: ``start()``, then ``checked()`` between the check and the step, then ``stop()``. What lies between
-    two kernels (changes of frame, padding, masks) counts to the stage that needs it:
+    Use: ``start()``, then a call of the module whose ``observer`` it is. The stages are those that the step names;
+    what follows the last one, the output's assembly, belongs to none.
 
-    check: the checks of the frame's input. segment: SPGF and the floor of its covariances. correspond:
-    the mixture into the camera frame, and the matching. fuse: making room, the segments into the first
-    camera's frame, and the fusion. append: the new components, and the mixture into the camera frame.
-    regress: the mixture made ready, and the dense regression. average: masks, moving average, statistics,
-    the new state.
+    Args:
+        wait: waits for the device that computes, before every reading of the clock.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, wait: Callable[[], None] = lambda: None) -> None:
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
         self.kernels: dict[str, list[float]] = {name: [] for name in _TIMED}
-        self._calls: list[tuple[str, float, float]] = []
-        self._start = self._checked = 0.0
-
-    def wrap(self, backend: Backend) -> Backend:
-        """The same backend, every function of which notes when it begins and ends."""
-        noted: dict[str, Any] = {name: self._noted(name, getattr(backend, name)) for name in _TIMED}
-        return replace(backend, **noted)
+        self._wait, self._last = wait, 0.0
+        self._in_step = dict.fromkeys(_TIMED, 0.0)
 
     def start(self) -> None:
         """A step begins, with its check."""
-        self._calls = []
-        self._start = time.perf_counter()
+        self._in_step = dict.fromkeys(_TIMED, 0.0)
+        self._last = self._now()
 
-    def checked(self) -> None:
-        """The check is done."""
-        self._checked = time.perf_counter()
+    def stage(self, name: str) -> None:
+        """A stage has ended; the last one ends the step."""
+        now = self._now()
+        self.stages[name].append(1e3 * (now - self._last))
+        self._last = now
+        if name == STAGES[-1]:
+            for kernel, seconds in self._in_step.items():
+                self.kernels[kernel].append(1e3 * seconds)
 
-    def stop(self) -> None:
-        """The step is done: add the time of every stage and of every kernel [ms].
+    @contextmanager
+    def kernel(self, name: str) -> Iterator[None]:
+        """Around one call of a kernel."""
+        begin = self._now()
+        yield
+        if name in self._in_step:
+            self._in_step[name] += self._now() - begin
 
-        Raises:
-            RuntimeError: the step did not call its backend's functions in the order of the stages.
-        """
-        stop = time.perf_counter()
-        names = [name for name, _, _ in self._calls]
-        if list(dict.fromkeys(names)) != list(_TIMED):
-            raise RuntimeError(f"expected the step to call {', '.join(_TIMED)} first in this order, got {names}")
-        end = {name: last for name, _, last in reversed(self._calls)}  # of the first call
-        after_fusion = self._calls[names.index("fuse") + 1][1]
-        edges = (
-            self._start, self._checked, end["floor_covariance"], end["correspond"], end["fuse"], after_fusion,
-            end["regress_image"], stop,
-        )  # fmt: skip
-        for name, low, high in zip(STAGES, edges[:-1], edges[1:], strict=True):
-            self.stages[name].append(1e3 * (high - low))
-        for kernel in _TIMED:
-            self.kernels[kernel].append(1e3 * sum(high - low for name, low, high in self._calls if name == kernel))
+    def _now(self) -> float:
+        self._wait()
+        return time.perf_counter()
 
     def drop(self, count: int) -> None:
         """Forget the first ``count`` steps: the warm-up."""
@@ -118,12 +104,3 @@ class StageClock:
             "kernels": {name: spread(times) for name, times in self.kernels.items()},
             "stages_total": spread(totals),
         }
-
-    def _noted(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def noted(*args: Any, **kwargs: Any) -> Any:
-            begin = time.perf_counter()
-            result = function(*args, **kwargs)
-            self._calls.append((name, begin, time.perf_counter()))
-            return result
-
-        return noted

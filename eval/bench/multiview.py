@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.backend import Backend, select
 from ufmstar_torch.eval.bench.benchmark_timing import StageClock
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
-from ufmstar_torch.frame import check_frame
 from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.step import UfMStarState, step
-
-_KERNELS = ("spgf", "floor_covariance", "correspond", "fuse", "regress", "regress_image", "smooth")
 
 
 @dataclass(frozen=True)
@@ -101,25 +97,14 @@ class StagedUfMStar:
         module = build(row)
         if not isinstance(module, UfMStar):
             raise ValueError(f"{row.label} is not behind UfM*, whose stages are known")
-        self.method, self.device, self.config = row.method, device, module.config
-        self.clock = StageClock()
-        self.backend = self.clock.wrap(_waited_for(select(self.config.backend, device.type), device))
-        self.state = UfMStarState.initial(1, self.config, torch.float32, device)
+        self.method, self.device, self.module = row.method, device, module.to(device)
+        self.clock = module.observer = StageClock(partial(synchronize, device))
 
     def __call__(self, inputs: Inputs) -> None:
         """The next frame."""
-        depth, pose, K, aleatoric, epistemic = inputs.maps(self.method, self.device)
-        with torch.no_grad():
-            synchronize(self.device)
-            self.clock.start()
-            frame = check_frame(
-                depth, pose, K, aleatoric, epistemic, None, None,
-                feature_count=0, rotation_tolerance=self.config.rotation_tolerance,
-            )  # fmt: skip
-            self.clock.checked()
-            self.state, _ = step(self.state, frame, self.config, self.backend)
-            synchronize(self.device)
-            self.clock.stop()
+        maps = inputs.maps(self.method, self.device)
+        self.clock.start()
+        self.module(*maps)
 
 
 def build(row: Row) -> UfM | UfMStar:
@@ -160,10 +145,3 @@ def waited(call: Callable[..., Any], device: torch.device) -> Callable[..., Any]
         return result
 
     return run
-
-
-def _waited_for(backend: Backend, device: torch.device) -> Backend:
-    if device.type == "cpu":
-        return backend
-    kernels: dict[str, Any] = {name: waited(getattr(backend, name), device) for name in _KERNELS}
-    return replace(backend, **kernels)

@@ -173,7 +173,7 @@ def _form(f: Field[Any], hint: Any) -> tuple[list[str], dict[str, Any]]:
         how = {"action": "store_false" if default else "store_true", "dest": f.name}
         return [f"--no-{name[2:]}" if default else name], how
     kind = hint
-    how = {} if default is MISSING else {"default": default}
+    how = {} if default is MISSING else {"default": str(default) if isinstance(default, Path) else default}
     parts = get_args(hint)
     if types.NoneType in parts and default is None:
         kind = reduce(or_, (part for part in parts if part is not types.NoneType))

@@ -16,7 +16,7 @@ from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
-from ufmstar_torch.step import FrameStatistics
+from ufmstar_torch.output import FrameStatistics
 from ufmstar_torch.ufmstar import UfMStar
 
 

@@ -16,9 +16,8 @@ from torch import Tensor
 from ufmstar_torch.camera import relative_pose
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.eval.methods.ufm_cloud import MOMENTS, Cloud, Taken, View, take_in
-from ufmstar_torch.frame import FrameInput, check_frame
+from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.stateful import StatefulModule, full_precision
-from ufmstar_torch.step import raise_faults
 
 _STATE = ("moments", "count", "points", "T_world_first", "started", "frames", "skipped")
 

@@ -81,8 +81,8 @@ def _paper_table(quoted: PaperTable) -> Table:
     bases = list(dict.fromkeys(Method.parse(method).base for method in quoted.rows))
     lines = []
     for method, cells in quoted.rows.items():
-        found = tuple(cells.get(column, Cell()) for column in quoted.columns)
-        lines.append(Line(bases.index(Method.parse(method).base), method, method.startswith("UfM*"), found))
+        printed = tuple(cells.get(column, Cell()) for column in quoted.columns)
+        lines.append(Line(bases.index(Method.parse(method).base), method, method.startswith("UfM*"), printed))
     alone = f"Depth alone: {quoted.alone['latency_ms']} ms, {quoted.alone['memory_mb']} MB."
     notes = (alone, f"Measured by the paper on {quoted.measured_on}.")
     title = f"The paper's table 2, {quoted.network}"

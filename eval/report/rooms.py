@@ -109,7 +109,7 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
     figure.text(0.1 / width, 1 - 0.2 / height, plain(title), size=11, weight="bold", color=INK, va="center")
     for line, (view, (low, high)) in enumerate(zip(views, limits, strict=True)):
         bottom = height - _TOP - sum(tall[: line + 1])
-        side = {"size": 8, "color": FAINT, "rotation": 90, "va": "center", "ha": "center"}
+        side: dict[str, Any] = {"size": 8, "color": FAINT, "rotation": 90, "va": "center", "ha": "center"}
         figure.text(0.2 / width, (bottom + tall[line] / 2) / height, view.name, **side)
         for column, snapshot in enumerate(shown):
             box = ((_LEFT + column * _CELL) / width, bottom / height, _CELL / width, tall[line] / height)

@@ -98,8 +98,8 @@ class Table:
                 raise ValueError(f"{name}: {line.label} has {len(line.cells)} cells for {len(columns)} columns")
         frame = pd.DataFrame([list(line.cells) for line in listed], columns=range(len(columns)), dtype=object)
         frame.columns = pd.MultiIndex.from_tuples(columns, names=Column._fields)
-        labels = [(line.block, line.label, line.bold) for line in listed]
-        frame.index = pd.MultiIndex.from_arrays(list(zip(*labels, strict=True)) or [[], [], []], names=Line._fields[:3])
+        labels = [[getattr(line, name) for line in listed] for name in Line._fields[:3]]
+        frame.index = pd.MultiIndex.from_arrays(labels, names=Line._fields[:3])
         return cls(name, title, first, frame, tuple(notes))
 
     @property
@@ -110,8 +110,8 @@ class Table:
     @property
     def lines(self) -> list[Line]:
         """The rows of all blocks."""
-        cells = self.frame.itertuples(index=False, name=None)
-        return [Line(*labels, found) for labels, found in zip(self.frame.index, cells, strict=True)]
+        cells: Iterable[tuple[Cell, ...]] = self.frame.itertuples(index=False, name=None)
+        return [Line(block, label, bold, c) for (block, label, bold), c in zip(self.frame.index, cells, strict=True)]
 
     @property
     def blocks(self) -> Iterator[list[Line]]:

@@ -1,1 +1,15 @@
 """Anchors, an extension that is off by default: sparse depths that show the error on which all views agree."""
+
+from typing import TYPE_CHECKING
+
+from ufmstar_torch.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ufmstar_torch.anchors.given import Anchors as Anchors
+    from ufmstar_torch.anchors.tracker import Landmarks as Landmarks
+    from ufmstar_torch.anchors.tracker import LandmarkTracker as LandmarkTracker
+    from ufmstar_torch.anchors.tracker import TrackerConfig as TrackerConfig
+else:
+    __getattr__, __dir__ = lazy_names(__name__)
+
+__all__ = ["Anchors", "LandmarkTracker", "Landmarks", "TrackerConfig"]

@@ -29,7 +29,7 @@ from torch import Tensor
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.regress_points_cpu import at_points, compiled, distribute_points, prepare
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression
+from ufmstar_torch.regress import Regression, regress_pixels
 from ufmstar_torch.regress import distribute as distribute_reference
 from ufmstar_torch.regress import regress as regress_reference
 
@@ -45,28 +45,36 @@ _SHARE = 128 * 128  # pixels; below that a thread costs more than it saves
 _BLOCK = 4  # tiles; a block of 64 x 64 pixels is culled first
 
 
-def regress_image(mixture_cam: GaussianMixture, depth: Tensor, intrinsics: Tensor, config: UfMStarConfig) -> Regression:
+def regress_image(
+    mixture_cam: GaussianMixture,
+    depth: Tensor,
+    intrinsics: Tensor,
+    valid: Tensor,
+    config: UfMStarConfig,
+    pixels: Tensor | None = None,
+) -> Regression:
     """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors."""
-    dtype = np.float64 if depth.dtype == torch.float64 else np.float32
-    b, height, width = depth.shape
-    maps = np.empty((b, height, width), dtype)
-    features = np.empty((b, height, width, mixture_cam.features.shape[2]), dtype)
+    if pixels is not None:
+        return regress_pixels(mixture_cam, depth, intrinsics, valid, config, pixels, regress)
+    maps = torch.empty_like(depth, memory_format=torch.contiguous_format)
+    features = torch.empty(*depth.shape, mixture_cam.features.shape[2], dtype=depth.dtype)
+    m = mixture_cam
     arguments = (
-        depth.detach().to(torch.float64 if dtype == np.float64 else torch.float32).contiguous().numpy(),
-        intrinsics.detach().double().contiguous().numpy(),
-        mixture_cam.mean.detach().double().contiguous().numpy(),
-        mixture_cam.covariance.detach().double().contiguous().numpy(),
-        mixture_cam.weight.detach().double().contiguous().numpy(),
-        mixture_cam.disagreement.detach().double().contiguous().numpy(),
-        mixture_cam.features.detach().double().contiguous().numpy(),
+        depth.detach().contiguous().numpy(),
+        valid.contiguous().numpy(),
+        *(
+            value.detach().double().contiguous().numpy()
+            for value in (intrinsics, m.mean, m.covariance, m.weight, m.disagreement, m.features)
+        ),
+        config.prior_weight,
+        config.prior_mean,
     )
-    prior = (config.prior_weight, config.prior_mean)
     if config.regression == "exact":
-        _share_out(_exact, *arguments, *prior, EPSILON[depth.dtype], maps, features)
+        _share_out(_exact, *arguments, EPSILON[depth.dtype], maps.numpy(), features.numpy())
     else:
         radii = (config.neighbourhood_sigmas, config.near_radius, config.far_radius)
-        _share_out(_neighbourhood, *arguments, *prior, *radii, maps, features)
-    return Regression(torch.from_numpy(maps), torch.from_numpy(features))
+        _share_out(_neighbourhood, *arguments, *radii, maps.numpy(), features.numpy())
+    return Regression(maps, features)
 
 
 def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Regression:
@@ -167,17 +175,17 @@ def _cull(candidates, count, centre, half, mean, whitening, log_peak, prior, eps
 
 
 @compiled
-def _box(depth, K, v0, v1, u0, u1, centre, half, origin):
-    """Bounding box of the points of a patch of pixels, and its nearest point; False without a positive depth."""
+def _box(depth, valid, K, v0, v1, u0, u1, centre, half, origin):
+    """Bounding box of the points of a patch of pixels, and its nearest point; False without a valid one."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
     for v in range(v0, v1):
         ry = (v - cy) / fy
         for u in range(u0, u1):
-            z = np.float64(depth[v, u])
-            if not (z > 0 and z < np.inf):
+            if not valid[v, u]:
                 continue
+            z = np.float64(depth[v, u])
             x, y = (u - cx) / fx * z, ry * z
             low[0], high[0] = min(low[0], x), max(high[0], x)
             low[1], high[1] = min(low[1], y), max(high[1], y)
@@ -224,14 +232,13 @@ def _exp_overload(t):
 
 
 @compiled
-def _points(depth, K, v0, v1, u0, u1, origin, x, y, z):
-    """Points of a patch relative to ``origin``, in the arrays' precision; pixels without depth give NaN."""
+def _points(depth, valid, K, v0, v1, u0, u1, origin, x, y, z):
+    """Points of a patch relative to ``origin``, in the arrays' precision; pixels that are not valid give NaN."""
     i = 0
     for v in range(v0, v1):
         ry = (v - K[1, 2]) / K[1, 1]
         for u in range(u0, u1):
-            value = np.float64(depth[v, u])
-            d = value if value > 0 and value < np.inf else np.nan
+            d = np.float64(depth[v, u]) if valid[v, u] else np.nan
             x[i] = (u - K[0, 2]) / K[0, 0] * d - origin[0]
             y[i] = ry * d - origin[1]
             z[i] = d - origin[2]
@@ -260,12 +267,30 @@ def _accumulate(coefficient, x, y, z, evidence, total, density):
 
 @compiled
 def _tile(
-    depth, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features, prior, prior_mean, out, out_f
+    depth,
+    valid,
+    K,
+    v0,
+    v1,
+    u0,
+    u1,
+    origin,
+    kept,
+    n,
+    index,
+    local,
+    log_peak,
+    m,
+    features,
+    prior,
+    prior_mean,
+    out,
+    out_f,
 ):
     """Regress one tile; ``local`` holds mean and whitening of the occupied components."""
     count = (v1 - v0) * (u1 - u0)
     x, y, z = np.empty(count, out.dtype), np.empty(count, out.dtype), np.empty(count, out.dtype)
-    _points(depth, K, v0, v1, u0, u1, origin, x, y, z)
+    _points(depth, valid, K, v0, v1, u0, u1, origin, x, y, z)
     evidence, total = np.full(count, prior, out.dtype), np.full(count, prior * prior_mean, out.dtype)
     density = np.empty(count, out.dtype)
     sums = np.zeros((out_f.shape[2], count), out.dtype)
@@ -293,7 +318,7 @@ def _tile(
 
 
 @compiled
-def _block(depth, K, v_low, u_low, components, index, local, log_peak, m, features, prior, epsilon, out, out_f):
+def _block(depth, valid, K, v_low, u_low, components, index, local, log_peak, m, features, prior, epsilon, out, out_f):
     """Regress a block of tiles with the components that matter to it."""
     height, width = depth.shape
     v_high, u_high = min(height, v_low + _TILE * _BLOCK), min(width, u_low + _TILE * _BLOCK)
@@ -302,23 +327,23 @@ def _block(depth, K, v_low, u_low, components, index, local, log_peak, m, featur
     mean, whitening = local[:, :3], local[:, 3:]
     weight, prior_mean = prior
     count = 0
-    if _box(depth, K, v_low, v_high, u_low, u_high, centre, half, origin):
+    if _box(depth, valid, K, v_low, v_high, u_low, u_high, centre, half, origin):
         count = _cull(components, components.size, centre, half, mean, whitening, log_peak, weight, epsilon, near)
     for v0 in range(v_low, v_high, _TILE):
         for u0 in range(u_low, u_high, _TILE):
             v1, u1 = min(v_high, v0 + _TILE), min(u_high, u0 + _TILE)
             n = 0
-            if _box(depth, K, v0, v1, u0, u1, centre, half, origin):
+            if _box(depth, valid, K, v0, v1, u0, u1, centre, half, origin):
                 n = _cull(near, count, centre, half, mean, whitening, log_peak, weight, epsilon, kept)
             _tile(
-                depth, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features,
+                depth, valid, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features,
                 weight, prior_mean, out, out_f,
             )  # fmt: skip
 
 
 @compiled
 def _exact(
-    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
+    depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
 ):
     """All streams; of their blocks of tiles every ``shares``-th, from ``first`` on."""
     height, width = depth.shape[1:]
@@ -330,7 +355,7 @@ def _exact(
         components = np.arange(index.size)
         for block in range(first, rows * columns, shares):
             _block(
-                depth[b], K[b], block // columns * side, block % columns * side, components, index, local,
+                depth[b], valid[b], K[b], block // columns * side, block % columns * side, components, index, local,
                 log_peak, m[b], features[b], (prior_weight, prior_mean), epsilon, out[b], out_f[b],
             )  # fmt: skip
 
@@ -355,17 +380,17 @@ def _pixel(x, y, z, count, gaps, kept, radius, index, local, log_peak, m, featur
 
 
 @compiled
-def _near_row(depth, K, v, components, extent, index, local, log_peak, m, features, prior, radii, out, out_f):
+def _near_row(depth, valid, K, v, components, extent, index, local, log_peak, m, features, prior, radii, out, out_f):
     """One row of pixels with the paper's neighbourhood."""
     near, far = radii
     gaps, kept = np.empty(components.size), np.empty(components.size, np.int64)
     sums = np.zeros(features.shape[1])
     for u in range(depth.shape[1]):
-        z = np.float64(depth[v, u])
         out[v, u] = np.nan
         out_f[v, u] = np.nan
-        if not (z > 0 and z < np.inf):
+        if not valid[v, u]:
             continue
+        z = np.float64(depth[v, u])
         x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
         count, least = 0, np.inf
         for k in components:
@@ -386,7 +411,7 @@ def _near_row(depth, K, v, components, extent, index, local, log_peak, m, featur
 
 @compiled
 def _neighbourhood(
-    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
+    depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
     first, shares,
 ):  # fmt: skip
     """All streams; of their rows every ``shares``-th, from ``first`` on."""
@@ -400,6 +425,6 @@ def _neighbourhood(
         components = np.arange(index.size)
         for v in range(first, depth.shape[1], shares):
             _near_row(
-                depth[b], K[b], v, components, extent, index, local, log_peak, m[b], features[b],
+                depth[b], valid[b], K[b], v, components, extent, index, local, log_peak, m[b], features[b],
                 (prior_weight, prior_mean), (near, far), out[b], out_f[b],
             )  # fmt: skip

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.config import SPGFConfig, UfMStarConfig
 from ufmstar_torch.kernels.segment_image_cpu import compiled, segment_image, write_gaussians
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
@@ -41,28 +40,11 @@ class _Limits(NamedTuple):
     min_rows: int
 
 
-def spgf(
-    depth: Tensor,
-    intrinsics: Tensor,
-    config: SPGFConfig | UfMStarConfig | None = None,
-    *,
-    variance: Tensor | None = None,
-    valid: Tensor | None = None,
-    features: Tensor | None = None,
-    before_pruning: bool = False,
-) -> tuple[GaussianMixture, Tensor]:
-    """As :func:`ufmstar_torch.segment.spgf`, for CPU tensors, float64 inside.
-
-    Raises:
-        TypeError: as there.
-        ValueError: as there, and for tensors of another device.
-    """
-    given = SegmentInput.checked(depth, intrinsics, config, variance, valid, features)
-    if depth.device.type != "cpu":
-        raise ValueError(f"depth must lie on the CPU for the numba kernel, got {depth.device}")
+def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
+    """As :func:`ufmstar_torch.segment.segment`, for CPU tensors, float64 inside."""
     z = given.depth.contiguous().numpy()
     absent = (z.shape[0], 1, 0)  # rows of no pixels stand for "not given"
-    use = np.empty(absent, np.bool_) if valid is None else valid.contiguous().numpy()
+    use = np.empty(absent, np.bool_) if given.valid is None else given.valid.contiguous().numpy()
     spread = np.empty(absent, z.dtype) if given.variance is None else _array(given.variance)
     limits = _limits(given, before_pruning)
     labels = np.empty(z.shape, np.int64)

@@ -1,0 +1,105 @@
+"""The one place where anchors meet the algorithm: two ends around step 5's single regression.
+
+Before it, a frame's anchors become evidence, and what the evidence says of each component is appended to the
+mixture's features; after it, those features are taken off the regressed ones again. The rest of the package uses
+anchors through this file only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.evidence import SUMS as EVIDENCE_SUMS
+from ufmstar_torch.anchors.evidence import Evidence, means, observe
+from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors
+from ufmstar_torch.camera import unproject_at
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import Regression
+
+__all__ = [
+    "EVIDENCE_SUMS",
+    "AnchorInput",
+    "Anchors",
+    "Evidence",
+    "after_regression",
+    "anchored_term",
+    "before_regression",
+    "check_anchors",
+]
+
+# (mixture in the camera frame, points [B, N, 3], values [B, N, C], config) -> sums by component [B, K, C]
+Distribute = Callable[[GaussianMixture, Tensor, Tensor, UfMStarConfig], Tensor]
+
+
+def before_regression(
+    evidence: Evidence,
+    mixture_cam: GaussianMixture,
+    frame: FrameInput,
+    anchors: AnchorInput | None,
+    config: UfMStarConfig,
+    distribute: Distribute,
+) -> tuple[Evidence, Tensor, GaussianMixture, Tensor | None]:
+    """Add a frame's anchors to the evidence, and make the mixture ready to regress it.
+
+    Args:
+        evidence: up to the frame before.
+        mixture_cam: M_i in the camera frame, [B, K].
+        frame: the same B streams.
+        anchors: of this frame, or None.
+        config: ``anchored`` False = everything is returned as it is.
+        distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
+
+    Returns:
+        The evidence, this frame's included; how many anchors were used [B]; the mixture with two more features, the
+        components' mean r and e less the stream's; the stream's means [B, 2], for :func:`after_regression`.
+    """
+    used = torch.zeros_like(frame.fault)
+    if not config.anchored:
+        return evidence, used, mixture_cam, None
+    evidence = evidence.padded(mixture_cam.capacity)
+    if anchors is not None:
+        points = unproject_at(anchors.predicted, anchors.index, frame.size[1], frame.intrinsics)
+
+        def by_component(rows: Tensor) -> Tensor:
+            return distribute(mixture_cam, points, rows, config)
+
+        memory = 0.5 ** (1 / config.anchor_half_life)
+        evidence, each = observe(evidence, anchors, by_component, memory)  # a faulty frame's anchors are not valid
+        used = each.sum(1)
+    beyond, stream = means(evidence, config.anchor_shrinkage)
+    return evidence, used, mixture_cam.replace(features=torch.cat([mixture_cam.features, beyond], dim=-1)), stream
+
+
+def after_regression(result: Regression, stream: Tensor | None) -> tuple[Regression, Tensor | None]:
+    """Separate the evidence from the regressed features.
+
+    Args:
+        result: of the mixture of :func:`before_regression`, at every pixel or at some.
+        stream: from there.
+
+    Returns:
+        The regression without the evidence; the residual [..., 2] to expect at each pixel, mean r and mean e
+        (``evidence``). The result as it is and None where ``stream`` is None.
+    """
+    if stream is None:
+        return result, None
+    residual = result.features[..., -2:]
+    residual = residual + stream.to(residual.dtype).view(-1, *[1] * (residual.dim() - 2), 2)
+    return replace(result, features=result.features[..., :-2]), residual
+
+
+def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> Tensor:
+    """B = max(0, d^2 e - M) [m^2], the mean square error that anchors show beyond M; NaN where M is.
+
+    Args:
+        depth: d, any shape [m].
+        excess: e, likewise, the relative mean square error that the network does not state (``evidence``).
+        disagreement: M, likewise [m^2].
+    """
+    return (depth.square() * excess - disagreement).clamp_min(0)
