@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import io
+import json
+import re
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import OutputSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
+# Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
+_TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")
+_RAW = re.compile(r"[^/]+/data/(weights/weight|constants/tensor)_\d+")
 Spec = ProgramSpec | Mapping[str, Any] | str | Path
 
 
@@ -104,13 +111,41 @@ def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwo
 
 def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
     """A ``torch.export`` file (``torch.export.save``, .pt2) as a network; arguments, trust and errors as
-    :func:`load_torchscript`."""
+    :func:`load_torchscript`. ``torch.export.load`` would unpickle any object in the archive, so one that holds more
+    than tensors beside its graph is refused."""
     declared = ProgramSpec.required(spec)
     try:
-        program = torch.export.load(_existing(path))
-    except (RuntimeError, ValueError, BadZipFile) as error:
+        _require_tensors(_existing(path))
+        program = torch.export.load(str(path))
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
         raise ValueError(f"{path} is not a readable torch.export file: {error}") from error
     return WrappedNetwork(_Exported(program.module()), declared.outputs, declared.preprocess or Preprocess())
+
+
+def _require_tensors(path: str) -> None:
+    """Raises ValueError (CheckpointError) if an archive holds anything but JSON, short texts, tensors and plain
+    values."""
+    with ZipFile(path) as archive:
+        names = archive.namelist()
+        if len({name.casefold() for name in names}) != len(names):
+            raise ValueError("it has two files of one name")
+        configs = [name for name in names if name.endswith("_config.json")]
+        payloads = [p for name in configs for p in json.loads(archive.read(name))["config"].values()]
+        pickled = {payload["path_name"] for payload in payloads if payload["use_pickle"]}
+        for name in names:
+            last, content = PurePosixPath(name).name, archive.read(name)
+            raw = _RAW.fullmatch(name) and last not in pickled
+            if last not in _TEXTS and not raw and not _is_json(content):
+                read_tensors(io.BytesIO(content), name)
+
+
+def _is_json(content: bytes) -> bool:
+    """Whether the content is nothing or JSON, neither of which can be unpickled."""
+    try:
+        json.loads(content or b"0")
+    except ValueError:
+        return False
+    return True
 
 
 class _Exported(nn.Module):

@@ -13,7 +13,7 @@ import secrets
 import struct
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor, nn
@@ -26,7 +26,17 @@ _UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SU
 # How the files of torch.save begin: an archive, or (before 1.6) the pickled magic number of its own format.
 _BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
 # What the restricted unpickler was seen to raise on damaged bytes; it documents none of it.
-_DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, AttributeError, AssertionError)
+_DAMAGE = (
+    EOFError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    AssertionError,
+    struct.error,
+)
 _SHOWN = 8  # keys named in an error message
 
 
@@ -174,23 +184,29 @@ def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
         return read_safetensors(path)[0]
     if path.suffix not in _TORCH_SUFFIXES:
         raise CheckpointError(_UNKNOWN_SUFFIX.format(path))
-    return _weights_in(_read_torch(path), path, ignore)
-
-
-def _read_torch(path: Path) -> Any:
     with path.open("rb") as file:
-        beginning = file.read(max(map(len, _BEGINNINGS)))
+        return _weights_in(read_tensors(file, path), path, ignore)
+
+
+def read_tensors(file: BinaryIO, name: str | Path) -> Any:
+    """What ``torch.save`` wrote into an open file, without running code from it.
+
+    Raises:
+        CheckpointError: it is damaged, or holds more than tensors and plain values; the message has ``name``.
+    """
+    beginning = file.read(max(map(len, _BEGINNINGS)))
     if not beginning.startswith(_BEGINNINGS):
-        raise CheckpointError(f"{path} is damaged or not a file of torch.save: it begins with {beginning[:8]!r}")
+        raise CheckpointError(f"{name} is damaged or not a file of torch.save: it begins with {beginning[:8]!r}")
+    file.seek(0)
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise CheckpointError(
-            f"{path} is damaged or holds pickled Python objects (a whole module?), which are never loaded because "
+            f"{name} is damaged or holds pickled Python objects (a whole module?), which are never loaded because "
             "they can run code; save the module's state_dict() with the program that made it, and load that"
         ) from error
-    except (*_DAMAGE, struct.error) as error:
-        raise CheckpointError(f"{path} is damaged or not a file of torch.save: {error}") from error
+    except _DAMAGE as error:
+        raise CheckpointError(f"{name} is damaged or not a file of torch.save: {error}") from error
 
 
 def _weights_in(content: Any, path: Path, ignore: Collection[str]) -> dict[str, Tensor]:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import pickle
 import subprocess
 import sys
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -161,6 +165,52 @@ def test_exported_program(tmp_path: Path, image: Tensor) -> None:
     (tmp_path / "broken.pt2").write_bytes((tmp_path / "n.pt2").read_bytes()[:200])
     with pytest.raises(ValueError, match=r"broken.pt2 is not a readable torch.export file"):
         load_exported(tmp_path / "broken.pt2", METRIC)
+
+
+class Malice:
+    """Unpickling it creates a folder."""
+
+    def __init__(self, trap: Path) -> None:
+        self.trap = str(trap)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (self.trap,)
+
+
+@pytest.mark.parametrize("attack", ["weight", "constant", "sample input", "object", "legacy", "old format"])
+def test_an_archive_that_would_be_unpickled_is_refused(tmp_path: Path, image: Tensor, attack: str) -> None:
+    """``torch.export.load`` alone unpickles what stands in these places, whatever it is."""
+    torch.export.save(torch.export.export(Sum().eval(), (image,)), tmp_path / "n.pt2")
+    trap = tmp_path / "trap"
+    evil, bad = io.BytesIO(), tmp_path / "bad.pt2"
+    torch.save((Malice(trap), {}), evil)
+    folder = "constants" if attack in ("constant", "object") else "weights"
+    names = {"object": "opaque_obj_0", "constant": "tensor_0", "weight": "weight_0"}
+    name = names.get(attack, "model.pt")
+    with zipfile.ZipFile(tmp_path / "n.pt2") as source, zipfile.ZipFile(bad, "w") as target:
+        root = source.namelist()[0].split("/")[0]
+        for entry in source.namelist():
+            content = source.read(entry)
+            if attack in (*names, "legacy") and entry.endswith(f"model_{folder}_config.json"):
+                payload = {
+                    "tensor_meta": None,
+                    "path_name": name,
+                    "is_param": False,
+                    "use_pickle": attack in ("weight", "constant"),
+                }
+                content = json.dumps({"config": {"factor": payload}}).encode()
+            if attack == "sample input" and "sample_inputs" in entry:
+                content = evil.getvalue()
+            if not (attack == "weight" and entry.endswith("weight_0")):
+                target.writestr(entry, content)
+        if attack == "old format":
+            target.writestr("serialized_state_dict.pt", evil.getvalue())
+        elif attack != "sample input":
+            plain = pickle.dumps(Malice(trap)) if attack == "object" else evil.getvalue()
+            target.writestr(f"{root}/data/{folder}/{name}", plain)
+    with pytest.raises(ValueError, match=r"bad.pt2 is not a readable torch.export file: .* (holds pickled|begins)"):
+        load_exported(bad, METRIC)
+    assert not trap.exists()
 
 
 # --- by name -----------------------------------------------------------------------------------------
