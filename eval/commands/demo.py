@@ -35,7 +35,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
-from ufmstar_torch.eval.methods.ufm_config import UfMConfig
+from ufmstar_torch.eval.methods.ufm import UfMConfig
 from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, panel, write_pictures
 from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
