@@ -88,6 +88,7 @@ def test_help_of_run_names_every_setting(ufmstar, capfd):
     assert "(0, 1]" in text
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_beyond_the_package():
     code = (
         "import sys, ufmstar_torch; before = set(sys.modules); from ufmstar_torch.cli import main; "
@@ -464,6 +465,7 @@ def test_skipped_frames_are_told(ufmstar, tmp_path):
 # ---- the real thing ----
 
 
+@pytest.mark.slow
 def test_fastdepth_on_a_real_sequence(tmp_path):
     sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
     weights = require_shared("weights/fastdepth_nyu.onnx")

@@ -526,6 +526,7 @@ def test_a_directory_is_identified_by_its_visible_files(broken, metric):
     assert identity["weights"] == [{"name": "metric", "sha256": sha256(metric)}]
 
 
+@pytest.mark.slow
 def test_transformers_is_loaded_only_with_a_checkpoint():
     code = (
         "import sys\n"

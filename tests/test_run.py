@@ -464,6 +464,7 @@ run(network_job(Path(sys.argv[1]), *networks), sys.argv[2])
 """
 
 
+@pytest.mark.slow
 def test_sigkill_loses_the_frame_in_hand_only(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(out)], cwd=TESTS, check=False)
