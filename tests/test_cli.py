@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -163,6 +164,11 @@ MISTAKES = {
     "intrinsics": (["run", "{path}", "--depth", "self", "--intrinsics", "1", "2", "--out", "{out}"], "fx fy cx cy"),
     "layout": (["run", "{path}", "--depth", "self", "--layout", "tum", "--out", "{out}"], "looked for rgb.txt"),
     "device": (["run", "{path}", "--depth", "self", "--device", "abacus", "--out", "{out}"], "--device abacus"),
+    "no data": (["run", "{path}", "--depth", "self", "--device", "meta", "--out", "{out}"], "--device meta is not"),
+    "size beyond memory": (
+        ["run", "{path}", "--depth", "self", "--size", "99999999x99999999", "--out", "{out}"],
+        "--size must be at most 134 million pixels",
+    ),
     "threads": (["run", "{path}", "--depth", "self", "--threads", "0", "--out", "{out}"], "--threads"),
     "someone else's folder": (["run", "{path}", "--depth", "self", "--out", "{path}"], "files of someone else"),
     "contradiction": (
@@ -210,7 +216,33 @@ def test_an_unknown_key_in_a_file_is_told(ufmstar, path, tmp_path):
         assert expected in err
 
 
+def test_damaged_files_end_in_one_line(ufmstar, tmp_path, capfd):
+    path, _ = write_generic(tmp_path, frames=2)
+    out = tmp_path / "out"
+    (path / "poses.txt").write_bytes(bytes(range(256)))
+    code, _, err = ufmstar("run", path, "--depth", "self", "--out", out)
+    assert (code, err.count("\n"), out.exists()) == (2, 1, False)
+    assert "poses.txt: expected a text file" in err
+    (tmp_path / "empty.mp4").touch()
+    words = ("--trajectory", path / "poses.txt", "--intrinsics", path / "K.txt", "--depth", "self", "--out", out)
+    code, _, err = ufmstar("run", tmp_path / "empty.mp4", *words)
+    assert (code, out.exists()) == (2, False)
+    assert "empty.mp4: cannot be opened as a video" in err.splitlines()[-1]
+
+
 # ---- options ----
+
+
+def test_poses_in_another_convention(ufmstar, path, tmp_path):
+    """The remedy of ``data check`` is an option of ``run``."""
+    inverted = shutil.copytree(path, tmp_path / "inverted")
+    poses = np.loadtxt(path / "poses.txt").reshape(-1, 4, 4)
+    np.savetxt(inverted / "poses.txt", np.linalg.inv(poses).reshape(-1, 16))
+    for source, words in ((path, ()), (inverted, ("--poses", "world-to-camera"))):
+        words += ("--depth", "self", *QUICK, "--out", tmp_path / "out" / source.name)
+        assert ufmstar("run", source, *words)[0] == 0
+    mixtures = [read_summary(tmp_path / "out" / source.name)["mixture"] for source in (path, inverted)]
+    assert mixtures[0]["components"] == mixtures[1]["components"]
 
 
 def test_settings_from_file_and_words(ufmstar, path, tmp_path):

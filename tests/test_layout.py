@@ -140,6 +140,14 @@ def test_folders_on_disk_are_the_packages():
     assert PYPROJECT["package-dir"] == mapping
 
 
+def test_data_files_beside_the_modules_are_packaged():
+    folders = {name: ROOT / name.removeprefix("ufmstar_torch.").replace(".", "/") for name in PYPROJECT["package-data"]}
+    globs = PYPROJECT["package-data"].items()
+    listed = {path for name, patterns in globs for pattern in patterns for path in folders[name].glob(pattern)}
+    data = {p for p in (ROOT / "eval").rglob("*") if p.is_file() and p.suffix != ".py" and "__pycache__" not in p.parts}
+    assert data - listed == set()
+
+
 @pytest.mark.parametrize(
     "module",
     ["ufmstar_torch", "ufmstar_torch.models", "ufmstar_torch.eval", "ufmstar_torch.train", "ufmstar_torch.cli"],

@@ -40,6 +40,17 @@ def test_kitti_rows_and_a_wrong_count(tmp_path):
         open_sequence(path)
 
 
+def test_a_link_without_its_file_keeps_its_place_and_is_an_error_of_its_frame(tmp_path):
+    path, truth = layouts.write_generic(tmp_path)
+    (path / "images" / "7.png").unlink()
+    (path / "images" / "7.png").symlink_to("nowhere.png")
+    sequence = open_sequence(path)
+    assert sequence.names[0] == "7"
+    np.testing.assert_array_equal(sequence[1].image, truth.images[1])
+    with pytest.raises(FrameError, match="cannot be decoded"):
+        sequence[0]
+
+
 @pytest.mark.parametrize("form", ["rows", "line", "4x4", "numbers"])
 def test_intrinsics_in_every_form(tmp_path, form):
     path, truth = layouts.write_generic(tmp_path)

@@ -233,6 +233,7 @@ def killed_in_birch(job, launch):
 forks = pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 
 
+@pytest.mark.slow
 @forks
 def test_a_kill_loses_the_sequence_in_hand_alone(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
@@ -268,6 +269,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_no_half_row(rooms, tmp_path, mon
     assert kept(job.out) == kept(tmp_path / "whole")
 
 
+@pytest.mark.slow
 @forks
 def test_helpers_do_not_try_again_what_killed_one_of_them(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")

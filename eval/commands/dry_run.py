@@ -15,7 +15,7 @@ _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file 
 
 
 def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> str:
-    """Open every sequence, predict one frame, and tell.
+    """Open every sequence, predict one frame, and describe the work.
 
     Args:
         job: what would be evaluated.
@@ -42,8 +42,8 @@ def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> 
         frames += count
         size += _cached(job.suite.rows, networks, count, sample or {})
     lines.append(f"{frames} frames, {len(items) * len(job.suite.rows)} records")
-    told = "no frame can be read" if sample is None else f"up to {size / 1e6:.1f} MB"
-    lines.append(f"cache of predictions: {told}")
+    cached = "no frame can be read" if sample is None else f"up to {size / 1e6:.1f} MB"
+    lines.append(f"cache of predictions: {cached}")
     return "\n".join(lines)
 
 
@@ -71,7 +71,7 @@ def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, BaseNetwork]
             made = {base: network.one(frame, 0) for base, network in networks.items() if network.cacheable}
         except FrameError:
             continue
-        # All members together have an epistemic variance, whatever one of them says.
+        # All members together have an epistemic variance, whatever a single one has.
         counts = {base: max(len(one.maps()), 3 if networks[base].passes > 1 else 1) for base, one in made.items()}
         return {base: _FILE_BYTES + 4 * counts[base] * one.depth.numel() for base, one in made.items()}
     return None

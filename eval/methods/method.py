@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-# What a network was trained to say, by the name it has alone, and the one it has behind UfM or UfM*.
+# The kinds of networks, each with its name alone and its name behind UfM or UfM*.
 BASES = {
     "ensemble": ("Ensemble", "Ensemble"),
     "mc_dropout": ("MC-Dropout", "MCD"),
@@ -18,7 +18,7 @@ BASES = {
     "aleatoric": ("Aleatoric", "Aleatoric"),
     "depth_only": ("DepthOnly", "DepthOnly"),
 }
-# Those that say more when they are run several times on an image.
+# Those whose several passes on an image differ.
 MANY = ("ensemble", "mc_dropout", "batch_ensemble")
 ALONE, UFM, UFM_STAR = "alone", "ufm", "ufm_star"
 FUSIONS = (ALONE, UFM, UFM_STAR)
@@ -89,16 +89,16 @@ class Method:
         if name in by_alone:
             return cls(by_alone[name])
         by_behind = {behind: base for base, (_, behind) in BASES.items()}
-        found = _NAME.fullmatch(name)
-        if found is None or found["base"] not in by_behind:
-            told = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full with {', '.join(by_behind)}"
+        match = _NAME.fullmatch(name)
+        if match is None or match["base"] not in by_behind:
+            known = f"{', '.join(by_alone)}, or UfM-, UfM*-, UfM*-Full with {', '.join(by_behind)}"
             raise ValueError(
-                f"no method is called {name!r}; there are {told}, UfM's with -100K, UfM*'s with -fixed-param"
+                f"no method is called {name!r}; there are {known}, UfM's with -100K, UfM*'s with -fixed-param"
             )
         return cls(
-            base=by_behind[found["base"]],
-            fusion=UFM_STAR if found["fusion"] == "UfM*" else UFM,
-            full=found["full"] is not None,
-            max_points=None if found["cap"] is None else 1000 * int(found["cap"]),
-            fixed_param=found["fixed"] is not None,
+            base=by_behind[match["base"]],
+            fusion=UFM_STAR if match["fusion"] == "UfM*" else UFM,
+            full=match["full"] is not None,
+            max_points=None if match["cap"] is None else 1000 * int(match["cap"]),
+            fixed_param=match["fixed"] is not None,
         )

@@ -35,7 +35,7 @@ class Row:
 
     @property
     def changed(self) -> dict[str, Any]:
-        """Settings that are not the default, less what ``name`` says."""
+        """Settings that are not the default, but for what is part of ``name``."""
         values = self.setting.to_dict()
         return {name: value for name, value in values.items() if (name, value) != ("anchors", TRACKED)}
 

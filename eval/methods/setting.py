@@ -117,7 +117,7 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
 
 
 def value_of(setting: Mapping[str, Any], name: str) -> Any:
-    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it says nothing.
+    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it has none.
 
     Raises:
         ValueError: an unknown name.
@@ -129,7 +129,7 @@ def default_of(name: str) -> Any:
     """The value that a row has as the paper runs it.
 
     Raises:
-        ValueError: there is no such setting.
+        ValueError: no setting has the name.
     """
     if name in _OWN:
         return getattr(DEFAULT, name)

@@ -66,7 +66,7 @@ class Suite:
         datasets: that the paper takes.
         sequences: how many it samples of each; None = all.
         network: that it judges.
-        size: (h, w) of the network's input there [px].
+        size: (h, w) of the network's input in the paper [px].
         efficiency: whether time, energy and memory are what it is about.
 
     Raises:
@@ -176,8 +176,8 @@ def suite_named(name: str, base: str | None = None) -> Suite:
 def check_row(row: Row) -> None:
     """Raises ValueError unless the setting changes something of the method, in a way that it takes."""
     if row.setting.overrides and row.method.fusion != UFM_STAR:
-        told = ", ".join(row.setting.overrides)
-        raise ValueError(f"row {row.method.name}: {told} is of UfM*, which the row does without")
+        names = ", ".join(row.setting.overrides)
+        raise ValueError(f"row {row.method.name}: {names} is of UfM*, which the row does without")
     if row.setting.anchors and row.method.fusion != UFM_STAR:
         raise ValueError(f"row {row.method.name}: anchors are of UfM*, which the row does without")
     configured(row.setting)

@@ -113,7 +113,7 @@ def draw_grid(
     require_matplotlib()
     from matplotlib.figure import Figure
 
-    letters = max(8, int(13 * words))
+    letters = max(8, int(12 * words))
     layout = _Layout.of(rows, aspect, bool(title), cell, words, letters)
     figure = Figure(figsize=(layout.width, layout.height), dpi=dpi, facecolor="white")
     if title:

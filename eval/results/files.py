@@ -21,7 +21,7 @@ _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")  # as write_together names t
 def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, durable: bool = False) -> None:
     """Write a file through a temporary one in the same folder, which then takes its place.
 
-    A full disk, Ctrl-C or a crash in the middle leaves the file that was there before, or none.
+    A full disk, Ctrl-C or a crash in the middle leaves the earlier file, or none.
 
     Args:
         path: the file; its folder must exist.
@@ -37,7 +37,7 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, durable: bo
 def write_together(files: Mapping[Path, Callable[[BinaryIO], object]], *, durable: bool = False) -> None:
     """``write_atomic`` for files that belong together: none takes its place before all are written.
 
-    They do so in the order given, so the presence of the last one says that all are there.
+    They do so in the order given: where the last one exists, all do.
     """
     # Hidden, and in the same file system, as os.replace needs.
     # Named at random: processes on several nodes may share both a folder and an id.
@@ -71,7 +71,7 @@ def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:
         data: mappings, sequences, dataclasses, NumPy arrays, tensors, paths, and plain values.
 
     Raises:
-        TypeError: a value has no JSON form; the message says where it stands.
+        TypeError: a value has no JSON form; the message names its place.
         OSError: see ``write_atomic``.
     """
     text = json.dumps(to_json(data), indent=2, allow_nan=False) + "\n"

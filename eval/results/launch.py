@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
 import torch
 
@@ -216,20 +216,20 @@ def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, co
     Returns:
         Whether every process came to its end.
     """
-    started: list[_Process] = []
+    running: list[_Process] = []
     try:
         for task in tasks:
             # In a session of its own, so that Ctrl-C reaches this process alone, which passes it on.
             child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
-            started.append(_Process(task.label, child))
+            running.append(_Process(task.label, child))
             assert child.stdin is not None
             child.stdin.write(task.to_json())
             child.stdin.close()
-        return _wait(started, stop, report)
+        return _wait(running, stop, report)
     finally:
-        for process in started:
-            process.kill()
-        for process in started:
+        for process in running:
+            process.child.kill()
+        for process in running:
             process.child.wait(_PATIENCE_SECONDS)
 
 
@@ -267,7 +267,7 @@ def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: 
         return _wait(running, stop, report)
     finally:
         for job in running:
-            job.kill()
+            job.stop()
 
 
 @dataclass(frozen=True)
@@ -286,19 +286,6 @@ class ClusterTask:
         return DelayedSubmission(self)
 
 
-class _Running(Protocol):
-    """A process or job that was started."""
-
-    def done(self) -> bool:
-        """Whether it has ended, or nobody waits for it any more."""
-
-    def result(self) -> tuple[bool, str]:
-        """Whether it came to its end, and a line about what went wrong, or ""; for one that is done."""
-
-    def stop(self) -> None:
-        """Ask it to end."""
-
-
 @dataclass
 class _Process:
     """A process on this computer."""
@@ -306,20 +293,17 @@ class _Process:
     label: str
     child: subprocess.Popen[str]
 
-    def done(self) -> bool:
-        return self.child.poll() is not None
-
-    def result(self) -> tuple[bool, str]:
-        code = self.child.returncode
+    def outcome(self) -> tuple[bool, str] | None:
+        """Whether it came to its end, and a line about what went wrong, or ""; None while it runs."""
+        code = self.child.poll()
+        if code is None:
+            return None
         how = f"signal {-code}" if code < 0 else f"code {code}"
         return code == DONE, "" if code in (DONE, STOPPED) else f"process {self.label} ended early ({how})"
 
     def stop(self) -> None:
+        """Ask it to end after the frame in hand."""
         self.child.send_signal(signal.SIGTERM)
-
-    def kill(self) -> None:
-        if not self.done():
-            self.child.kill()
 
 
 @dataclass
@@ -329,40 +313,39 @@ class _ClusterJob:
     job: Any
     cancelled: bool = False
 
-    def done(self) -> bool:
-        return self.cancelled or bool(self.job.done())
-
-    def result(self) -> tuple[bool, str]:
-        if self.cancelled:
-            return False, ""
+    def outcome(self) -> tuple[bool, str] | None:
+        """As ``_Process.outcome``."""
+        if self.cancelled or not self.job.done():
+            return (False, "") if self.cancelled else None
         error = self.job.exception()
         if error is not None:
             return False, f"job {self.job.job_id} failed: {' '.join(str(error).split())[-300:]}"
         return bool(self.job.result()), ""
 
     def stop(self) -> None:
+        """Cancel it."""
         self.cancelled = True
         self.job.cancel()
 
-    def kill(self) -> None:
-        if not self.done():
-            self.stop()
+
+_Started = TypeVar("_Started", _Process, _ClusterJob)
 
 
-def _wait(started: Sequence[_Running], stop: Stop, report: Report) -> bool:
-    """Wait for all of them; whether every one came to its end."""
-    running, finished, stopping = list(started), True, False
+def _wait(running: list[_Started], stop: Stop, report: Report) -> bool:
+    """Wait until the list is empty, from which those that have ended are removed; whether all came to their end."""
+    finished, stopping = True, False
     while running:
         if not stopping and stop():
             stopping = True
             for one in running:
                 one.stop()
-        for one in [one for one in running if one.done()]:
-            running.remove(one)
-            ended_well, line = one.result()
-            finished = finished and ended_well
-            if line:
-                report(line)
+        for one in list(running):
+            outcome = one.outcome()
+            if outcome is not None:
+                running.remove(one)
+                finished = finished and outcome[0]
+                if outcome[1]:
+                    report(outcome[1])
         if running:
             time.sleep(_POLL_SECONDS)
     return finished

@@ -42,7 +42,7 @@ def summarise(
     figures: Mapping[str, Mapping[str, float]],
     outputs: Mapping[str, str | None],
 ) -> dict[str, Any]:
-    """Everything that summary.json says; a pure function of what the run has kept.
+    """The content of summary.json, from what the run has stored.
 
     Args:
         ending: of the run.
@@ -54,7 +54,7 @@ def summarise(
         sessions: of every start of the program.
         mixture: at the end.
         figures: metrics by method.
-        outputs: by file, None if it is there, or why it is not.
+        outputs: by file, None if it exists, or why it does not.
     """
     done = [record for record in records if record["state"] == "done"]
     return {
@@ -147,7 +147,7 @@ def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
 
 
 def _near_zero_share(done: Sequence[Mapping[str, Any]]) -> float | None:
-    """Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component: there, the prior says 0."""
+    """Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0."""
     pixels = sum(record["valid_pixels"] for record in done)
     return sum(record["near_zero"] for record in done) / pixels if pixels else None
 

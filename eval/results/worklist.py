@@ -65,7 +65,7 @@ class Shard:
 
     Attributes:
         index: which, from 1.
-        count: how many there are.
+        count: number of parts.
 
     Raises:
         ValueError: no such part.
@@ -85,10 +85,10 @@ class Shard:
         Raises:
             ValueError: another form.
         """
-        found = _SHARD.fullmatch(text)
-        if found is None:
+        match = _SHARD.fullmatch(text)
+        if match is None:
             raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
-        return cls(int(found[1]), int(found[2]))
+        return cls(int(match[1]), int(match[2]))
 
     def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
         """Its items: every n-th, so that all parts get neighbours of each."""
@@ -129,9 +129,9 @@ def find_work(
         raise ValueError(f"--sequences must be at least 1, got {sample}")
     taken: list[WorkItem] = []
     for dataset in dict.fromkeys(item.dataset for item in items):
-        there = [item for item in items if item.dataset == dataset]
+        of_dataset = [item for item in items if item.dataset == dataset]
         # By names, which are sorted: random.sample draws positions.
-        taken += sorted(random.Random(seed).sample(there, min(sample, len(there))))
+        taken += sorted(random.Random(seed).sample(of_dataset, min(sample, len(of_dataset))))
     return taken
 
 
@@ -143,14 +143,14 @@ def read_names(file: Path) -> list[str]:
         ValueError: it names nothing.
     """
     lines = [line.partition("#")[0].strip() for line in file.read_text(encoding="utf-8").splitlines()]
-    found = [line for line in lines if line]
-    if not found:
+    names = [line for line in lines if line]
+    if not names:
         raise ValueError(f"--sequence-list {file} names no sequence")
-    return found
+    return names
 
 
 def content_digest(sequence: FrameSequence) -> str:
-    """Hex digest of what can be told of a sequence without decoding it: frames, cameras and poses."""
+    """Hex digest of what is known of a sequence before it is decoded: frames, cameras and poses."""
     digest = hashlib.sha256(sequence_digest(sequence).encode())
     digest.update(
         repr((None if (K := sequence.depth_intrinsics) is None else K.tolist(), sequence.depth_size)).encode()
@@ -162,26 +162,26 @@ def content_digest(sequence: FrameSequence) -> str:
 
 def _below(root: str) -> list[WorkItem]:
     """The sequences of one root."""
-    found = _ROOT.fullmatch(root)
-    dataset, path = (found["dataset"], found["path"]) if found else (None, root)
+    match = _ROOT.fullmatch(root)
+    dataset, path = (match["dataset"], match["path"]) if match else (None, root)
     if path.startswith(f"{TOUR}:"):
         return [WorkItem(dataset or TOUR, path, path, "auto")]
     from ufmstar_torch.eval.sequences.find import find_sequences
 
-    there = find_sequences(path)
-    if not there:
+    sequences = find_sequences(path)
+    if not sequences:
         raise ValueError(f"--root {root}: no sequence of a known layout is there or below")
-    return [WorkItem(dataset or f.layout, f.name, str(f.path.absolute()), f.layout) for f in there]
+    return [WorkItem(dataset or f.layout, f.name, str(f.path.absolute()), f.layout) for f in sequences]
 
 
 def _chosen(items: list[WorkItem], only: list[str]) -> list[WorkItem]:
-    """Those that are named; every name must be there."""
+    """The items that are named; a name without an item is an error."""
     named = {name: [item for item in items if name in (item.sequence, item.label)] for name in only}
-    missing = [name for name, found in named.items() if not found]
+    missing = [name for name, chosen in named.items() if not chosen]
     if missing:
-        told = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
-        raise ValueError(f"--sequence-list names sequences that are not there: {told}")
-    return sorted({item for found in named.values() for item in found})
+        shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+        raise ValueError(f"--sequence-list names sequences that are not there: {shown}")
+    return sorted({item for chosen in named.values() for item in chosen})
 
 
 def _safe(name: str) -> str:

@@ -143,8 +143,12 @@ def common_size(loaders: Iterable[Loader | None]) -> Size | None:
 
 
 def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10)."""
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file()), key=natural_key)
+    """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10).
+
+    Links whose file is missing are among them, so that their frames are skipped and counted.
+    """
+    named = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    return sorted((p for p in named if p.is_file() or (p.is_symlink() and not p.exists())), key=natural_key)
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
