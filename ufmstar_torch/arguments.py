@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 
-def require_float(
-    name: str, value: object, shapes: Sequence[tuple[int, ...]] = (), like: Tensor | None = None
-) -> Tensor:
+Shapes = Sequence[tuple[int, ...]]
+
+
+def require_float(name: str, value: object, shapes: Shapes = (), like: Tensor | None = None) -> Tensor:
     """The argument ``name`` if it is a tensor of a floating-point dtype.
 
     Args:
