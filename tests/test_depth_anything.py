@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from scenes import look, render
 from ufmstar_torch import UncertainDepth, cli
-from ufmstar_torch.eval.engine.run_source import network_source, sha256
+from ufmstar_torch.eval.engine.load import network_source, sha256
 from ufmstar_torch.models import (
     Alignment,
     CheckpointError,

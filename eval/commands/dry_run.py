@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from ufmstar_torch.eval.engine.networks import BaseNetwork
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.results.work import EvalJob
@@ -14,7 +14,7 @@ from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file systems allot
 
 
-def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> str:
+def dry_run(job: EvalJob, networks: Mapping[str, DepthSource], shard: Shard) -> str:
     """Open every sequence, predict one frame, and describe the work.
 
     Args:
@@ -47,7 +47,7 @@ def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> 
     return "\n".join(lines)
 
 
-def predictions(rows: Iterable[Row], network: BaseNetwork, frames: int) -> int:
+def predictions(rows: Iterable[Row], network: DepthSource, frames: int) -> int:
     """How many predictions of a network the rows need on so many frames, all members on an image counting as one."""
     needed: set[tuple[int, int | None]] = set()
     for row in rows:
@@ -57,13 +57,13 @@ def predictions(rows: Iterable[Row], network: BaseNetwork, frames: int) -> int:
     return len(needed)
 
 
-def _cached(rows: Sequence[Row], networks: Mapping[str, BaseNetwork], frames: int, sample: Mapping[str, int]) -> int:
+def _cached(rows: Sequence[Row], networks: Mapping[str, DepthSource], frames: int, sample: Mapping[str, int]) -> int:
     """Bytes of the predictions of a sequence."""
     by_base = {base: [row for row in rows if row.method.base == base] for base in sample}
     return sum(predictions(own, networks[base], frames) * sample[base] for base, own in by_base.items())
 
 
-def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, BaseNetwork]) -> dict[str, int] | None:
+def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, DepthSource]) -> dict[str, int] | None:
     """By base, from the first frame that can be read; None if none can."""
     for index in range(len(sequence)):
         try:
