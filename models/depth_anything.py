@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 
@@ -61,24 +61,19 @@ class DepthAnything(HuggingFaceDepth):
         device: torch.device | str | None = None,
         revision: str | None = None,
         local_files_only: bool = False,
-    ) -> DepthAnything:
-        """A checkpoint in the format of ``transformers``, in eval mode; colours as its own processor has them.
+    ) -> Self:
+        """As :func:`from_hugging_face`, for this architecture; colours as the published checkpoints have them where the
+        directory does not state them.
 
         Args:
             name_or_dir: a hub name (:func:`depth_anything_name`) or a directory.
             size: (height, width) [px] of the input, multiples of the patch (14).
             keep_aspect: keep the image's aspect as the checkpoint's own processor does: 480 x 640 becomes 518 x 686.
                 The intrinsics follow in either case.
-            dtype: of the weights; depth is float32 in any case (float64 for float64).
-            device: where the weights go; None = the CPU.
-            revision: branch, tag or commit on the hub.
-            local_files_only: do not access the hub.
+            dtype, device, revision, local_files_only: as in :func:`from_hugging_face`; errors too.
 
         Raises:
             ValueError: ``size`` is no multiple of the patch.
-            CheckpointError: the checkpoint is damaged, incomplete or of another kind of model; named.
-            FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
-            ModuleNotFoundError: transformers is missing.
         """
         checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
         if checkpoint.model_type != "depth_anything":

@@ -20,6 +20,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 METRIC = "metric"
+SPREADS = ("variance", "std", "log_variance", "log_std", "relative_std")
 NOT_METRIC = ("inverse", "disparity", "relative", "affine")
 
 
@@ -34,8 +35,9 @@ class OutputSpec(Checked):
             network has only one output.
         scale: [m] length of one unit of the depth output, .001 for millimetres.
         aleatoric, epistemic: names of the outputs with the learned data and model variance, if any.
-        aleatoric_kind, epistemic_kind: "variance", "std" or "log_variance" (natural logarithm), in the units
-            of the depth output.
+        aleatoric_kind, epistemic_kind: "variance", "std", "log_variance" or "log_std" (natural logarithms), in the
+            units of the depth output; or "relative_std", a standard deviation per depth (to first order that of the
+            logarithm of depth). A "confidence" has no such meaning and is refused.
         resize: whether outputs of another resolution than the input are brought to it by repeating or
             dropping pixels; otherwise such outputs are an error.
 
@@ -47,9 +49,9 @@ class OutputSpec(Checked):
     depth: str | int | None = None
     scale: float = number(1.0, "", "m", 0.0, open_low=True, open_high=True)
     aleatoric: str | int | None = None
-    aleatoric_kind: str = choice("variance", "std", "log_variance")
+    aleatoric_kind: str = choice(*SPREADS)
     epistemic: str | int | None = None
-    epistemic_kind: str = choice("variance", "std", "log_variance")
+    epistemic_kind: str = choice(*SPREADS)
     resize: bool = False
 
     def __post_init__(self) -> None:
@@ -61,6 +63,8 @@ class OutputSpec(Checked):
             )
         if self.kind != METRIC:
             raise ValueError(f"OutputSpec.kind must be {METRIC!r} (refused: {NOT_METRIC}), got {self.kind!r}")
+        if "confidence" in (self.aleatoric_kind, self.epistemic_kind):
+            raise ValueError(f"a confidence is no spread of depth: it ranks pixels only; expected one of {SPREADS}")
         super().__post_init__()
 
     def names(self) -> list[str | int]:
@@ -81,22 +85,21 @@ class OutputSpec(Checked):
             raise ValueError(f"the network returns {list(outputs)}; declare which one is depth")
         depth_name = next(iter(outputs)) if self.depth is None else self.depth
         depth = self._map(outputs, depth_name, size) * self.scale
-        aleatoric = self._variance(outputs, self.aleatoric, self.aleatoric_kind, size)
-        epistemic = self._variance(outputs, self.epistemic, self.epistemic_kind, size)
+        aleatoric = self._variance(outputs, self.aleatoric, self.aleatoric_kind, depth)
+        epistemic = self._variance(outputs, self.epistemic, self.epistemic_kind, depth)
         return DepthPrediction(depth, aleatoric, epistemic)
 
     def _variance(
-        self, outputs: Mapping[str | int, Tensor], name: str | int | None, kind: str, size: tuple[int, int]
+        self, outputs: Mapping[str | int, Tensor], name: str | int | None, kind: str, depth: Tensor
     ) -> Tensor | None:
-        """[B, H, W] [m^2], or None where the network has none."""
+        """[B, H, W] [m^2], or None where the network has none; ``depth`` [B, H, W] [m]."""
         if name is None:
             return None
-        value = self._map(outputs, name, size)
-        if kind == "log_variance":
-            value = value.exp()
-        elif kind == "std":
-            value = value.square()
-        return value * self.scale**2
+        spread = self._map(outputs, name, (depth.shape[-2], depth.shape[-1]))
+        if kind == "relative_std":
+            return (spread * depth).square()
+        spread = spread.exp() if kind.startswith("log_") else spread
+        return (spread.square() if kind.endswith("std") else spread) * self.scale**2
 
     def _map(self, outputs: Mapping[str | int, Tensor], name: str | int, size: tuple[int, int]) -> Tensor:
         """[B, H, W] of one output, in its own units."""

@@ -8,12 +8,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from ufmstar_torch import DepthPrediction, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.commands.run import Job
-from ufmstar_torch.eval.engine.run_maps import MapSource, own_depth_source
-from ufmstar_torch.eval.engine.run_source import NetworkSource
+from ufmstar_torch import DepthPrediction, UfMStarConfig
+from ufmstar_torch.eval.commands.run import RunJob
+from ufmstar_torch.eval.engine.maps import own_depth
+from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
+from ufmstar_torch.pipeline import NetworksInTurn
 
 CONFIG = UfMStarConfig(on_bad_frame="skip")
 
@@ -34,25 +35,29 @@ class Brightness(nn.Module):
         return DepthPrediction(depth, None if self.spread is None else self.spread * depth)
 
 
-def network_job(path, *networks, config=CONFIG, frames=slice(None), mode="alternate", **options):
+def networks(*members, preprocess=None, identity=()):
+    """A source of networks on the CPU; their input is 24x32 unless another preprocessing is given."""
+    turns = NetworksInTurn(list(members), preprocess=preprocess or Preprocess(size=(24, 32)))
+    return NetworkSource(turns, torch.device("cpu"), dict(identity))
+
+
+def network_job(path, *members, mode="alternate", **options):
     """A job with networks, at 24x32 so that prediction and image differ in size."""
-    sequence = open_sequence(path)
-    members = networks or (Brightness(),)
-    pipeline = UncertainDepth(list(members), config, mode=mode, preprocess=Preprocess(size=(24, 32)))
-    identity = {"networks": [network.gain for network in members]}
-    source = NetworkSource(pipeline, torch.device("cpu"), identity)
-    return job_of(sequence, source, frames=frames, **options)
+    members = members or (Brightness(),)
+    source = networks(*members, identity={"networks": [network.gain for network in members]})
+    return job_of(open_sequence(path), source, every=mode == "full", **options)
 
 
-def own_depth_job(path, config=CONFIG, frames=slice(None), **options):
+def own_depth_job(path, **options):
     """A job with the sequence's own depth as the prediction."""
-    return job_of(open_sequence(path), own_depth_source(config), frames=frames, **options)
+    return job_of(open_sequence(path), own_depth(), **options)
 
 
-def job_of(sequence, source: NetworkSource | MapSource, frames=slice(None), **options):
+def job_of(sequence, source, frames=slice(None), config=CONFIG, **options):
     """Without pictures, unless they are asked for."""
     options = {"video": False, "sheet": False, **options}
-    return Job(sequence, range(len(sequence))[frames], source, {"note": "a test"}, **options)
+    indices, settings = range(len(sequence))[frames], {"note": "a test"}
+    return RunJob(sequence, indices, source, config, torch.device("cpu"), settings, **options)
 
 
 def outputs(out):

@@ -10,8 +10,9 @@ from dataclasses import replace
 import torch
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.evaluate import RowResult, Stopped
-from ufmstar_torch.eval.engine.networks import NetworkChoice
+from ufmstar_torch.eval.engine.evaluate import RowResult
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.results.eval_folder import EvalFolder

@@ -253,6 +253,7 @@ def test_refusals_by_name(tmp_path: Path) -> None:
     assert {"exported", "fastdepth", "monodepth2", "onnx", "torchscript"} <= set(network_names())
 
 
+@pytest.mark.slow
 def test_the_package_is_light_and_complete() -> None:
     """Importing it loads no file of it, nor onnx, onnxruntime or safetensors; every name then resolves."""
     code = (

@@ -19,15 +19,9 @@ from ufmstar_torch.eval.bench.benchmark_frames import PosedDepth, RecordedSequen
 from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
 from ufmstar_torch.eval.bench.benchmark_report import format_report
 from ufmstar_torch.eval.bench.benchmark_step import build_up, components_in_view, memory
-from ufmstar_torch.eval.bench.benchmark_timing import (
-    STAGES,
-    StageClock,
-    Stopwatch,
-    paired_ratio,
-    pinned_threads,
-    spread,
-)
+from ufmstar_torch.eval.bench.benchmark_timing import STAGES, StageClock, pinned_threads
 from ufmstar_torch.eval.commands import bench_command
+from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
 from ufmstar_torch.eval.results.machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, FastDepthWidths
@@ -78,7 +72,7 @@ def test_spread_needs_a_measurement():
 
 
 def test_stopwatch_tells_waiting_from_computing():
-    watch = Stopwatch()
+    watch = CallTimes()
     for _ in range(3):
         assert watch.time("sleep", lambda x: (time.sleep(0.02), x)[1], 7) == 7
     assert watch.spread("sleep")["min_ms"] >= 20

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +19,7 @@ from runs import Brightness, outputs, read_summary
 from shared_data import require_shared
 
 from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
-from ufmstar_torch.eval.engine import run_source
+from ufmstar_torch.eval.engine import load as sources
 from ufmstar_torch.eval.results import writers
 from ufmstar_torch.models import Preprocess
 
@@ -53,7 +55,7 @@ def brightness(monkeypatch, tmp_path):
         return network
 
     loaded = []
-    monkeypatch.setattr(run_source, "load_network", load)
+    monkeypatch.setattr(sources, "load_network", load)
     files = [tmp_path / "first.pt", tmp_path / "second.pt"]
     for file, gain in zip(files, ("1.0", "1.1"), strict=True):
         file.write_text(gain)
@@ -85,8 +87,14 @@ def test_help_of_run_names_every_setting(ufmstar, capfd):
     for name in SPGFConfig().to_dict():
         assert f"--ufm.segment.{name}" in text
     assert "(0, 1]" in text
+    words = " ".join(text.split())
+    assert "smallest variance of a pixel v_min [m^2], [0, inf]" in words
+    for config in (UfMStarConfig, SPGFConfig):
+        for field in dataclasses.fields(config):
+            assert f" {field.name}: " in (config.__doc__ or ""), "the docstring's attributes are the help"
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_beyond_the_package():
     code = (
         "import sys, ufmstar_torch; before = set(sys.modules); from ufmstar_torch.cli import main; "
@@ -163,6 +171,11 @@ MISTAKES = {
     "intrinsics": (["run", "{path}", "--depth", "self", "--intrinsics", "1", "2", "--out", "{out}"], "fx fy cx cy"),
     "layout": (["run", "{path}", "--depth", "self", "--layout", "tum", "--out", "{out}"], "looked for rgb.txt"),
     "device": (["run", "{path}", "--depth", "self", "--device", "abacus", "--out", "{out}"], "--device abacus"),
+    "no data": (["run", "{path}", "--depth", "self", "--device", "meta", "--out", "{out}"], "--device meta is not"),
+    "size beyond memory": (
+        ["run", "{path}", "--depth", "self", "--size", "99999999x99999999", "--out", "{out}"],
+        "--size must be at most 134 million pixels",
+    ),
     "threads": (["run", "{path}", "--depth", "self", "--threads", "0", "--out", "{out}"], "--threads"),
     "someone else's folder": (["run", "{path}", "--depth", "self", "--out", "{path}"], "files of someone else"),
     "contradiction": (
@@ -210,7 +223,33 @@ def test_an_unknown_key_in_a_file_is_told(ufmstar, path, tmp_path):
         assert expected in err
 
 
+def test_damaged_files_end_in_one_line(ufmstar, tmp_path, capfd):
+    path, _ = write_generic(tmp_path, frames=2)
+    out = tmp_path / "out"
+    (path / "poses.txt").write_bytes(bytes(range(256)))
+    code, _, err = ufmstar("run", path, "--depth", "self", "--out", out)
+    assert (code, err.count("\n"), out.exists()) == (2, 1, False)
+    assert "poses.txt: expected a text file" in err
+    (tmp_path / "empty.mp4").touch()
+    words = ("--trajectory", path / "poses.txt", "--intrinsics", path / "K.txt", "--depth", "self", "--out", out)
+    code, _, err = ufmstar("run", tmp_path / "empty.mp4", *words)
+    assert (code, out.exists()) == (2, False)
+    assert "empty.mp4: cannot be opened as a video" in err.splitlines()[-1]
+
+
 # ---- options ----
+
+
+def test_poses_in_another_convention(ufmstar, path, tmp_path):
+    """The remedy of ``data check`` is an option of ``run``."""
+    inverted = shutil.copytree(path, tmp_path / "inverted")
+    poses = np.loadtxt(path / "poses.txt").reshape(-1, 4, 4)
+    np.savetxt(inverted / "poses.txt", np.linalg.inv(poses).reshape(-1, 16))
+    for source, words in ((path, ()), (inverted, ("--poses", "world-to-camera"))):
+        words += ("--depth", "self", *QUICK, "--out", tmp_path / "out" / source.name)
+        assert ufmstar("run", source, *words)[0] == 0
+    mixtures = [read_summary(tmp_path / "out" / source.name)["mixture"] for source in (path, inverted)]
+    assert mixtures[0]["components"] == mixtures[1]["components"]
 
 
 def test_settings_from_file_and_words(ufmstar, path, tmp_path):
@@ -334,14 +373,14 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
 
 
 def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness, monkeypatch):
-    load = run_source.load_network
+    load = sources.load_network
 
     def other(name, weights, **options):
         network = load(name, weights, **options)
         network.preprocess = Preprocess(size=(24, 32 + len(brightness.loaded)))
         return network
 
-    monkeypatch.setattr(run_source, "load_network", other)
+    monkeypatch.setattr(sources, "load_network", other)
     code, _, err = ufmstar("run", path, "--model", "any", "--weights", *brightness.files, "--out", tmp_path / "out")
     assert code == 2
     assert "same input" in err
@@ -351,7 +390,7 @@ def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness, m
 def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, brightness, monkeypatch, number):
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK)
     assert ufmstar(*words, "--out", tmp_path / "whole")[0] == 0
-    load = run_source.load_network
+    load = sources.load_network
 
     def loaded(name, weights, **options):
         network = load(name, weights, **options)
@@ -359,14 +398,14 @@ def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, 
         return network
 
     before = signal.getsignal(number)
-    monkeypatch.setattr(run_source, "load_network", loaded)
+    monkeypatch.setattr(sources, "load_network", loaded)
     code, _, err = ufmstar(*words, "--out", tmp_path / "out")
     assert code == 130
     assert "stopping after this frame" in err
     assert "interrupted: stopped by the user after 3 of 6 frames; --resume goes on" in err
     assert signal.getsignal(number) is before
     assert read_summary(tmp_path / "out")["state"] == "interrupted"
-    monkeypatch.setattr(run_source, "load_network", load)
+    monkeypatch.setattr(sources, "load_network", load)
     assert ufmstar(*words, "--out", tmp_path / "out", "--resume")[0] == 0
     whole, resumed = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
     for found in (whole, resumed):
@@ -384,8 +423,8 @@ def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness, mo
         network.at, network.then = 1, twice
         return network
 
-    load = run_source.load_network
-    monkeypatch.setattr(run_source, "load_network", loaded)
+    load = sources.load_network
+    monkeypatch.setattr(sources, "load_network", loaded)
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out")
     assert ufmstar(*words)[0] == 130
     assert read_summary(tmp_path / "out")["frames"]["done"] == 2
@@ -411,8 +450,8 @@ def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness, monkeypa
         network.at, network.then = 0, fail
         return network
 
-    load = run_source.load_network
-    monkeypatch.setattr(run_source, "load_network", loaded)
+    load = sources.load_network
+    monkeypatch.setattr(sources, "load_network", loaded)
     words = ("run", path, "--model", "any", "--weights", brightness.files[0], *QUICK, "--out", tmp_path / "out")
     code, _, err = ufmstar(*words)
     assert code == 1
@@ -432,6 +471,7 @@ def test_skipped_frames_are_told(ufmstar, tmp_path):
 # ---- the real thing ----
 
 
+@pytest.mark.slow
 def test_fastdepth_on_a_real_sequence(tmp_path):
     sequence = require_shared("data/rgbd_dataset_freiburg1_xyz")
     weights = require_shared("weights/fastdepth_nyu.onnx")

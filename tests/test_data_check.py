@@ -77,7 +77,7 @@ def test_other_conventions_are_named_with_their_option(tour, capsys, written):
     spoil_poses(tour, inverse[written])
     code, out = command(capsys, tour, "--pairs", 2)
     assert code == 1
-    assert f"the poses look {CONVENTIONS[written].told}" in out
+    assert f"the poses look {CONVENTIONS[written].description}" in out
     assert re.findall(r"remedy +(.*)", out) == [f"--poses {written}"]
     assert out.splitlines()[-1] == "1 problem"
     code, out = command(capsys, tour, "--pairs", 2, "--poses", written)

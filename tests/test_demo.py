@@ -15,20 +15,26 @@ from runs import read_summary
 
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.eval.commands import demo
-from ufmstar_torch.eval.commands.demo import DEMO, sheet_rows, surface_kinds
+from ufmstar_torch.eval.commands.demo import DEMO, demo_rows, sheet_rows, surface_kinds
 from ufmstar_torch.eval.commands.demo_command import DemoOptions
-from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, METHODS, NETWORK, UFM, UFM_STAR, Comparison, Tally
+from ufmstar_torch.eval.engine.judge import RegionMetrics
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
+from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import colour_table
 from ufmstar_torch.eval.report.figures import write_curves
-from ufmstar_torch.eval.report.outputs import DEMO_FILES
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK
 from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
+from ufmstar_torch.pipeline import NetworksInTurn
 
+METHODS = (NETWORK, UFM, UFM_STAR, ENSEMBLE)
+CPU = torch.device("cpu")
 SIZE, FRAMES, SEED = (64, 96), 7, 5
 SPEC = NetworkSpec(widths=0.1, positive="softplus", size=SIZE, preprocess="resize")
 SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
@@ -54,9 +60,8 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sequence():
-    """Frames that overlap, as those of a long tour do."""
-    tour = tour_sequence(SEED, frames=80, size=SIZE, style="mixed")
-    return [tour[index] for index in range(FRAMES)]
+    """A long tour, whose first frames overlap."""
+    return tour_sequence(SEED, frames=80, size=SIZE, style="mixed")
 
 
 @pytest.fixture(scope="module")
@@ -157,10 +162,27 @@ def test_progress_goes_to_stderr(done):
 # ---- the rows are what they say ----
 
 
+class Collected(FrameSink):
+    """Keeps every result."""
+
+    def __init__(self):
+        self.results = []
+
+    def take(self, result):
+        self.results.append(result)
+
+
+def walked(networks, frames, indices=None, sinks=()):
+    """The frames through the demo's rows: their results."""
+    source = NetworkSource(NetworksInTurn(networks, preprocess=networks[0].preprocess), CPU, {}, seeding=None)
+    collected = Collected()
+    FrameStream(frames, indices or range(FRAMES), demo_rows(source, CPU)).drive([collected, *sinks])
+    return collected.results
+
+
 @pytest.fixture(scope="module")
 def compared(sequence):
-    comparison = Comparison(members(), torch.device("cpu"))
-    return comparison, [comparison.take(frame) for frame in sequence]
+    return walked(members(), sequence)
 
 
 def inputs(frame):
@@ -168,29 +190,31 @@ def inputs(frame):
     return image, torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(frame.intrinsics)[None]
 
 
-def test_ufm_star_is_the_pipeline_with_members_in_turn(sequence, compared):
+def test_ufm_star_is_the_pipeline_with_members_in_turn(compared):
     networks = members()
     pipeline, added = UncertainDepth(networks, preprocess=networks[0].preprocess), 0.0
-    for index, frame in enumerate(sequence):
-        want, got = pipeline(*inputs(frame)), compared[1][index].estimates
+    for index, result in enumerate(compared):
+        want, got = pipeline(*inputs(result.frame)), result.rows
         assert want.member == index % 3
         for method in (NETWORK, UFM, UFM_STAR):
-            assert torch.equal(got[method].depth, want.depth[0])
-        assert torch.equal(got[UFM_STAR].variance.nan_to_num(-1), want.variance[0].nan_to_num(-1))
-        assert torch.equal(got[NETWORK].variance, want.prediction.variance[0])
-        added += float((got[UFM_STAR].variance - got[NETWORK].variance).nanmean())
+            assert got[method].member == want.member
+            assert torch.equal(got[method].estimate.depth, want.depth[0])
+        star, own = got[UFM_STAR].estimate.variance, got[NETWORK].estimate.variance
+        assert torch.equal(star.nan_to_num(-1), want.variance[0].nan_to_num(-1))
+        assert torch.equal(own, want.prediction.variance[0])
+        added += float((star - own).nanmean())
     assert added > 0, "the members disagree"
 
 
-def test_ufm_judges_the_same_predictions(sequence, compared):
+def test_ufm_judges_the_same_predictions(compared):
     networks, ufm = members(), UfM()
-    for index, frame in enumerate(sequence):
-        image, pose, K = inputs(frame)
+    for index, result in enumerate(compared):
+        image, pose, K = inputs(result.frame)
         with torch.no_grad():
             x, K = networks[0].preprocess(image, K)
             prediction = networks[index % 3](x)
         want = ufm(prediction.depth, pose, K, prediction.aleatoric_variance)
-        assert torch.equal(compared[1][index].estimates[UFM].variance, want.variance[0])
+        assert torch.equal(result.rows[UFM].estimate.variance, want.variance[0])
 
 
 def test_the_ensemble_row_is_the_mixture_of_all_members(sequence, compared):
@@ -200,32 +224,24 @@ def test_the_ensemble_row_is_the_mixture_of_all_members(sequence, compared):
         predictions = [network(network.preprocess(image, K)[0]) for network in networks]
     d = torch.stack([p.depth[0] for p in predictions]).double()
     a = torch.stack([p.aleatoric_variance[0] for p in predictions]).double()
-    got = compared[1][3].estimates[ENSEMBLE]
+    got = compared[3].rows[ENSEMBLE].estimate
     assert torch.allclose(got.depth.double(), d.mean(0), atol=1e-6)
     assert torch.allclose(got.variance.double(), a.mean(0) + d.var(0, correction=0), rtol=1e-5)
 
 
-def test_restart_forgets_everything(sequence, compared):
-    comparison = Comparison(members(), torch.device("cpu"))
-    comparison.take(sequence[4])
-    comparison.restart()
-    again = comparison.take(sequence[0]).estimates
-    for method, estimate in compared[1][0].estimates.items():
-        assert torch.equal(again[method].variance.nan_to_num(-1), estimate.variance.nan_to_num(-1))
-
-
 def test_one_network_is_no_ensemble(sequence):
-    comparison = Comparison(members(1), torch.device("cpu"))
-    assert comparison.methods == (NETWORK, UFM, UFM_STAR)
-    assert ENSEMBLE not in comparison.take(sequence[0]).estimates
+    [result] = walked(members(1), sequence, range(1))
+    assert tuple(result.rows) == (NETWORK, UFM, UFM_STAR)
 
 
-def test_what_cannot_be_compared_is_refused(sequence):
-    with pytest.raises(ValueError, match="at least one network"):
-        Comparison([], torch.device("cpu"))
-    plain = Comparison(members(1, replace(SPEC, method="depth")), torch.device("cpu"))
-    with pytest.raises(ValueError, match="a variance of their own"):
-        plain.take(sequence[0])
+def test_networks_without_a_variance_are_refused(ufmstar, tmp_path):
+    save_trained(
+        tmp_path / "plain.safetensors", members(1, replace(SPEC, method="depth")), replace(SPEC, method="depth")
+    )
+    words = ["--weights", tmp_path / "plain.safetensors", "--frames", 2, "--seed", SEED]
+    code, _, err = ufmstar("demo", "--out", tmp_path / "out", *words)
+    assert code == 1
+    assert "a variance of their own" in err
 
 
 # ---- the figures ----
@@ -249,21 +265,25 @@ def test_pixels_belong_to_the_room_they_show():
     assert both >= 2, "some frames must show both kinds through a door"
 
 
-def test_figures_by_kind_and_overall(sequence, compared):
+def test_figures_by_kind_and_overall(sequence):
     tour = make_tour(SEED, "mixed")
-    tally, metrics = Tally(METHODS, ("a", "b")), SequenceMetrics()
-    squares, spread = {"a": [], "b": []}, {"a": [], "b": []}
-    for frame, one in zip(sequence, compared[1], strict=True):
-        kinds, truth = surface_kinds(tour, frame), torch.from_numpy(frame.depth)
+
+    def region_of(result, row):
+        kinds = surface_kinds(tour, result.frame)
         kinds[:, : SIZE[1] // 3] = 1  # so that there are both kinds in every frame
-        tally.add(one, truth, torch.from_numpy(kinds))
-        estimate = one.estimates[UFM_STAR]
-        metrics.update(estimate.depth, estimate.variance, truth, estimate.valid)
+        return torch.from_numpy(kinds)
+
+    regions, metrics = RegionMetrics(METHODS, ("a", "b"), region_of), SequenceMetrics()
+    squares, spread = {"a": [], "b": []}, {"a": [], "b": []}
+    for result in walked(members(), sequence, sinks=[regions]):
+        frame, estimate = result.frame, result.rows[UFM_STAR].estimate
+        kinds = region_of(result, None).numpy()
+        metrics.update(estimate.depth, estimate.variance, torch.from_numpy(frame.depth), estimate.valid)
         for number, kind in enumerate("ab"):
             use = (kinds == number) & (frame.depth > 0) & estimate.valid.numpy()
             squares[kind].append((estimate.depth.numpy()[use].astype(float) - frame.depth[use]) ** 2)
             spread[kind].append(estimate.variance.numpy()[use].astype(float))
-    by_kind, whole = tally.by_kind(), tally.overall()[UFM_STAR].compute()
+    by_kind, whole = regions.by_region(), regions.overall()[UFM_STAR].compute()
     for kind in "ab":
         figures = by_kind[kind][UFM_STAR]
         assert figures["rmse"] == pytest.approx(np.concatenate(squares[kind]).mean() ** 0.5, rel=1e-6)
@@ -272,7 +292,6 @@ def test_figures_by_kind_and_overall(sequence, compared):
     assert whole.keys() == expected.keys()
     for name, value in expected.items():
         assert whole[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
-    assert tally.median_ms()[NETWORK] == np.median([one.ms[NETWORK] for one in compared[1]])
 
 
 def test_the_table_shows_the_figures_of_the_summary(done):
@@ -427,15 +446,12 @@ def test_the_shipped_networks_are_small_and_several():
     info = read_info(SHIPPED)
     assert info.members >= 3
     assert "command" in json.dumps(info.info), "a checkpoint says which command trained it"
-    networks = load_trained(SHIPPED)
-    comparison = Comparison(networks, torch.device("cpu"))
     frames = tour_sequence(DemoOptions().seed, frames=40, size=info.spec.size, style="mixed")
-    tour, tally = make_tour(DemoOptions().seed, "mixed"), Tally(METHODS, ("familiar", "unfamiliar"))
-    for index in range(0, 40, 2):
-        frame = frames[index]
-        kinds = torch.from_numpy(surface_kinds(tour, frame))
-        tally.add(comparison.take(frame), torch.from_numpy(frame.depth), kinds)
-    found = tally.by_kind()
+    tour = make_tour(DemoOptions().seed, "mixed")
+    kinds = ("familiar", "unfamiliar")
+    regions = RegionMetrics(METHODS, kinds, lambda result, _: torch.from_numpy(surface_kinds(tour, result.frame)))
+    walked(load_trained(SHIPPED), frames, range(0, 40, 2), [regions])
+    found = regions.by_region()
     assert found["familiar"][UFM_STAR]["delta1"] > 0.6
     assert found["unfamiliar"][UFM_STAR]["rms_sigma"] > found["familiar"][UFM_STAR]["rms_sigma"]
     assert found["unfamiliar"][UFM_STAR]["nll"] < found["unfamiliar"][NETWORK]["nll"]

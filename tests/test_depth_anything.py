@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from scenes import look, render
 from ufmstar_torch import UncertainDepth, cli
-from ufmstar_torch.eval.engine.run_source import network_source, sha256
+from ufmstar_torch.eval.engine.load import network_source, sha256
 from ufmstar_torch.models import (
     Alignment,
     CheckpointError,
@@ -526,6 +526,7 @@ def test_a_directory_is_identified_by_its_visible_files(broken, metric):
     assert identity["weights"] == [{"name": "metric", "sha256": sha256(metric)}]
 
 
+@pytest.mark.slow
 def test_transformers_is_loaded_only_with_a_checkpoint():
     code = (
         "import sys\n"

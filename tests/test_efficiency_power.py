@@ -381,6 +381,7 @@ def test_a_jetsons_rails_serve_both_units(bare):
     assert idle_gpu.missing[GPU] == "nothing runs on a GPU"
 
 
+@pytest.mark.slow
 def test_importing_reads_no_sensor():
     code = (
         "import sys, threading, ufmstar_torch.eval.bench.power, ufmstar_torch.eval.bench.sensors;"

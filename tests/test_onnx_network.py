@@ -98,14 +98,15 @@ def test_input_types(tmp_path: Path, image: Tensor, kind: int, value_range: floa
     torch.testing.assert_close(network(x).depth, depth_of(image) * value_range, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("kind", ["variance", "std", "log_variance"])
+@pytest.mark.parametrize("kind", ["variance", "std", "log_variance", "log_std", "relative_std"])
 def test_variances_in_square_metres(tmp_path: Path, image: Tensor, kind: str) -> None:
     """A spread in the depth's own unit becomes m^2, whatever form it has."""
     path = write(tmp_path / "n.onnx", spread="spread")
     outputs = OutputSpec("metric", "depth", 0.5, aleatoric="spread", aleatoric_kind=kind)
     got = OnnxNetwork(path, OnnxSpec(outputs))(image).aleatoric_variance
     raw = image[:, 0] - 1
-    expected = {"variance": raw, "std": raw**2, "log_variance": raw.exp()}[kind] / 4
+    spreads = {"variance": raw, "std": raw**2, "log_variance": raw.exp(), "log_std": raw.exp() ** 2}
+    expected = (raw * depth_of(image) / 2) ** 2 if kind == "relative_std" else spreads[kind] / 4
     torch.testing.assert_close(got, expected)
     other = OutputSpec("metric", "depth", 0.5, epistemic="spread", epistemic_kind=kind)
     torch.testing.assert_close(OnnxNetwork(path, OnnxSpec(other))(image).epistemic_variance, expected)
@@ -163,6 +164,7 @@ def test_depth_that_is_not_metric_is_refused(kind: str) -> None:
         ({"outputs": {"kind": "metric", "unit": "mm"}}, r"no \['unit'\]"),
         ({"outputs": {"kind": "metric", "scale": 0}}, r"scale must lie in \(0.0, inf\)"),
         ({"outputs": {"kind": "metric", "aleatoric_kind": "sigma"}}, "aleatoric_kind must be one of"),
+        ({"outputs": {"kind": "metric", "epistemic_kind": "confidence"}}, "a confidence is no spread of depth"),
         ({"outputs": {"kind": "metric"}, "inputs": "x"}, r"no \['inputs'\]"),
         ({"outputs": {"kind": "metric"}, "layout": "CHW"}, "layout must be"),
         ({"outputs": {"kind": "metric"}, "channels": "gray"}, "channels must be"),

@@ -11,7 +11,7 @@ import pytest
 from evaluations import in_memory
 
 from ufmstar_torch.anchors.tracker import TrackerConfig
-from ufmstar_torch.eval.engine.anchor_source import TRUTH_COUNT
+from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 from layouts import truncate, write_depth_png, write_generic, write_scannet
-from runs import CONFIG, Brightness, job_of, network_job, outputs, own_depth_job, read_summary
+from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
 from scenes import render
 from ufmstar_torch import UfMStar, UncertainDepth
 from ufmstar_torch.eval.commands.run import Progress, run
-from ufmstar_torch.eval.engine.run_maps import folder_source
-from ufmstar_torch.eval.engine.run_source import NetworkSource
+from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.outputs import field_of_view, square_pixels
 from ufmstar_torch.eval.results import run_folder, writers
@@ -260,7 +259,7 @@ def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):
         (tmp_path / "spread").mkdir(exist_ok=True)
         np.save(tmp_path / "spread" / f"{i + 7}.npy", np.full(half.shape, 0.04, np.float32))
     sequence = open_sequence(path)
-    source = folder_source(sequence, tmp_path / "maps", CONFIG, variance=tmp_path / "spread")
+    source = folder_source(sequence, tmp_path / "maps", variance=tmp_path / "spread")
     summary = run(job_of(sequence, source), tmp_path / "out")
     K = [truth.K[0, 0] / 2, truth.K[1, 1] / 2, (truth.K[0, 2] - 0.5) / 2, (truth.K[1, 2] - 0.5) / 2]
     np.testing.assert_allclose(summary["prediction"]["intrinsics"], K)
@@ -274,9 +273,7 @@ def test_maps_of_another_size_get_their_intrinsics(scene, tmp_path):
 
 
 def test_maps_are_brought_to_a_size(path, tmp_path):
-    from ufmstar_torch.eval.engine.run_maps import own_depth_source
-
-    summary = run(job_of(open_sequence(path), own_depth_source(CONFIG, size=(12, 16))), tmp_path / "out")
+    summary = run(job_of(open_sequence(path), own_depth((12, 16))), tmp_path / "out")
     assert summary["prediction"]["size"] == [12, 16]
     assert summary["metrics"]["rmse"] == 0
     frame = open_sequence(path)[5]
@@ -295,11 +292,11 @@ def test_maps_that_were_cropped_need_their_intrinsics(path, tmp_path):
         write_depth_png(tmp_path / "maps" / f"{name}.png", np.ones((48, 48)), 1000, scale_text="0.001")
     sequence = open_sequence(path)
     with pytest.raises(ValueError, match=r"7\.png: the map is 48x48, the images are 64x48: it does not show the whole"):
-        folder_source(sequence, tmp_path / "maps", CONFIG)
+        folder_source(sequence, tmp_path / "maps")
     # Only a later one: that frame is left out.
     for name in (7, 8, 9):
         write_depth_png(tmp_path / "maps" / f"{name}.png", np.ones((48, 64)), 1000, scale_text="0.001")
-    summary = run(job_of(sequence, folder_source(sequence, tmp_path / "maps", CONFIG)), tmp_path / "out")
+    summary = run(job_of(sequence, folder_source(sequence, tmp_path / "maps")), tmp_path / "out")
     assert summary["frames"]["done"] == 3
     assert "does not show the whole image" in next(iter(summary["frames"]["skipped"]))
 
@@ -308,10 +305,9 @@ def test_the_depth_of_a_run_as_maps_of_another_gives_the_same(path, tmp_path):
     """A network's cropped view, once from the network and once from its stored maps and their intrinsics."""
     preprocess = Preprocess(resize_height=40, crop=(30, 40), size=(24, 36))
     sequence = open_sequence(path)
-    pipeline = UncertainDepth(Brightness(), CONFIG, preprocess=preprocess)
-    first = run(job_of(sequence, NetworkSource(pipeline, torch.device("cpu"), {})), tmp_path / "first")
+    first = run(job_of(sequence, networks(Brightness(), preprocess=preprocess)), tmp_path / "first")
     K = first["prediction"]["intrinsics"]
-    source = folder_source(sequence, tmp_path / "first" / "frames", CONFIG, intrinsics=K)
+    source = folder_source(sequence, tmp_path / "first" / "frames", intrinsics=K)
     second = run(job_of(sequence, source), tmp_path / "second")
     assert second["metrics"] == first["metrics"]
     for name in range(7, 13):
@@ -468,6 +464,7 @@ run(network_job(Path(sys.argv[1]), *networks), sys.argv[2])
 """
 
 
+@pytest.mark.slow
 def test_sigkill_loses_the_frame_in_hand_only(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(out)], cwd=TESTS, check=False)

@@ -8,21 +8,20 @@ import json
 import numpy as np
 import pytest
 import torch
-from runs import Brightness, job_of, outputs, read_summary
+from runs import Brightness, job_of, networks, outputs, read_summary
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.commands.run_job import job_from
-from ufmstar_torch.eval.engine import run_anchors
-from ufmstar_torch.eval.engine.run_maps import MapSource, PredictedMap
-from ufmstar_torch.eval.engine.run_source import NetworkSource
+from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.report.outputs import Finished
 from ufmstar_torch.eval.report.panels import fit_scales, map_columns
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.results.folder import FolderError
+from ufmstar_torch.eval.results.journal import why_none
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.models import Preprocess
@@ -60,7 +59,7 @@ def too_far(frame, stop_at=None):
 
 
 def map_job(sequence, config=ON, read=too_far, **options):
-    return job_of(sequence, MapSource(read, config, CPU, {"maps": "30 % too far"}), **options)
+    return job_of(sequence, MapSource(read, {"maps": "30 % too far"}), config=config, **options)
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +115,8 @@ def test_a_run_with_maps_equals_a_loop_by_hand(tour, finished):
 
 def test_a_run_with_a_network_equals_a_loop_by_hand(tour, tmp_path):
     preprocess = Preprocess(size=(60, 80))
-    pipeline, by_hand = (UncertainDepth(Brightness(), ON, preprocess=preprocess) for _ in range(2))
-    run(job_of(tour, NetworkSource(pipeline, CPU, {})), tmp_path / "out")
+    by_hand = UncertainDepth(Brightness(), ON, preprocess=preprocess)
+    run(job_of(tour, networks(Brightness(), preprocess=preprocess), config=ON), tmp_path / "out")
     tracker = LandmarkTracker()
     for frame in tour:
         K = torch.from_numpy(frame.intrinsics)
@@ -187,7 +186,7 @@ def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
     ],
 )
 def test_why_a_frame_has_none(counts, why):
-    assert why in run_anchors.why_none(*counts)
+    assert why in why_none(*counts)
 
 
 def test_a_frame_with_a_bad_pose_does_not_spoil_the_tracks(tour, tmp_path):
@@ -216,14 +215,14 @@ def test_a_stopped_run_goes_on_with_the_same_tracks(tour, finished, tmp_path, at
     assert outputs(out) == outputs(finished[0])
 
 
-def test_only_a_run_with_anchors_goes_on_with_anchors(tour, finished, tmp_path):
+def test_only_a_run_with_anchors_goes_on_with_anchors(tour, finished, tmp_path, monkeypatch):
     run(map_job(tour, OFF, frames=slice(2)), tmp_path / "out")
     with pytest.raises(FolderError, match=r"other input: source.anchors was null, now .tracked"):
         run(map_job(tour, frames=slice(2)), tmp_path / "out", resume=True)
-    job = map_job(tour)
-    job.source.identity["tracker"]["window"] = 9
-    with pytest.raises(FolderError, match=r"other input: source.tracker.window was 10, now 9"):
-        run(job, finished[0], resume=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(TrackerConfig, "to_dict", lambda config: {**dataclasses.asdict(config), "window": 9})
+        with pytest.raises(FolderError, match=r"other input: source.tracker.window was 10, now 9"):
+            run(map_job(tour), finished[0], resume=True)
 
 
 # ---- the command ----
@@ -275,7 +274,7 @@ def test_images_and_opencv_are_needed(tour, monkeypatch, tmp_path):
     with pytest.raises(ValueError, match=r"--anchors tracks corners of images, of which the sequence .* has none"):
         job_from(options)
     monkeypatch.setattr("ufmstar_torch.eval.commands.run_job.open_sequence", lambda *_, **__: tour)
-    monkeypatch.setattr(run_anchors, "find_spec", lambda _: None)
+    monkeypatch.setattr("ufmstar_torch.eval.commands.run_job.find_spec", lambda _: None)
     with pytest.raises(ModuleNotFoundError, match=r"--anchors needs OpenCV: pip install 'ufmstar-torch\[eval\]'"):
         job_from(options)
 

@@ -10,8 +10,8 @@ import pytest
 from layouts import truncate
 
 from scenes import look
-from ufmstar_torch.eval.check.alignment import alignment, depth_edges
 from ufmstar_torch.eval.check.check import check_sequence
+from ufmstar_torch.eval.check.depth_image_fit import depth_edges, depth_image_fit
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
 
@@ -142,7 +142,7 @@ def test_depth_edges_lie_on_the_near_side_and_planes_have_none():
     step[:, 33:] = 0  # nothing known on one side: no edge can be told
     assert depth_edges(step)[:, 30:].sum() == 0
     assert not depth_edges(np.zeros((40, 60))).any()
-    assert np.isnan(alignment([(np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60)))]).quality)
+    assert np.isnan(depth_image_fit([(np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60)))]).quality)
 
 
 def test_unregistered_depth_is_flagged():
@@ -153,15 +153,15 @@ def test_unregistered_depth_is_flagged():
     truth = layouts.truth(K_color, 8, size)
     T_depth_color = np.eye(4)
     T_depth_color[0, 3] = 0.025
-    good = alignment(zip(truth.images, truth.depths, strict=True))
+    good = depth_image_fit(zip(truth.images, truth.depths, strict=True))
     assert good.quality > 0.8
     unregistered = [register_depth(d, K_color, K_depth, T_depth_color, size) for d in truth.depths]
-    bad = alignment(zip(truth.images, unregistered, strict=True))
+    bad = depth_image_fit(zip(truth.images, unregistered, strict=True))
     assert bad.quality < 0.25
     assert bad.zoom == pytest.approx(525 / 585, abs=0.03)
     assert bad.shift_x < 0
     moved = [np.roll(depth, (6, -8), axis=(0, 1)) for depth in truth.depths]  # what undoes it is found
-    found = alignment(zip(truth.images, moved, strict=True))
+    found = depth_image_fit(zip(truth.images, moved, strict=True))
     assert found.quality < 0.25
     assert found.zoom == pytest.approx(1, abs=0.03)
     assert found.shift_x - good.shift_x == pytest.approx(8, abs=2)  # steps of 2 px

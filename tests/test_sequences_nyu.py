@@ -14,7 +14,6 @@ from ufmstar_torch.eval.commands.run_job import job_from
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.models.preprocess import Preprocess
@@ -132,7 +131,6 @@ def test_an_evaluation_refuses_rows_that_compare_views(written):
             open_sequence(written[0]),
             rows,
             {"aleatoric": None},
-            cache=PredictionCache(None),
             device=torch.device("cpu"),
         )
 

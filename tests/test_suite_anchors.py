@@ -13,9 +13,9 @@ from tiny_suite import CPU, base_network, evaluate, row, write_network
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
-from ufmstar_torch.eval.engine.anchor_source import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
-from ufmstar_torch.eval.engine.estimator import make_estimator, ufm_star_config
-from ufmstar_torch.eval.engine.predicted import Predicted
+from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
+from ufmstar_torch.eval.engine.estimators import make_estimator, ufm_star_config
+from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
@@ -45,7 +45,7 @@ def networks(tmp_path_factory):
 
 
 class Biased:
-    """The truth, but what is farther than 2 m is put 40 % too far; as much of a BaseNetwork as is asked of it."""
+    """The truth, but what is farther than 2 m is put 40 % too far; as much of a ``DepthSource`` as is asked of it."""
 
     digest, passes, needs_image, cacheable = "biased", 1, False, False
 
@@ -54,7 +54,7 @@ class Biased:
 
     def one(self, frame, n):
         depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
-        return Predicted(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
+        return Prediction(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
 
 
 def in_memory(sequence, part):
@@ -235,9 +235,9 @@ def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
 
     def drawn(count, seed=0):
         source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)
-        found, ms = source.of(frame, frame.T_world_cam, p, truth)
-        assert ms is None
-        return found
+        found = source.of(frame, frame.T_world_cam, p, truth)
+        assert found.ms is None
+        return found.anchors
 
     few, many, default = drawn(20), drawn(300), drawn(None)
     assert [a.depth.shape[1] for a in (few, many, default)] == [20, 300, 100]
@@ -258,10 +258,10 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
         pair = []
         for size, own in zip((0.0, 0.5), tracks, strict=True):
             source = AnchorSource(Setting(anchors="tracked", track_noise=size), own)
-            anchors, ms = source.of(frame, frame.T_world_cam, p, np.zeros(p.size, np.float32))
-            assert isinstance(anchors, Anchors)
-            assert ms > 0
-            pair.append(anchors)
+            found = source.of(frame, frame.T_world_cam, p, None)
+            assert isinstance(found.anchors, Anchors)
+            assert found.ms > 0
+            pair.append(found.anchors)
         assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know of the noise"
         clean.append(torch.cat([pair[0].pixel, pair[0].depth[..., None]], -1)[0])
         noisy.append(torch.cat([pair[1].pixel, pair[1].depth[..., None]], -1)[0])
@@ -277,8 +277,8 @@ def test_rows_of_the_same_poses_share_a_tracker():
     others = [row(NAME, anchors="tracked", rotation_noise=1.0, seed=seed) for seed in (0, 1)]
     sources = anchor_sources([row(NAME), *alike, *others, row(NAME, anchors="tracked", skip=1)])
     assert row(NAME) not in sources
-    assert sources[alike[0]]._tracks is sources[alike[1]]._tracks
-    assert len({id(source._tracks) for source in sources.values()}) == 4
+    assert sources[alike[0]].tracks is sources[alike[1]].tracks
+    assert len({id(source.tracks) for source in sources.values()}) == 4
 
 
 def test_tracking_needs_images(tour):

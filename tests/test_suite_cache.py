@@ -11,14 +11,8 @@ import torch
 from layouts import truncate, write_generic, write_image
 from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
 
-from ufmstar_torch.eval.engine.predicted import Predicted
-from ufmstar_torch.eval.results.cache import (
-    CacheError,
-    PredictionCache,
-    PredictionKey,
-    frame_digest,
-    sequence_digest,
-)
+from ufmstar_torch.eval.engine.predictions import Prediction, PredictionKey, frame_digest, sequence_digest
+from ufmstar_torch.eval.results.cache import CacheError, PredictionCache
 from ufmstar_torch.eval.sequences import open_sequence
 
 ROWS = [row(name) for name in ("Ensemble", "UfM*-Ensemble", "UfM*-MCD", "MC-Dropout", "Evidential", "UfM-DepthOnly")]
@@ -40,7 +34,7 @@ def networks(tmp_path_factory):
 def maps(seed=0):
     depth, a, e = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(seed)).unbind()
     depth[0, 0], a[1, 1], e[2, 2] = torch.nan, torch.inf, -0.0
-    return Predicted(depth, a, e, torch.arange(9.0, dtype=torch.float64).reshape(3, 3) / 7)
+    return Prediction(depth, a, e, torch.arange(9.0, dtype=torch.float64).reshape(3, 3) / 7)
 
 
 @pytest.mark.parametrize("left_out", [(), ("aleatoric",), ("aleatoric", "epistemic")])
@@ -174,11 +168,3 @@ def test_digests_tell_frames_and_sequences_apart(tmp_path):
     changed = [replace(frame, intrinsics=moved), replace(frame, index=2), replace(frame, image=frame.image[:, ::-1])]
     assert len({frame_digest(f) for f in [frame, *changed]}) == 4
     assert frame_digest(replace(frame, name="x", depth=None)) == frame_digest(frame)
-
-
-def test_no_folder_keeps_nothing(path, networks, tmp_path):
-    cache = PredictionCache(None)
-    cache.store(KEY, maps())
-    assert cache.load(KEY, CPU) is None
-    evaluate(open_sequence(path), ROWS[:1], networks, cache)
-    assert (cache.hits, cache.misses, cache.damaged) == (0, 0, 0)

@@ -13,10 +13,12 @@ from scipy.stats import chi2, kstest
 from tiny_suite import row
 
 from ufmstar_torch.eval.bench.measure import _obstacle
-from ufmstar_torch.eval.engine.anchor_source import anchor_sources
+from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.confident import references
-from ufmstar_torch.eval.engine.predicted import Predicted
-from ufmstar_torch.eval.engine.row_run import RowRun
+from ufmstar_torch.eval.engine.estimators import Estimate
+from ufmstar_torch.eval.engine.maps import own_depth
+from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import Setting, default_of, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
@@ -179,21 +181,19 @@ class Poses:
 
     def update(self, predicted, T_world_cam, anchors=None):
         self.given.append(T_world_cam.numpy())
-
-    def state(self):
-        return {}
+        return Estimate(predicted.depth, None, predicted.depth > 0)
 
 
 def test_a_row_sees_drift_and_noise_on_top_of_it():
     setting = Setting(rotation_drift=0.5, translation_drift=0.02, translation_noise=0.1, seed=3)
-    run, blank = RowRun(row(NAME, **setting.to_dict()), torch.device("cpu"), []), np.zeros((2, 2), np.float32)
-    run.estimator = Poses()
-    one = Predicted(torch.ones(2, 2), None, None, torch.eye(3, dtype=torch.float64))
+    poses = Poses()
+    runner = RowRunner("drift", own_depth(), poses, setting=setting)
+    one = Prediction(torch.ones(2, 2), None, None, torch.eye(3, dtype=torch.float64))
     for i in range(0, 20, 4):
-        run.estimate(Frame(i, str(i), None, None, WALK[i], np.eye(3)), one, blank)
+        taken = runner.take(Frame(i, str(i), None, None, WALK[i], np.eye(3)), one, None)
     expected = [perturbed(T, setting, i) for T, i in zip(drifted(BOTH, range(0, 20, 4)), range(0, 20, 4), strict=True)]
-    np.testing.assert_allclose(np.stack(run.estimator.given), np.stack(expected), atol=1e-12)
-    np.testing.assert_array_equal(run.last[1], run.estimator.given[-1])
+    np.testing.assert_allclose(np.stack(poses.given), np.stack(expected), atol=1e-12)
+    np.testing.assert_array_equal(taken.T_world_cam, poses.given[-1])
 
 
 def test_rows_of_one_drift_share_a_tracker_and_a_reference():
@@ -207,8 +207,8 @@ def test_rows_of_one_drift_share_a_tracker_and_a_reference():
         for seed in (0, 1)
     ]
     sources = anchor_sources([*alike, *others, row(NAME, anchors="tracked")])
-    assert sources[alike[0]]._tracks is sources[alike[1]]._tracks
-    assert len({id(source._tracks) for source in sources.values()}) == 6
+    assert sources[alike[0]].tracks is sources[alike[1]].tracks
+    assert len({id(source.tracks) for source in sources.values()}) == 6
     plain, drift = (row("UfM-Ensemble-100K", **values) for values in ({}, {"rotation_drift": 0.1}))
     rows = [plain, drift, row("UfM*-Ensemble", rotation_drift=0.1), row("UfM*-Ensemble", anchors="truth", seed=7)]
     assert references(rows[2], rows) == [drift]

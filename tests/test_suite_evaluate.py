@@ -12,7 +12,8 @@ from layouts import truncate, write_generic, write_tum
 from tiny_suite import CPU, base_network, evaluate, row, same, write_networks
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.engine.evaluate import SequenceError, Stopped
+from ufmstar_torch.eval.engine.evaluate import SequenceError
+from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics

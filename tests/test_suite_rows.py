@@ -15,8 +15,8 @@ from scipy.stats import kstest
 from tiny_suite import CPU, base_network, row, write_network, write_networks
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.engine.estimator import make_estimator, ufm_star_config
-from ufmstar_torch.eval.engine.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.engine.estimators import make_estimator, ufm_star_config
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.perturb import perturbed, rotation, selects
 from ufmstar_torch.eval.methods.setting import Setting
 
@@ -279,7 +279,7 @@ def test_digests_tell_networks_apart(files, loaded):
 def test_labels(files, loaded):
     assert loaded["ensemble"].label == "FastDepth"
     assert base_network("depth_only=ground-truth").label == "ground truth"
-    assert BaseNetwork(NetworkChoice.parse(files["evidential"], "Mine"), CPU).label == "Mine"
+    assert NetworkChoice.parse(files["evidential"], "Mine").load(CPU).label == "Mine"
 
 
 def test_what_was_run_is_told_in_plain_values(loaded):

@@ -53,12 +53,10 @@ def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
 
 
 def test_the_real_judge_gives_what_it_gives_when_called_alone(rooms, tmp_path):
-    from ufmstar_torch.eval.results.cache import PredictionCache
-
     job = replace(job_on(rooms, tmp_path / "out"), frames=slice(1, None, 2), examples=1)
     go(job, evaluate_sequence)
     networks = job.load(torch.device("cpu"))
-    how = {"cache": PredictionCache(None), "device": torch.device("cpu"), "limit": job.frames}
+    how = {"device": torch.device("cpu"), "limit": job.frames}
     for item in job.items:
         for result in evaluate_sequence(item.open(), job.suite.rows, networks, **how):
             record = folder_of(job).records(item)[result.row.slug]

@@ -75,8 +75,10 @@ def test_every_method_of_the_paper_is_a_preset_of_both_architectures():
 
 
 def test_the_table_has_a_row_for_every_preset():
-    lines = table().splitlines()
+    text, sources = table().split("\n\n")
+    lines = text.splitlines()
     assert [line.split()[0] for line in lines] == ["preset", *PRESETS]
+    assert re.search("From the paper .*size, epochs, .*Ours, .*learning rate", sources, re.DOTALL)
     row = dict(zip(re.split(r"\s{2,}", lines[0]), re.split(r"\s{2,}", lines[6]), strict=True))
     assert (row["preset"], row["members"], row["learning rate"]) == ("monodepth2-batch-ensemble", "10", "0.0001 cosine")
 
@@ -213,7 +215,8 @@ def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
     """Twelve scenes, the red half of each with noise of .9 m, twice for training and once more for validation.
 
     Over ten seeds, the likelihood's gain was .45 nat at least (.51 in the median), the error of the depth .56 of the
-    depth's deviation at most (.28), sigma's ratio 2.7 at least (4.1) and the fall of the loss .71 at least (.83).
+    depth's deviation at most (.28), sigma's ratio 2.7 at least (4.1) and the fall of the loss .71 at least (.83); with
+    ATEN_CPU_CAPABILITY=avx2 and default and ONEDNN_MAX_CPU_ISA=AVX2, three seeds each, nothing came nearer to a limit.
     """
     size = (64, 64)
     folders = [str(write_frames(tmp_path / f"walk{n}", 12, size, noise=0.9, seed=n)) for n in (1, 2, 3)]
@@ -298,6 +301,7 @@ def test_every_method_trains(frames, tmp_path, network):
     assert len(load_trained(tmp_path / "out" / WEIGHTS)) == network.get("members", 1)
 
 
+@pytest.mark.slow
 def test_a_resnet_trains(frames, tmp_path):
     network = NetworkSpec(architecture="monodepth2", layers=18, size=(64, 64), preprocess="resize")
     summary = fit(tiny_job(frames, tmp_path / "out", replace(ONE_STEP, network=network, average=0.0)))
@@ -510,7 +514,7 @@ def test_only_the_named_part_is_trained(frames, tmp_path):
 
 def test_a_part_that_is_not_there_is_named():
     network = build_network(SPEC)
-    with pytest.raises(ValueError, match=r"no parameter begins with 'tail'; there are backbone\.decoder, "):
+    with pytest.raises(ValueError, match=r"no parameter begins with 'tail'; expected one of backbone\.decoder, "):
         train_only(network, ["head", "tail"])
     assert train_only(network, ["head"]) == sum(p.numel() for p in network.head.parameters())
 

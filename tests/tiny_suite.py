@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
-from ufmstar_torch.eval.engine.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
 CPU = torch.device("cpu")
@@ -56,7 +55,7 @@ def write_networks(folder):
 
 def base_network(text, **options):
     """What a user typed, loaded."""
-    return BaseNetwork(NetworkChoice.parse(text), CPU, **options)
+    return NetworkChoice.parse(text).load(CPU, **options)
 
 
 def row(name, **setting):
@@ -64,9 +63,9 @@ def row(name, **setting):
     return Row(Method.parse(name), Setting(**setting))
 
 
-def evaluate(sequence, rows, networks, cache=None, **options):
+def evaluate(sequence, rows, networks, store=None, **options):
     """``evaluate_sequence`` on the CPU; the results by the row's slug."""
-    results = evaluate_sequence(sequence, rows, networks, cache=cache or PredictionCache(None), device=CPU, **options)
+    results = evaluate_sequence(sequence, rows, networks, store=store, device=CPU, **options)
     assert [result.row for result in results] == list(rows)
     return {result.row.slug: result for result in results}
 

@@ -1,4 +1,4 @@
-"""The order of training samples: a pure function of seed and epoch, shared by processes, entered anywhere."""
+"""The order of training samples: a function of seed and epoch, divided among processes, entered at any batch."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class EpochBatches(Sampler[list[SampleKey]]):
 
 
 class EpochLoader:
-    """A ``DataLoader`` that knows how far it got: what a trainer iterates over.
+    """A ``DataLoader`` whose position can be stored: what a trainer iterates over.
 
     Lightning calls ``sampler.set_epoch`` at the start of every epoch and stores ``state_dict`` in its
     checkpoints, so a run that was killed inside an epoch goes on with the batch after the last one of its
@@ -99,7 +99,7 @@ class EpochLoader:
         pin_memory: for copies to a GPU.
     """
 
-    batch_sampler: None = None  # Lightning asks for it wherever there is a ``sampler``
+    batch_sampler: None = None  # Lightning reads it from every loader with a ``sampler``
 
     def __init__(self, dataset: SampleDataset, batches: EpochBatches, *, workers: int = 0, pin_memory: bool = False):
         self.dataset, self.batches = dataset, batches
@@ -121,7 +121,7 @@ class EpochLoader:
         return self
 
     def set_epoch(self, epoch: int) -> None:
-        """Go over that epoch; from its beginning, unless a loaded state says where in it to start."""
+        """Iterate over that epoch: from its beginning, or from a loaded state's batch."""
         if epoch != self.batches.epoch:
             self.batches.set_epoch(epoch)
 

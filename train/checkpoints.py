@@ -45,7 +45,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """Replace ``path`` durably.
 
         Raises:
-            OSError: a full disk, say; the checkpoint before it is kept.
+            OSError: for example a full disk; the checkpoint before it is kept.
         """
         target = Path(path)
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -42,7 +42,7 @@ class Part:
             raise ValueError(f"a part must be START:STOP in frames or percent (0:70%, 100:400), got {text!r}")
         part = cls(float(found[1]), float(found[3]), bool(found[2]), bool(found[4]))
         if part.start_share == part.stop_share and part.start >= part.stop:
-            raise ValueError(f"a part must end behind its start, got {text!r}")
+            raise ValueError(f"a part must end after its start, got {text!r}")
         return part
 
     def frames(self, length: int) -> range:
@@ -78,7 +78,7 @@ class DataConfig(Checked):
         paths: nyu: the folder with ``train`` and ``val``; sequences: one or more; tour: none.
         validation_paths: sequences to validate on; empty = the held-back part of ``paths``.
         part: part of each sequence to train on, ``START:STOP`` in frames or percent.
-        validation_part: part of each sequence that is held back. A gap behind ``part`` keeps frames that show the
+        validation_part: part of each sequence that is held back. A gap after ``part`` keeps frames that show the
             same thing out of both.
         tours: number of rendered tours to train on.
         validation_tours: number of other tours to validate on.

@@ -56,7 +56,7 @@ class Examples(pl.Callback):
 def draw_examples(
     path: Path, network: torch.nn.Module, preprocess: Preprocess, samples: list[tuple[str, Sample]], title: str
 ) -> None:
-    """Write a sheet of what a network says of some samples.
+    """Write a sheet of a network's predictions for some samples.
 
     Args:
         path: of the PNG.

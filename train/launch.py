@@ -1,8 +1,8 @@
 """Several processes that train together: the first prepares the folder, the others wait until it has.
 
 A launcher (torchrun, SLURM, one command per computer) starts processes in any order, and their process group exists
-only once Lightning trains. Until then they meet at the store of torch.distributed's rendezvous. It belongs to this
-launch, so that nothing an earlier one left can be mistaken for the first process's word.
+only once Lightning trains. Until then they communicate through the store of torch.distributed's rendezvous. It belongs
+to this launch, so that no message of an earlier launch is read.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def prepared_by_first(
 
     Args:
         prepare: entered by the first process alone.
-        trainer: knows how many processes there are, and where they meet.
+        trainer: of this process; its rank, the number of processes and their address are used.
         out: the folder that is prepared, for messages.
         wait: longest time [s] that the others wait.
 
@@ -56,20 +56,20 @@ def prepared_by_first(
         ) from error
     with ExitStack() as held:
         if first:
-            told = "the first process was interrupted"
+            message = "the first process was interrupted"
             try:
                 held.enter_context(prepare)
-                told = _READY
+                message = _READY
             except (OSError, ValueError) as error:
-                told = str(error)
+                message = str(error)
                 raise
             finally:
                 if store is not None:
-                    store.set(key, told)
-        elif store is not None and (told := store.get(key).decode()) != _READY:
-            raise FolderError(f"the first process could not prepare the folder: {told}")
+                    store.set(key, message)
+        elif store is not None and (message := store.get(key).decode()) != _READY:
+            raise FolderError(f"the first process could not prepare the folder: {message}")
         elif not out.is_dir():
-            raise FolderError(f"--out {out} is not there: all machines must see the folder of the first process")
+            raise FolderError(f"--out {out} does not exist: all machines must see the folder of the first process")
         yield
 
 
@@ -77,7 +77,7 @@ def _meet(trainer: pl.Trainer, wait: float) -> dist.TCPStore:
     """The store where process group and this meet: torchrun's own, or else one that the first process opens."""
     environment = cast(ParallelStrategy, trainer.strategy).cluster_environment
     if environment is None:
-        raise ValueError(f"{type(trainer.strategy).__name__} says of no environment where its processes meet")
+        raise ValueError(f"{type(trainer.strategy).__name__} does not state the address of its processes")
     # A port that Lightning has chosen for this launch: what it starts later, and its process group, take the same.
     os.environ.setdefault("MASTER_PORT", str(environment.main_port))
     served = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == str(True)
@@ -93,6 +93,6 @@ def _meet(trainer: pl.Trainer, wait: float) -> dist.TCPStore:
 
 
 def _key(store: dist.Store, rank: int) -> str:
-    """Where the word stands: a new one for every restart by torchrun, and every training of the same processes."""
+    """The key of the first process's message: a new one for every restart by torchrun, and every training."""
     attempt = f"ufmstar/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}"
     return f"{attempt}/prepared/{store.add(f'{attempt}/trainings/{rank}', 1)}"

@@ -1,8 +1,8 @@
 """Training losses: per-pixel negative log likelihoods and their mean over the valid pixels of a batch.
 
 Gaussian: Kendall and Gal 2017, Eq. 8. Evidential: Amini et al. 2020, Eq. 8 to 10; torch-uncertainty's ``DERLoss`` is
-not used, since on pixels it divides by the wrong number and knows no mask. Everything is computed at least in
-single precision, whatever autocast says: the square of an error leaves half precision at 256 m, and bfloat16 has
+not used, since on pixels it divides by the wrong number and takes no mask. Everything is computed at least in
+single precision, also under autocast: the square of an error leaves half precision at 256 m, and bfloat16 has
 three digits.
 """
 
@@ -18,7 +18,7 @@ from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth
 
 # [1] Weight of the evidence on wrong pixels: the regulariser's lambda.
 EVIDENCE_WEIGHT = 0.01
-# [log m^2] Beyond +-40 (2 nm and 500,000 km as standard deviations) the loss goes on as at the limit: there
+# [log m^2] Beyond +-40 (2 nm and 500,000 km as standard deviations) the loss continues as at the limit:
 # exp(-s) times the square of an error of 10 km is still far from single precision's largest number.
 _LOG_VARIANCE_LIMIT = 40.0
 # [m^2] Added to squared errors before their logarithm; it is below the square of any distance in the world, and
@@ -44,7 +44,7 @@ def loss_of(
 
     Args:
         distribution: parameters, each [B, H, W].
-        target: [B, H, W] ground truth depth [m]; what stands at other pixels does not matter.
+        target: [B, H, W] ground truth depth [m]; values at other pixels are not used.
         valid: [B, H, W] bool, True = use. Of these, pixels whose target is not finite and positive are
             left out as well.
         evidence_weight: lambda of :func:`evidential_loss`.
@@ -80,7 +80,7 @@ def loss_sums(
     usable = valid & target.isfinite() & (target > 0)
 
     def at_valid(values: Tensor, elsewhere: float = 1.0) -> Tensor:
-        # Before the loss, not behind it: a gradient of NaN times 0 is NaN.
+        # Before the loss, not after it: a gradient of NaN times 0 is NaN.
         return torch.where(usable, values.to(torch.promote_types(values.dtype, torch.float32)), elsewhere)
 
     # Autocast leaves all that follows in the type it is in: it is about matrix products and convolutions.

@@ -64,7 +64,7 @@ class TrainingModule(pl.LightningModule):
 
     @property
     def result(self) -> DepthNetwork:
-        """The network to keep: the running mean where there is one."""
+        """The network to keep: the running mean if there is one."""
         kept: DepthNetwork = self.network if self.averaged is None else self.averaged
         return kept
 
@@ -87,7 +87,7 @@ class TrainingModule(pl.LightningModule):
         torch.manual_seed(step_seed(self.seed, self.global_rank, self.global_step))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """The loss of the whole batch, whatever processes it is divided among.
+        """The loss of the whole batch, however many processes it is divided among.
 
         The value returned is this process's sum over the batch's number of pixels, times the number of processes:
         its gradient, averaged over processes as DistributedDataParallel does, is that of the mean over all pixels.
@@ -113,7 +113,7 @@ class TrainingModule(pl.LightningModule):
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Raise NonFiniteLossError where a finite loss has a gradient that is not, before it spoils the weights."""
         if self.trainer.precision == "16-mixed":
-            return  # there such steps are left out, and the loss is scaled down
+            return  # with it such steps are skipped, and the loss is scaled down
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         if gradients and not math.isfinite(get_total_norm(gradients)):
             raise NonFiniteLossError(self._blame("gradient", self._batch_idx))

@@ -46,10 +46,9 @@ class NyuFrames:
         if part not in PARTS:
             raise ValueError(f"part must be 'train' or 'val', got {part!r}")
         folder = Path(root) / part
-        found = part_files(folder)
-        if not found:
+        self.files = tuple(part_files(folder))
+        if not self.files:
             raise FileNotFoundError(f"{folder} holds no <scene>/*.h5: expected FastDepth's layout of NYU Depth V2")
-        self.files = tuple(found)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -115,7 +114,7 @@ def convert_labelled(
         if images.ndim != 4 or images.shape[1] != 3 or depths.shape != (images.shape[0], *images.shape[2:]):
             raise ValueError(f"{mat}: images {images.shape} and {key} {depths.shape} must be [N, 3, W, H], [N, W, H]")
         if len(scenes) != len(images):
-            raise ValueError(f"{mat}: there are {len(scenes)} scenes for {len(images)} images")
+            raise ValueError(f"{mat} has {len(scenes)} scenes for {len(images)} images")
         validation = _validation(scenes, splits)
         for i, scene in enumerate(scenes):
             path = Path(out) / ("val" if i in validation else "train") / scene / f"{i + 1:05d}.h5"

@@ -123,6 +123,11 @@ PRESETS: dict[str, Recipe] = {
 } | {"demo": _DEMO}
 
 
+_SOURCES = """From the paper (Section V-A): method, members, size, epochs, decay, dropout, Adam's betas (.9, .999), and
+the ResNet50 encoder's start from ImageNet (--init imagenet). Ours, since the paper does not state them: batch,
+learning rate and its schedule. The preset demo is ours."""
+
+
 def preset(name: str) -> Recipe:
     """A named recipe.
 
@@ -135,7 +140,7 @@ def preset(name: str) -> Recipe:
 
 
 def table() -> str:
-    """The presets as a table, one a row."""
+    """The presets as a table, one a row, and which of their values are the paper's."""
     columns = ("preset", "method", "members", "widths", "size", "epochs", "batch", "learning rate", "decay", "dropout")
     rows = [columns]
     for name, r in PRESETS.items():
@@ -144,7 +149,7 @@ def table() -> str:
         widths = str(n.widths) if n.architecture == "fastdepth" else f"ResNet{n.layers}"
         training = (f"{r.epochs}", f"{r.batch_size}", f"{r.learning_rate:g} {r.schedule}", f"{r.weight_decay:g}")
         rows.append((name, n.method, f"{members}", widths, size, *training, f"{n.dropout:g}" if n.dropout else "-"))
-    return text_table(rows)
+    return f"{text_table(rows)}\n\n{_SOURCES}"
 
 
 def text_table(rows: Sequence[Sequence[str]], justify: Callable[[str, int], str] = str.ljust) -> str:

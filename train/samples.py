@@ -1,4 +1,4 @@
-"""Training samples: where frames come from, what the network gets of them, and what happens to broken files."""
+"""Training samples: frames as a network's input with their ground truth, and the treatment of broken files."""
 
 from __future__ import annotations
 
@@ -93,13 +93,13 @@ class SampleDataset(Dataset[Sample]):
         augmentation: None = none, as for validation.
         seed: of the augmentation.
         on_bad_file: "raise": the first broken file stops the run. "skip": the next readable frame takes its
-            place (after the last comes the first), whoever asks and in whatever order. For training, that frame
+            place (after the last comes the first), in every process and in every order. For training, that frame
             is then seen twice in an epoch; for validation (``evaluate``), it counts once: its copy has no valid
             pixel.
         evaluate: see ``on_bad_file``.
 
     Raises:
-        ValueError: an empty source, another word for ``on_bad_file``.
+        ValueError: an empty source, another value of ``on_bad_file``.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class SampleDataset(Dataset[Sample]):
             raise ValueError("source must hold at least one frame, got none")
         self.source, self.preprocess, self.augmentation = source, preprocess, augmentation
         self.seed, self.on_bad_file, self.evaluate = seed, on_bad_file, evaluate
-        # Shared memory, so that what a worker process finds is known to the one that asks.
+        # In shared memory, so that the calling process sees the broken files that its workers meet.
         self._bad = torch.zeros(len(source), dtype=torch.bool).share_memory_()
 
     def __len__(self) -> int:
@@ -138,9 +138,9 @@ class SampleDataset(Dataset[Sample]):
         epoch, index, counts = SampleKey(*key) if isinstance(key, tuple) else SampleKey(0, key)
         if not 0 <= index < len(self):
             raise IndexError(f"index must lie in [0, {len(self)}), got {index}")
-        raw, found = self._readable(index)
+        raw, number = self._readable(index)
         sample = make_sample(raw, self.preprocess, self.augmentation, (self.seed, epoch, index))
-        if not counts or (self.evaluate and found != index):
+        if not counts or (self.evaluate and number != index):
             sample["valid"] = torch.zeros_like(sample["valid"])
         return sample
 

@@ -68,7 +68,7 @@ def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
     for prefix in prefixes:
         if not any(name.startswith(prefix) for name in names):
             parts = sorted({".".join(name.split(".")[:2]) for name in names})
-            raise ValueError(f"trainable: no parameter begins with {prefix!r}; there are {', '.join(parts)}")
+            raise ValueError(f"trainable: no parameter begins with {prefix!r}; expected one of {', '.join(parts)}")
     for name, parameter in network.named_parameters():
         parameter.requires_grad_(not prefixes or name.startswith(tuple(prefixes)))
     return sum(p.numel() for p in network.parameters() if p.requires_grad)

@@ -208,7 +208,7 @@ def _rendered(folder: Path, seeds: list[int], settings: TourSettings, workers: i
     if workers == 1:
         yield from map(task, seeds)
         return
-    # "spawn" as for the loader's workers; each process renders with one thread, there is one for each core.
+    # "spawn" as for the loader's workers; each process renders with one thread.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         yield from pool.map(task, seeds)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -58,7 +59,74 @@ class UncertainPrediction:
         return self.ufm.disagreement
 
 
-class UncertainDepth(nn.Module):
+class NetworksInTurn(nn.Module):
+    """Depth networks that take the same input: one of them per image, in turn, or all of them on every image.
+
+    Nothing is remembered between images: the caller counts them and asks :meth:`turn`. The networks stay in eval mode,
+    whatever the caller's training flag is.
+
+    Args:
+        networks: one network or a sequence of them. Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`.
+        samples: passes of a single stochastic network that :meth:`every` combines; None: one pass of each network.
+        preprocess: maps image and intrinsics to the networks' input; None passes both through.
+
+    Raises:
+        ValueError: no network, or ``samples`` of several.
+    """
+
+    def __init__(
+        self,
+        networks: nn.Module | Sequence[nn.Module],
+        *,
+        samples: int | None = None,
+        preprocess: Preprocess | None = None,
+    ) -> None:
+        super().__init__()
+        members = [networks] if isinstance(networks, nn.Module) else list(networks)
+        if not members or not all(isinstance(m, nn.Module) for m in members):
+            raise ValueError("networks must be an nn.Module or a non-empty sequence of them")
+        if samples is not None and (samples < 1 or len(members) > 1):
+            raise ValueError(f"samples must be at least 1 and goes with one network, got {samples} of {len(members)}")
+        self.networks = nn.ModuleList(members).eval()
+        self.samples = samples
+        self.preprocess = preprocess
+
+    @property
+    def passes(self) -> int:
+        """Inferences that :meth:`every` takes."""
+        return len(self.networks) if self.samples is None else self.samples
+
+    def turn(self, images: int) -> int:
+        """The member whose turn it is after ``images`` images, both counted from 0."""
+        return images % len(self.networks)
+
+    def prepare(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+        """The networks' input [B, 3, h, w] and its intrinsics [B, 3, 3] [px]."""
+        return (image, intrinsics) if self.preprocess is None else self.preprocess(image, intrinsics)
+
+    def member(self, x: Tensor, n: int) -> DepthPrediction:
+        """One inference of member ``n``, or sample ``n`` of a single network, on the prepared input.
+
+        Raises:
+            TypeError: the network returns something else than a :class:`DepthPrediction`.
+        """
+        prediction = self.networks[n % len(self.networks)](x)
+        if not isinstance(prediction, DepthPrediction):
+            raise TypeError(f"network {n} must return a DepthPrediction, got {type(prediction).__name__}")
+        return prediction
+
+    def every(self, x: Tensor) -> DepthPrediction:
+        """All members, or samples, on the prepared input, combined (:func:`combine`)."""
+        return combine([self.member(x, n) for n in range(self.passes)])
+
+    def train(self, mode: bool = True) -> Self:
+        """The networks stay in eval mode: a prediction must not depend on the caller's training flag."""
+        super().train(mode)
+        self.networks.eval()
+        return self
+
+
+class UncertainDepth(NetworksInTurn):
     """Depth with a variance from any pretrained network(s): image, pose and intrinsics in.
 
     Args:
@@ -100,21 +168,16 @@ class UncertainDepth(nn.Module):
         samples: int | None = None,
         preprocess: Preprocess | None = None,
     ) -> None:
-        super().__init__()
-        members = [networks] if isinstance(networks, nn.Module) else list(networks)
-        if not members or not all(isinstance(m, nn.Module) for m in members):
-            raise ValueError("networks must be an nn.Module or a non-empty sequence of them")
+        single = isinstance(networks, nn.Module) or len(networks) == 1
         if mode not in ("alternate", "full"):
             raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
-        if samples is not None and (samples < 2 or len(members) > 1 or mode != "full"):
+        if samples is not None and (samples < 2 or not single or mode != "full"):
             raise ValueError("samples must be at least 2 and goes with one network in mode 'full'")
-        if mode == "full" and len(members) == 1 and samples is None:
+        if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
-        self.networks = nn.ModuleList(members).eval()
+        super().__init__(networks, samples=samples, preprocess=preprocess)
         self.ufm = UfMStar(config)
         self.mode = mode
-        self.samples = samples
-        self.preprocess = preprocess
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0
 
@@ -142,27 +205,16 @@ class UncertainDepth(nn.Module):
         """
         if image.dim() != 4 or image.shape[1] != 3:
             raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
-        K = intrinsics.expand(image.shape[0], 3, 3)
+        member = None if self.mode == "full" else self.turn(self._next)
         with torch.no_grad():
-            x, K = (image, K) if self.preprocess is None else self.preprocess(image, K)
-            member = None if self.mode == "full" else self._next % len(self.networks)
-            prediction = self._all(x) if member is None else self._one(member, x)
+            x, K = self.prepare(image, intrinsics.expand(image.shape[0], 3, 3))
+            prediction = self.every(x) if member is None else self.member(x, member)
         if anchors is not None and self.preprocess is not None:
             anchors = anchors.moved(intrinsics, K)
         a, e = prediction.aleatoric_variance, prediction.epistemic_variance
         ufm = self.ufm(prediction.depth, pose, K, a, e, valid, anchors=anchors)
         self._count(self._next + 1)
         return UncertainPrediction(prediction, ufm, K, member)
-
-    def _one(self, member: int, x: Tensor) -> DepthPrediction:
-        prediction = self.networks[member](x)
-        if not isinstance(prediction, DepthPrediction):
-            raise TypeError(f"network {member} must return a DepthPrediction, got {type(prediction).__name__}")
-        return prediction
-
-    def _all(self, x: Tensor) -> DepthPrediction:
-        members = range(len(self.networks)) if self.samples is None else [0] * self.samples
-        return combine([self._one(n, x) for n in members])
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
@@ -179,12 +231,6 @@ class UncertainDepth(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._next = int(self.image_index)
-
-    def train(self, mode: bool = True) -> UncertainDepth:
-        """The networks stay in eval mode: a prediction must not depend on the caller's training flag."""
-        super().train(mode)
-        self.networks.eval()
-        return self
 
 
 def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:

@@ -19,7 +19,8 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench.benchmark_frames import FrameSource, PosedDepth
 from ufmstar_torch.eval.bench.benchmark_step import build_up, memory
-from ufmstar_torch.eval.bench.benchmark_timing import Stopwatch, pinned_threads
+from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
+from ufmstar_torch.eval.engine.clock import CallTimes
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import tour_sequence
 
@@ -126,7 +127,7 @@ def measure_tracker(frames: Sequence[Frame], points: int) -> dict[str, Any]:
         "followed" and "landmarks" per frame; "state_bytes".
     """
     config = TrackerConfig(max_points=round(_SLOTS_PER_POINT * points))
-    whole, parts, watch = LandmarkTracker(config), _Parts(config), Stopwatch()
+    whole, parts, watch = LandmarkTracker(config), _Parts(config), CallTimes()
     results: list[Landmarks] = []
     for frame in frames:
         arguments = (_image(frame), frame.T_world_cam, frame.intrinsics)
@@ -160,7 +161,7 @@ def measure_step(built: UfMStar, frames: Sequence[PosedDepth], points: int, *, w
     """
     plain, anchored = copy.deepcopy(built), copy.deepcopy(built)
     plain.config = built.config.replace(anchored=False)
-    watch, used, rng = Stopwatch(), [], np.random.default_rng(0)
+    watch, used, rng = CallTimes(), [], np.random.default_rng(0)
     calls: dict[str, Callable[[PosedDepth, Anchors], Any]] = {
         "plain": lambda f, _: plain(f.depth, f.T_world_cam, f.intrinsics),
         "anchored": lambda f, a: anchored(f.depth, f.T_world_cam, f.intrinsics, anchors=a),

@@ -9,7 +9,7 @@ import numpy as np
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.bench.benchmark_frames import FrameSource
 from ufmstar_torch.eval.bench.benchmark_step import components_in_view, memory
-from ufmstar_torch.eval.bench.benchmark_timing import Stopwatch
+from ufmstar_torch.eval.engine.clock import CallTimes
 
 
 def measure_long_run(
@@ -33,7 +33,7 @@ def measure_long_run(
         raise ValueError(f"a long run needs at least {start + 2 * window} frames for two windows, got {frames}")
     if source.available is not None and source.available < frames:
         raise ValueError(f"a long run of {frames} frames was asked for, there are {source.available}")
-    ufm, watch = UfMStar(config), Stopwatch()
+    ufm, watch = UfMStar(config), CallTimes()
     counts: dict[str, list[int]] = {"components": [], "in_view": [], "segments": [], "matched": [], "new": []}
     for frame in source.frames(size, frames):
         statistics = watch.time("step", ufm, frame.depth, frame.T_world_cam, frame.intrinsics).statistics

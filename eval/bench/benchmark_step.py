@@ -17,7 +17,8 @@ from torch import Tensor
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.eval.bench.benchmark_frames import FrameSource, PosedDepth
-from ufmstar_torch.eval.bench.benchmark_timing import StageClock, Stopwatch
+from ufmstar_torch.eval.bench.benchmark_timing import StageClock
+from ufmstar_torch.eval.engine.clock import CallTimes
 from ufmstar_torch.models import FastDepth
 from ufmstar_torch.models.fastdepth import MULTIPLE
 
@@ -94,7 +95,7 @@ def measure_step(plan: Plan, built: UfMStar, frames: Sequence[PosedDepth], netwo
         "staged": staged,
         "mean_uncertainty": lambda f: average.mean_uncertainty(f.depth, f.T_world_cam, f.intrinsics, pixels=pixels),
     }
-    watch = Stopwatch()
+    watch = CallTimes()
     counts = _take_turns(frames[: plan.warm_up + plan.rounds], ufm, networks, watch, whole)
     watch.drop(plan.warm_up)
     staged.clock.drop(plan.warm_up)
@@ -119,7 +120,7 @@ def _take_turns(
     frames: Sequence[PosedDepth],
     ufm: dict[str, Call],
     networks: dict[str, Call],
-    watch: Stopwatch,
+    watch: CallTimes,
     whole: UfMStar,
 ) -> dict[str, list[int]]:
     """A B A B: per frame each of ``ufm`` in turn, a network before each; every network once per frame is timed."""

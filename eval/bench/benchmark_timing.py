@@ -8,9 +8,8 @@ the process itself computed (over all its threads, waiting ones that spin includ
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -18,45 +17,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ufmstar_torch.eval.engine.clock import spread
+
 # Every moment of a step belongs to one of these; see ``ufmstar_torch.step.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
 _TIMED = ("spgf", "floor_covariance", "correspond", "fuse", "regress_image")
-
-
-def spread(milliseconds: Sequence[float]) -> dict[str, float | int]:
-    """Median, interquartile range, quartiles and minimum [ms] of at least one measurement, and their count.
-
-    Quartiles are interpolated linearly between the sorted values (NumPy's default).
-
-    Raises:
-        ValueError: no measurement.
-    """
-    if not len(milliseconds):
-        raise ValueError("milliseconds must hold at least one measurement")
-    low, middle, high = (float(q) for q in np.percentile(np.asarray(milliseconds, np.float64), (25, 50, 75)))
-    return {
-        "median_ms": middle,
-        "iqr_ms": high - low,
-        "q1_ms": low,
-        "q3_ms": high,
-        "min_ms": float(min(milliseconds)),
-        "count": len(milliseconds),
-    }
-
-
-def paired_ratio(numerator: Sequence[float], denominator: Sequence[float]) -> dict[str, float | int]:
-    """Median and quartiles of the ratios of measurements taken one right after the other.
-
-    Another program that slows both down for a while then cancels, as it does not in a ratio of medians.
-
-    Raises:
-        ValueError: the two differ in length or are empty.
-    """
-    if len(numerator) != len(denominator) or not len(numerator):
-        raise ValueError(f"expected as many numerators as denominators, got {len(numerator)} and {len(denominator)}")
-    ratios = np.asarray(numerator, np.float64) / np.asarray(denominator, np.float64)
-    low, middle, high = (float(q) for q in np.percentile(ratios, (25, 50, 75)))
-    return {"median": middle, "q1": low, "q3": high, "count": len(ratios)}
 
 
 @contextmanager
@@ -82,37 +47,6 @@ def pinned_threads(count: int) -> Iterator[None]:
         if numba is not None:
             numba.set_num_threads(before_numba)
         torch.set_num_threads(before)
-
-
-@dataclass
-class Stopwatch:
-    """Wall-clock and processor times of calls by name [ms]."""
-
-    wall: dict[str, list[float]] = field(default_factory=dict)
-    cpu: dict[str, list[float]] = field(default_factory=dict)
-
-    def time(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
-        """Call ``function(*args)``, keep its times under ``name``, and return what it returned."""
-        cpu, wall = time.process_time(), time.perf_counter()
-        result = function(*args)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        self.wall.setdefault(name, []).append(1e3 * wall)
-        self.cpu.setdefault(name, []).append(1e3 * cpu)
-        return result
-
-    def drop(self, count: int) -> None:
-        """Forget the first ``count`` calls of every name: the warm-up."""
-        for times in (*self.wall.values(), *self.cpu.values()):
-            del times[:count]
-
-    def spread(self, name: str) -> dict[str, float | int]:
-        """:func:`spread` of the wall-clock times, and the median of the processor times."""
-        return {**spread(self.wall[name]), "cpu_median_ms": float(np.median(self.cpu[name]))}
-
-    def ratio(self, name: str, other: str) -> dict[str, float | int]:
-        """:func:`paired_ratio` of the wall-clock times, and the median of that of the processor times."""
-        cpu = paired_ratio(self.cpu[name], self.cpu[other])
-        return {**paired_ratio(self.wall[name], self.wall[other]), "cpu_median": cpu["median"]}
 
 
 class StageClock:

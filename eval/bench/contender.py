@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.bench.memory import NetworkMemory, tensor_bytes
-from ufmstar_torch.eval.engine.networks import BaseNetwork
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
@@ -89,7 +89,7 @@ class Contender:
             return network(x)
 
 
-def contenders(networks: Mapping[str, BaseNetwork]) -> dict[str, Contender]:
+def contenders(networks: Mapping[str, DepthSource]) -> dict[str, Contender]:
     """The networks of an evaluation by base; ground truth is none, since nothing runs."""
     return {
         base: Contender(base, one.networks, one.label, one.passes) for base, one in networks.items() if one.networks

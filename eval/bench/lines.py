@@ -7,11 +7,11 @@ from dataclasses import asdict
 from statistics import median
 from typing import Any
 
-from ufmstar_torch.eval.bench.benchmark_timing import paired_ratio, spread
 from ufmstar_torch.eval.bench.contender import Contender
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, ONCE, PROCESSOR, WALL, Race, inference_of
 from ufmstar_torch.eval.bench.windows import PartEnergy
+from ufmstar_torch.eval.engine.clock import paired_ratio, spread
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.bench.benchmark_timing import StageClock
-from ufmstar_torch.eval.engine.estimator import ufm_star_config
+from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig

@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.bench.benchmark_timing import Stopwatch
 from ufmstar_torch.eval.bench.contender import Contender
 from ufmstar_torch.eval.bench.multiview import Inputs, Multiview, StagedUfMStar, synchronize, waited
+from ufmstar_torch.eval.engine.clock import CallTimes
 from ufmstar_torch.eval.methods.method import ALONE, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -53,7 +53,7 @@ class Race:
         staged: likewise, the stages of UfM*.
     """
 
-    watch: Stopwatch = field(default_factory=Stopwatch)
+    watch: CallTimes = field(default_factory=CallTimes)
     prepared: dict[str, list[Prepared]] = field(default_factory=dict)
     inputs: dict[tuple[str, str], list[Inputs]] = field(default_factory=dict)
     multiview: dict[str, Multiview] = field(default_factory=dict)

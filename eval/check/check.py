@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ufmstar_torch.eval.check.alignment import Alignment, alignment
+from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_fit
 from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 
-AS_GIVEN = CONVENTIONS[OURS].told
-_READINGS = {convention.told: convention.convert for convention in CONVENTIONS.values()}
+AS_GIVEN = CONVENTIONS[OURS].description
+_READINGS = {convention.description: convention.convert for convention in CONVENTIONS.values()}
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
 # Share of a frame's points that must land on valid depth, of those that would if all fell into the image, or a pair
@@ -28,7 +28,7 @@ _SAME_FACTOR, _SAME_ERROR = 1.5, 0.003
 _MAX_ERROR = 0.05  # above it no reading explains the data; registered sequences are at .001 to .02
 # Nearer to 1 a scale is noise (1.15 was estimated from four pairs of fr1/xyz) or calibration, no mistake.
 _SCALE_TOLERANCE = 1.25
-# See alignment(): with 10 frames, registered recordings have at least .5, displaced ones at most .2.
+# See depth_image_fit(): with 10 frames, registered recordings have at least .5, displaced ones at most .2.
 _ALIGNED, _NOT_ALIGNED, _REGISTRATION_FRAMES = 0.4, 0.25, 12
 _MIN_EDGES, _MIN_CONTRAST = 500, 0.03  # contrast observed: .04 to .25
 
@@ -48,7 +48,7 @@ class SequenceCheck:
         registration: how depth lies on the image, or None where it was not checked.
         unreadable: files that could not be decoded.
         problems: what is wrong, in words; empty if nothing.
-        undecided: what this sequence cannot tell, in words.
+        undecided: what this sequence leaves open, in words.
     """
 
     pairs: int
@@ -57,7 +57,7 @@ class SequenceCheck:
     reading: str
     scale: float
     best_error: float
-    registration: Alignment | None
+    registration: DepthImageFit | None
     unreadable: tuple[str, ...]
     problems: tuple[str, ...]
     undecided: tuple[str, ...]
@@ -65,7 +65,7 @@ class SequenceCheck:
     @property
     def convention(self) -> str:
         """The reading by the name that ``open_sequence`` takes as ``poses``."""
-        return next(name for name, convention in CONVENTIONS.items() if convention.told == self.reading)
+        return next(name for name, convention in CONVENTIONS.items() if convention.description == self.reading)
 
     @property
     def ok(self) -> bool:
@@ -115,7 +115,7 @@ def check_sequence(sequence: FrameSequence, pairs: int = 8) -> SequenceCheck:
     return _judge(loaded, gap, errors, registration, tuple(dict.fromkeys(unreadable)))
 
 
-def _without_poses(registration: Alignment | None, unreadable: list[str]) -> SequenceCheck:
+def _without_poses(registration: DepthImageFit | None, unreadable: list[str]) -> SequenceCheck:
     problems: list[str] = []
     undecided = ["there are no poses: methods that compare views cannot be run"]
     if registration is not None:
@@ -193,21 +193,21 @@ def _errors(pairs: list[_Pair], reading: str, scales: np.ndarray) -> np.ndarray:
     return np.median([[warp_error(pair, reading, scale) for scale in scales] for pair in pairs], axis=0)
 
 
-def _registration(sequence: FrameSequence, unreadable: list[str]) -> Alignment | None:
-    """Alignment of depth and image, where the depth maps claim to lie on the images."""
+def _registration(sequence: FrameSequence, unreadable: list[str]) -> DepthImageFit | None:
+    """Fit of depth and image, where the depth maps claim to lie on the images."""
     if sequence.depth_intrinsics is not None:
         return None
     indices = np.unique(np.linspace(0, len(sequence) - 1, _REGISTRATION_FRAMES).astype(int))
     found = [_read(sequence, int(i), unreadable) for i in indices]
     both = [(one[0].image, one[1]) for one in found if one is not None and one[0].image is not None]
-    return alignment(both) if both else None
+    return depth_image_fit(both) if both else None
 
 
 def _judge(
     pairs: list[_Pair],
     gap: int,
     errors: dict[str, np.ndarray],
-    registration: Alignment | None,
+    registration: DepthImageFit | None,
     unreadable: tuple[str, ...],
 ) -> SequenceCheck:
     reading = min(errors, key=lambda name: float(errors[name].min()))
@@ -250,14 +250,14 @@ def _geometry_verdict(
     if not np.isfinite(best):
         return ["no two frames overlap under any reading of the poses"], undecided
     as_given = f"by {given:.1%} as given" if np.isfinite(given) else "as given frames do not overlap"
-    told = f"warped depth is off by {best:.1%} then, {as_given}"
+    measured = f"warped depth is off by {best:.1%} then, {as_given}"
     if best > _MAX_ERROR:
-        problems.append(f"depth and poses disagree under every reading tried ({told})")
+        problems.append(f"depth and poses disagree under every reading tried ({measured})")
         return problems, undecided
     if reading != AS_GIVEN:
-        problems.append(f"the poses look {reading} ({told})")
+        problems.append(f"the poses look {reading} ({measured})")
     if not 1 / _SCALE_TOLERANCE < scale < _SCALE_TOLERANCE:
-        problems.append(f"depth looks too {'small' if scale > 1 else 'large'}: times {scale:.3g} fits ({told})")
+        problems.append(f"depth looks too {'small' if scale > 1 else 'large'}: times {scale:.3g} fits ({measured})")
     others = [name for name in errors if name != reading and _as_good(float(errors[name].min()), best)]
     if others:
         undecided.append(f"the motion does not tell the poses from {', or '.join(others)}")
@@ -267,8 +267,8 @@ def _geometry_verdict(
     return problems, undecided
 
 
-def _registration_verdict(registration: Alignment, problems: list[str], undecided: list[str]) -> None:
-    """Appends what the alignment of depth and image says."""
+def _registration_verdict(registration: DepthImageFit, problems: list[str], undecided: list[str]) -> None:
+    """Appends the verdict on the fit of depth and image."""
     if registration.edges < _MIN_EDGES or registration.contrast < _MIN_CONTRAST:
         undecided.append("too few edges, or too many, to tell whether depth is registered to the images")
     elif registration.quality < _NOT_ALIGNED:

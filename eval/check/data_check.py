@@ -47,7 +47,7 @@ class DataReport:
         checked: what ``check_sequence`` measured, plain values; {} where it could not.
         problems: what is wrong, in words.
         remedies: what to do about it; options are named as on the command line.
-        undecided: what the data cannot tell.
+        undecided: what the data leave open.
     """
 
     name: str
@@ -81,7 +81,7 @@ class DataReport:
 
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
-    """Opens a sequence and looks at all that can be told without a network.
+    """Opens a sequence and checks all that needs no network.
 
     A sequence that cannot be opened is a report with that problem.
 
@@ -219,7 +219,7 @@ def _measured(found: SequenceCheck) -> dict[str, Any]:
 
 
 def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
-    """How many frames were read, and what was said of those that cannot be; a rendered frame always can."""
+    """How many frames were read, and the errors of those that cannot be; a rendered frame always can."""
     if sequence.layout == "tour":
         return 0, []
     chosen = np.unique(np.linspace(0, len(sequence) - 1, min(_DECODED, len(sequence))).astype(int))

@@ -19,9 +19,9 @@ def page(report: DataReport) -> str:
         f"  poses         {f'path of {report.walked:.1f} m' if report.posed else 'none: single images'}",
     ]
     if report.checked and report.posed:
-        told = f"off by {report.checked['error']:.1%}" if report.checked["error"] < float("inf") else "does not overlap"
-        pairs, gap = report.checked["pairs"], report.checked["gap"]
-        lines.append(f"  geometry      depth warped {_count(gap, 'frame')} on {told} ({_count(pairs, 'pair')})")
+        pairs, gap, error = (report.checked[key] for key in ("pairs", "gap", "error"))
+        fit = f"off by {error:.1%}" if error < float("inf") else "does not overlap"
+        lines.append(f"  geometry      depth warped {_count(gap, 'frame')} on {fit} ({_count(pairs, 'pair')})")
     lies = report.checked.get("registration")
     if lies is not None:
         lines.append(f"  registration  {lies['quality']:.2f} of 1: how well depth edges meet image edges as they are")
@@ -33,8 +33,8 @@ def line(report: DataReport) -> str:
     """One sequence in one line."""
     if report.ok:
         error = report.checked.get("error")
-        told = f", depth fits to {error:.1%}" if error is not None and report.posed else ""
-        return f"fine     {report.name}: {report.layout}, {report.frames} of {report.on_disk} frames{told}"
+        fit = f", depth fits to {error:.1%}" if error is not None and report.posed else ""
+        return f"fine     {report.name}: {report.layout}, {report.frames} of {report.on_disk} frames{fit}"
     remedy = f" -> {'; '.join(report.remedies)}" if report.remedies else ""
     return f"PROBLEM  {report.name}: {' '.join('; '.join(report.problems).split())}{remedy}"
 
@@ -65,10 +65,10 @@ def _depth(report: DataReport) -> str:
     if report.depth_range is None:
         return "none"
     low, high = report.depth_range
-    told = f"{_size(report.depth_size)}, {low:.2f} to {high:.2f} m, {report.filled:.0%} of the pixels"
+    maps = f"{_size(report.depth_size)}, {low:.2f} to {high:.2f} m, {report.filled:.0%} of the pixels"
     camera = "" if report.depth_intrinsics is None else f", a camera of its own: {_camera(report.depth_intrinsics)}"
     missing = f", {_count(report.without_depth, 'frame')} without" if report.without_depth else ""
-    return told + camera + missing
+    return maps + camera + missing
 
 
 def _count(number: int, what: str) -> str:

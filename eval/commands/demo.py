@@ -7,24 +7,36 @@ UfM and UfM* judge the same predictions, and the table says how well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
+from statistics import median
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ufmstar_torch.camera import unproject
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.commands.run import Progress
-from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR, Comparison, Tally
-from ufmstar_torch.eval.engine.run_source import sha256
-from ufmstar_torch.eval.report.outputs import DEMO_FILES, panel, write_pictures
+from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, Pointwise
+from ufmstar_torch.eval.engine.judge import RegionMetrics
+from ufmstar_torch.eval.engine.load import sha256
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
+from ufmstar_torch.eval.methods.ufm import UfMConfig
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, panel, write_pictures
 from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
@@ -32,9 +44,10 @@ from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.results.summary import versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
+from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
 from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
+from ufmstar_torch.pipeline import NetworksInTurn
 from ufmstar_torch.ufmstar import UfMStar
 
 # Of "mixed" tours: what the networks were trained on, and what they never saw.
@@ -74,27 +87,29 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         digest = sha256(file)
     OutputFolder.open(options.out, DEMO, {}, overwrite=options.overwrite).close()
     size = info.spec.size
-    sequence = tour_sequence(options.seed, frames=options.frames, size=size, style=STYLE, device=device)
-    frames = _render(sequence, device, progress)
-    comparison = Comparison(members, device)
-    tally, panels = _walk(comparison, frames, make_tour(options.seed, STYLE), progress)
+    tour = tour_sequence(options.seed, frames=options.frames, size=size, style=STYLE, device=device)
+    sequence = _rendered(tour, device, progress)
+    source = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {}, seeding=None)
+    rows, metrics, walk = _walk(sequence, source, device, make_tour(options.seed, STYLE), progress)
     summary = {
         "program": DEMO.program,
         "out": str(options.out),
         "settings": options.settings(),
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
         "network": _network(info, digest, len(members)),
-        "methods": _methods(comparison, tally),
-        "surfaces": tally.by_kind(),
-        "components": int(comparison.ufm_star.mixture.components.sum()),
-        "points": int(comparison.ufm.points.sum()),
+        "methods": _methods(rows, metrics, walk),
+        "surfaces": metrics.by_region(),
+        "components": int(rows[2].estimator.memory()["count"]),
+        "points": int(rows[1].estimator.memory()["count"]),
         "versions": versions(),
     }
     progress(Progress("pictures", 0, 1, None, 0))
     shown = demo_names(len(members))
-    metrics = {shown[method].strip(): values for method, values in tally.overall().items()}
+    overall = {shown[method].strip(): values for method, values in metrics.overall().items()}
     title = f"ufmstar demo: {len(sequence)} frames, seed {options.seed}"
-    outputs = write_pictures(options.out, panels, metrics, comparison.ufm_star, title)
+    gaussians = rows[2].estimator
+    assert isinstance(gaussians, Gaussians)
+    outputs = write_pictures(options.out, walk.panels, overall, gaussians.ufm, title)
     summary |= {"outputs": outputs, "seconds": perf_counter() - started}
     write_json_atomic(options.out / SUMMARY, summary)
     progress(Progress("pictures", 1, 1, None, 0))
@@ -134,34 +149,100 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
     return chosen
 
 
+def demo_rows(source: DepthSource, device: torch.device) -> list[RowRunner]:
+    """The rows of the table, at the start. The first three judge one prediction, of the member in turn; the last one
+    is all members on every image, which is what alternation saves. A single network is no ensemble."""
+    rows = [
+        RowRunner(NETWORK, source, Alone(), device=device),
+        RowRunner(UFM, source, Pointwise(UfMConfig(), device), device=device),
+        RowRunner(UFM_STAR, source, Gaussians(UfMStarConfig(), device), device=device),
+    ]
+    several = [RowRunner(ENSEMBLE, source, Alone(), every=True, device=device)]
+    return rows + (several if source.passes > 1 else [])
+
+
+class _RequireVariances(FrameSink):
+    """Raises ValueError where a row has no variance: the network states none."""
+
+    def take(self, result: FrameResult) -> None:
+        """See ``Sink``."""
+        if any(row.estimate.variance is None for row in result.rows.values()):
+            raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
+
+
+class _Walk(FrameSink):
+    """Collects times and the rows of the contact sheet, and reports the progress.
+
+    Args:
+        unfamiliar: of every frame, whether most of it shows an unfamiliar room.
+        progress: called at the start and after every frame.
+
+    Attributes:
+        panels: the rows of the sheet, in its order.
+        ms: by row, the times of every frame by stage [ms].
+    """
+
+    def __init__(self, unfamiliar: list[bool], progress: Callable[[Progress], None]) -> None:
+        self._unfamiliar, self._progress = unfamiliar, progress
+        self._rows = sheet_rows(unfamiliar)
+        self._panels: dict[int, FramePanel] = {}
+        self.ms: dict[str, list[Mapping[str, float]]] = {}
+
+    @property
+    def panels(self) -> list[FramePanel]:
+        """See above."""
+        return [self._panels[index] for index in self._rows]
+
+    def begin(self, stream: FrameStream) -> None:
+        """See ``Sink``."""
+        self._gaussians = next(row.estimator for row in stream.rows if row.key == UFM_STAR)
+        self._progress(Progress("frames", 0, len(self._unfamiliar), None, 0))
+
+    def take(self, result: FrameResult) -> None:
+        """See ``Sink``."""
+        for key, row in result.rows.items():
+            self.ms.setdefault(key, []).append(row.ms)
+        if result.index in self._rows:
+            note = list(KINDS.values())[self._unfamiliar[result.index]]
+            self._panels[result.index] = panel(f"frame {result.index}", note, result)
+        components = int(self._gaussians.memory()["count"])
+        self._progress(Progress("frames", result.number + 1, len(self._unfamiliar), components, 0))
+
+    def median_ms(self, key: str, stage: str) -> float:
+        """Of the typical frame [ms]."""
+        return median(ms[stage] for ms in self.ms[key])
+
+
 def _walk(
-    comparison: Comparison, frames: list[Frame], tour: Tour, progress: Callable[[Progress], None]
-) -> tuple[Tally, list[FramePanel]]:
-    """All frames by all methods, with their figures and the rows of the contact sheet."""
-    comparison.take(frames[0])  # libraries set themselves up at the first call, which does not count
-    comparison.restart()
-    kinds = [surface_kinds(tour, frame) for frame in frames]
-    unfamiliar = [bool(kind.mean() > 0.5) for kind in kinds]
-    labels, rows = list(KINDS.values()), sheet_rows(unfamiliar)
-    tally, panels = Tally(comparison.methods, labels), {}
-    progress(Progress("frames", 0, len(frames), None, 0))
-    for index, frame in enumerate(frames):
-        compared = comparison.take(frame)
-        K, size = compared.intrinsics.double().numpy(), compared.size
-        truth = truth_at(frame, K, size)
-        assert truth is not None
-        assert frame.image is not None
-        kind = resample_nearest(kinds[index], frame.intrinsics, K, size)
-        tally.add(compared, torch.from_numpy(truth), torch.from_numpy(kind))
-        if index in rows:
-            panels[index] = panel(f"frame {index}", labels[unfamiliar[index]], frame.image, compared, truth)
-        components = int(comparison.ufm_star.mixture.components.sum())
-        progress(Progress("frames", index + 1, len(frames), components, 0))
-    return tally, [panels[row] for row in rows]
+    sequence: FrameSequence,
+    source: DepthSource,
+    device: torch.device,
+    tour: Tour,
+    progress: Callable[[Progress], None],
+) -> tuple[list[RowRunner], RegionMetrics, _Walk]:
+    """All frames through all rows, with their figures by kind of room.
+
+    Raises:
+        ValueError: a network states no variance of its own.
+    """
+    # Libraries set themselves up at the first call, which does not count.
+    FrameStream(sequence, range(1), demo_rows(source, device), device=device).drive([_RequireVariances()])
+    rows, kinds = demo_rows(source, device), [surface_kinds(tour, frame) for frame in sequence]
+
+    def kind_of(result: FrameResult, row: RowFrame) -> Tensor:
+        assert result.frame is not None
+        K, size = row.prediction.intrinsics.numpy(), row.prediction.size
+        return torch.from_numpy(resample_nearest(kinds[result.index], result.frame.intrinsics, K, size))
+
+    metrics = RegionMetrics([row.key for row in rows], list(KINDS.values()), kind_of)
+    walk = _Walk([bool(kind.mean() > 0.5) for kind in kinds], progress)
+    FrameStream(sequence, range(len(sequence)), rows, device=device).drive([metrics, walk])
+    return rows, metrics, walk
 
 
-def _render(sequence: FrameSequence, device: torch.device, progress: Callable[[Progress], None]) -> list[Frame]:
-    """All frames. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the very first run."""
+def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[[Progress], None]) -> FrameSequence:
+    """All frames in memory. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the very first
+    run."""
     progress(Progress("rooms", 0, len(sequence), None, 0))
     frames = [sequence[index] for index in range(2)]
     with ThreadPoolExecutor(1) as beside:
@@ -172,7 +253,16 @@ def _render(sequence: FrameSequence, device: torch.device, progress: Callable[[P
         progress(Progress("kernels", 0, 1, None, 0))
         compiled.result()
     progress(Progress("kernels", 1, 1, None, 0))
-    return frames
+    entries = [
+        replace(entry, load_image=partial(_same, frame.image), load_depth=partial(_same, frame.depth))
+        for entry, frame in zip(sequence.entries, frames, strict=True)
+    ]
+    return replace(sequence, entries=tuple(entries))
+
+
+def _same(array: np.ndarray | None) -> np.ndarray:
+    assert array is not None
+    return array
 
 
 def _compile(frames: list[Frame], device: torch.device) -> None:
@@ -184,18 +274,17 @@ def _compile(frames: list[Frame], device: torch.device) -> None:
         ufm_star(depth, pose, K, torch.full_like(depth, 0.01))
 
 
-def _methods(comparison: Comparison, tally: Tally) -> dict[str, Any]:
+def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict[str, Any]:
     """The rows of the table: figures, times and memory."""
-    ms, state = tally.median_ms(), comparison.state_bytes()
-    curves = tally.overall()
+    overall = metrics.overall()
     return {
-        method: {
-            "figures": curves[method].compute(),
-            "network_ms": ms[ENSEMBLE if method == ENSEMBLE else NETWORK],
-            "uncertainty_ms": ms[method] if method in (UFM, UFM_STAR) else None,
-            "state_bytes": state[method],
+        row.key: {
+            "figures": overall[row.key].compute(),
+            "network_ms": walk.median_ms(row.key, "network"),
+            "uncertainty_ms": walk.median_ms(row.key, "uncertainty") if row.estimator.memory() else None,
+            "state_bytes": int(row.estimator.memory().get("bytes", 0)),
         }
-        for method in tally.methods
+        for row in rows
     }
 
 

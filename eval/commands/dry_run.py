@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from ufmstar_torch.eval.engine.networks import BaseNetwork
+from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.results.work import EvalJob
@@ -14,8 +14,8 @@ from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file systems allot
 
 
-def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> str:
-    """Open every sequence, predict one frame, and tell.
+def dry_run(job: EvalJob, networks: Mapping[str, DepthSource], shard: Shard) -> str:
+    """Open every sequence, predict one frame, and describe the work.
 
     Args:
         job: what would be evaluated.
@@ -42,12 +42,12 @@ def dry_run(job: EvalJob, networks: Mapping[str, BaseNetwork], shard: Shard) -> 
         frames += count
         size += _cached(job.suite.rows, networks, count, sample or {})
     lines.append(f"{frames} frames, {len(items) * len(job.suite.rows)} records")
-    told = "no frame can be read" if sample is None else f"up to {size / 1e6:.1f} MB"
-    lines.append(f"cache of predictions: {told}")
+    cached = "no frame can be read" if sample is None else f"up to {size / 1e6:.1f} MB"
+    lines.append(f"cache of predictions: {cached}")
     return "\n".join(lines)
 
 
-def predictions(rows: Iterable[Row], network: BaseNetwork, frames: int) -> int:
+def predictions(rows: Iterable[Row], network: DepthSource, frames: int) -> int:
     """How many predictions of a network the rows need on so many frames, all members on an image counting as one."""
     needed: set[tuple[int, int | None]] = set()
     for row in rows:
@@ -57,13 +57,13 @@ def predictions(rows: Iterable[Row], network: BaseNetwork, frames: int) -> int:
     return len(needed)
 
 
-def _cached(rows: Sequence[Row], networks: Mapping[str, BaseNetwork], frames: int, sample: Mapping[str, int]) -> int:
+def _cached(rows: Sequence[Row], networks: Mapping[str, DepthSource], frames: int, sample: Mapping[str, int]) -> int:
     """Bytes of the predictions of a sequence."""
     by_base = {base: [row for row in rows if row.method.base == base] for base in sample}
     return sum(predictions(own, networks[base], frames) * sample[base] for base, own in by_base.items())
 
 
-def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, BaseNetwork]) -> dict[str, int] | None:
+def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, DepthSource]) -> dict[str, int] | None:
     """By base, from the first frame that can be read; None if none can."""
     for index in range(len(sequence)):
         try:
@@ -71,7 +71,7 @@ def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, BaseNetwork]
             made = {base: network.one(frame, 0) for base, network in networks.items() if network.cacheable}
         except FrameError:
             continue
-        # All members together have an epistemic variance, whatever one of them says.
+        # All members together have an epistemic variance, whatever a single one has.
         counts = {base: max(len(one.maps()), 3 if networks[base].passes > 1 else 1) for base, one in made.items()}
         return {base: _FILE_BYTES + 4 * counts[base] * one.depth.numel() for base, one in made.items()}
     return None

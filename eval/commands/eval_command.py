@@ -173,7 +173,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         FileNotFoundError: something that was named does not exist.
         ValueError: options that do not go together, a base given twice, no row with a network, no sequence.
     """
-    from ufmstar_torch.eval.engine.networks import NetworkChoice
+    from ufmstar_torch.eval.engine.load import NetworkChoice
     from ufmstar_torch.eval.methods.suite import suite_named
     from ufmstar_torch.eval.results.work import EvalJob
     from ufmstar_torch.eval.results.worklist import find_work, read_names

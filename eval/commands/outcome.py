@@ -1,4 +1,4 @@
-"""What ``ufmstar eval`` says in the end: the table over sequences, and where everything lies."""
+"""What ``ufmstar eval`` prints in the end: the table over sequences, and where everything lies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sequence through a depth source and UfM*, onto disk: the runner behind ``ufmstar run``.
+"""``ufmstar run``: a sequence through a depth source and UfM*, onto disk.
 
 Every frame is finished or not there, and a run that was stopped, by whatever, goes on with the same
 results as if it had not been.
@@ -14,19 +14,24 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.judge import Judge
-from ufmstar_torch.eval.engine.run_source import Source
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
+from ufmstar_torch.eval.engine.estimators import Gaussians
+from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.rows import RowRunner
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Stopped
+from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.report.outputs import Finished, common_scales, draw_sheet, draw_video, write_mixture
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
-from ufmstar_torch.eval.results.run_folder import Checkpoint, RunFolder
-from ufmstar_torch.eval.results.summary import FAILED, FINISHED, INTERRUPTED, NEAR_ZERO, Ending, summarise
-from ufmstar_torch.eval.results.writers import WrittenFrame
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
-from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.frame import FRAME_FAULTS
-from ufmstar_torch.pipeline import UncertainPrediction
+from ufmstar_torch.eval.results.journal import Journal, MapWriter, row_state
+from ufmstar_torch.eval.results.run_folder import RunFolder
+from ufmstar_torch.eval.results.summary import FAILED, FINISHED, INTERRUPTED, Ending, summarise
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.ufmstar import UfMStar
 
 # [s] between two updates of the summary of a run that is going on.
 _SUMMARY_EVERY = 30.0
@@ -34,24 +39,50 @@ _GOING_ON = Ending(INTERRUPTED, "no orderly end: the program was killed, or is s
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class RunJob:
     """What to run.
 
     Attributes:
         sequence: the posed frames.
         indices: which of them, in order.
-        source: the depth; in its initial state.
+        source: of the depth.
+        config: of UfM*.
+        device: of UfM*.
         settings: everything the user chose, as plain values, for the summary.
+        every: all members predict on every image, instead of one in turn.
         video: whether to make preview.mp4.
         sheet: whether to make contact_sheet.png.
     """
 
     sequence: FrameSequence
     indices: range
-    source: Source
+    source: DepthSource
+    config: UfMStarConfig
+    device: torch.device
     settings: Mapping[str, Any]
+    every: bool = False
     video: bool = True
     sheet: bool = True
+
+    def row(self, module: Mapping[str, Tensor], position: int) -> RowRunner:
+        """UfM* on the source after ``position`` frames, in the state that a checkpoint holds; {} at the start."""
+        row = RowRunner(
+            UFM,
+            self.source,
+            Gaussians(self.config, self.device),
+            every=self.every,
+            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks()) if self.config.anchored else None,
+            skips_faults=True,
+            device=self.device,
+        )
+        if module:
+            row.load_state(row_state(module, bare=not self.source.needs_image, images=torch.tensor(position)))
+        return row
+
+    @property
+    def source_identity(self) -> dict[str, Any]:
+        """Plain values on which depth and anchors depend."""
+        return {**self.source.identity, **(Tracks().identity if self.config.anchored else {})}
 
     def identity(self) -> dict[str, Any]:
         """Plain values on which the results depend: a run can only go on with the same ones."""
@@ -69,9 +100,9 @@ class Job:
                 "depth_intrinsics": sequence.depth_intrinsics,
                 "first_frame": self._first_frame(),
             },
-            "ufm": self.source.ufm.config.to_dict(),
-            "source": self.source.identity,
-            "device": self.source.device.type,
+            "ufm": self.config.to_dict(),
+            "source": self.source_identity,
+            "device": self.device.type,
         }
 
     def _first_frame(self) -> str | None:
@@ -103,12 +134,8 @@ class Progress:
     skipped: int
 
 
-class _Stopped(Exception):
-    """The caller asked to stop, between two frames."""
-
-
 def run(
-    job: Job,
+    job: RunJob,
     out: str | Path,
     *,
     resume: bool = False,
@@ -138,15 +165,14 @@ def run(
         Exception: whatever else the network or UfM* raise, after the summary was written.
     """
     folder = RunFolder.open(out, job.identity(), resume=resume, overwrite=overwrite)
-    _rewind(job.source, folder)
     with folder:
         _write_summary(job, folder, _GOING_ON)
         ending, outputs = Ending(FAILED, "an error in the program"), {}
         try:
-            _all_frames(job, folder, progress, stop)
+            _frames(job, folder, progress, stop)
             ending = _ending(job, folder)
             outputs = _outputs(job, folder, progress, stop)
-        except (KeyboardInterrupt, _Stopped):
+        except (KeyboardInterrupt, Stopped):
             ending = Ending(INTERRUPTED, f"stopped by the user after {_counts(folder, job)}; --resume goes on")
         except OSError as error:
             ending = Ending(FAILED, f"{error}; stopped after {_counts(folder, job)}; --resume goes on")
@@ -154,133 +180,43 @@ def run(
             ending = Ending(FAILED, f"{type(error).__name__}: {error}")
             raise
         finally:
-            # A frame in hand may have changed the state already; what is reported is what is on disk.
-            _rewind(job.source, folder)
             summary = _write_summary(job, folder, ending, outputs)
     return summary
 
 
-def _rewind(source: Source, folder: RunFolder) -> None:
-    """Bring the source to the state after the last finished frame."""
-    source.reset()
-    if folder.checkpoint.module:
-        source.load_state(folder.checkpoint.module)
-
-
-def _all_frames(job: Job, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
+def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
-    judge = Judge(folder.checkpoint.metrics)
-    first, earlier = folder.checkpoint.position, list(folder.checkpoint.sessions)
-    skipped = sum(record["state"] == "skipped" for record in folder.records)
-    started = reported = perf_counter()
-    saving = 0.0
-    progress(Progress("frames", first, len(job.indices), None, skipped))
-    for position in range(first, len(job.indices)):
-        if stop():
-            raise _Stopped
-        record = _one_frame(job, folder, judge, job.indices[position], saving)
-        session = {"first": first, "frames": position + 1 - first, "seconds": perf_counter() - started}
-        state = Checkpoint(
-            position=position + 1,
-            module=job.source.state(),
-            metrics=judge.state(),
-            sessions=[*earlier, session],
-        )
-        before = perf_counter()
-        folder.commit(record, state)
-        saving = 1000 * (perf_counter() - before)
-        skipped += record["state"] == "skipped"
-        progress(Progress("frames", position + 1, len(job.indices), record.get("components"), skipped))
-        if perf_counter() - reported > _SUMMARY_EVERY:
-            _write_summary(job, folder, _GOING_ON)
-            reported = perf_counter()
+    position = folder.checkpoint.position
+    row = job.row(folder.checkpoint.module, position)
+    metrics, maps = RunMetrics(UFM, folder.checkpoint.metrics), MapWriter(UFM, folder.writer)
+    journal = Journal(UFM, folder, metrics.figures.state, maps, bare=not job.source.needs_image)
+    stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
+    stream.drive([metrics, maps, journal, _Reports(job, folder, progress)], stop=stop)
 
 
-def _one_frame(job: Job, folder: RunFolder, judge: Judge, index: int, saving: float) -> dict[str, Any]:
-    """Predict, judge and write one frame; its line for frames.jsonl.
+class _Reports(FrameSink):
+    """The progress after every frame, and now and then the summary of a run that is going on."""
 
-    Args:
-        saving: [ms] what it took to save the state after the frame before; this frame's is not known yet.
-    """
-    clock, name = job.source.clock, job.sequence.entries[index].name
-    clock.take()
-    try:
-        with clock.stage("read"):
-            frame = job.sequence[index]
-        with clock.stage("predict"):
-            result = job.source.predict(frame)
-        with clock.stage("metrics"):
-            truth = _truth(frame, result)
-    except FrameError as error:
-        return {"index": index, "name": name, "state": "skipped", "reason": error.reason}
-    fault = int(result.ufm.statistics.fault[0])
-    if fault:
-        if job.source.anchors is not None:
-            job.source.anchors.undo()
-        return {"index": index, "name": name, "state": "skipped", "reason": FRAME_FAULTS[fault]}
-    with clock.stage("metrics"):
-        judge.update(result, truth)
-    with clock.stage("write"):
-        written = folder.writer.write(
-            name,
-            depth=result.depth[0],
-            variance=result.variance[0],
-            disagreement=result.disagreement[0],
-            anchored=None if result.ufm.anchored is None else result.ufm.anchored[0],
-            bias=None if result.ufm.bias is None else result.ufm.bias[0],
-            valid=result.ufm.valid[0],
-        )
-    ms = {**clock.take(), "save": saving}
-    return _record(index, name, result, truth is not None, written, ms) | _anchors(job.source, result)
+    def __init__(self, job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]) -> None:
+        self._job, self._folder, self._progress = job, folder, progress
+        self._skipped = sum(record["state"] == "skipped" for record in folder.records)
+
+    def begin(self, stream: FrameStream) -> None:
+        """See ``Sink``."""
+        self._reported = perf_counter()
+        self._progress(Progress("frames", stream.position, len(self._job.indices), None, self._skipped))
+
+    def take(self, result: FrameResult) -> None:
+        """See ``Sink``."""
+        self._skipped += len(result.skipped)
+        components = self._folder.records[-1].get("components")
+        self._progress(Progress("frames", result.number + 1, len(self._job.indices), components, self._skipped))
+        if perf_counter() - self._reported > _SUMMARY_EVERY:
+            _write_summary(self._job, self._folder, _GOING_ON)
+            self._reported = perf_counter()
 
 
-def _truth(frame: Frame, result: UncertainPrediction) -> np.ndarray | None:
-    height, width = result.depth.shape[-2:]
-    return truth_at(frame, result.intrinsics[0].cpu().double().numpy(), (height, width))
-
-
-def _record(
-    index: int, name: str, result: UncertainPrediction, judged: bool, written: WrittenFrame, ms: dict[str, float]
-) -> dict[str, Any]:
-    """What is remembered of a frame. "prepare" is what a prediction takes beside network, anchors and UfM*."""
-    statistics, K = result.ufm.statistics, result.intrinsics[0].tolist()
-    counts = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-    prepare = ms["predict"] - ms.get("network", 0.0) - ms.get("anchors", 0.0) - ms["ufm"]
-    times = {stage: time for stage, time in {**ms, "prepare": prepare}.items() if stage != "predict"}
-    own = result.prediction.variance
-    return {
-        "index": index,
-        "name": name,
-        "state": "done",
-        "size": list(result.depth.shape[-2:]),
-        "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
-        "member": result.member,
-        **{count: int(getattr(statistics, count)[0]) for count in counts},
-        "rotation_deviation": float(statistics.rotation_deviation[0]),
-        "mean_disagreement": _mean(result.disagreement, result.ufm.valid),
-        "mean_sigma": _mean(result.std, result.ufm.valid),
-        "mean_network_sigma": None if own is None else _mean(own.sqrt(), result.ufm.valid),
-        "near_zero": int(((result.std > 0) & (result.std < NEAR_ZERO)).sum()),
-        "ground_truth": judged,
-        "saturated": {"depth": written.depth_saturated, "sigma": written.sigma_saturated},
-        "ms": times,
-    }
-
-
-def _anchors(source: Source, result: UncertainPrediction) -> dict[str, Any]:
-    """What a run with anchors remembers besides: their counts, and the means of B [m^2] and of r."""
-    anchored, bias, valid = result.ufm.anchored, result.ufm.bias, result.ufm.valid
-    if source.anchors is None or anchored is None or bias is None:
-        return {}
-    means = {"mean_anchored": _mean(anchored, valid), "mean_bias": _mean(bias, valid)}
-    return {"anchors": source.anchors.counts(result.ufm.statistics), **means}
-
-
-def _mean(values: Tensor, valid: Tensor) -> float:
-    return float(values[valid].double().mean()) if bool(valid.any()) else float("nan")
-
-
-def _ending(job: Job, folder: RunFolder) -> Ending:
+def _ending(job: RunJob, folder: RunFolder) -> Ending:
     """Of a run that went through all frames."""
     if any(record["state"] == "done" for record in folder.records):
         return Ending(FINISHED, _counts(folder, job))
@@ -288,21 +224,21 @@ def _ending(job: Job, folder: RunFolder) -> Ending:
     return Ending(FAILED, f"no frame could be used: {'; '.join(reasons[:3])}")
 
 
-def _counts(folder: RunFolder, job: Job) -> str:
+def _counts(folder: RunFolder, job: RunJob) -> str:
     skipped = sum(record["state"] == "skipped" for record in folder.records)
     done = f"{len(folder.records) - skipped} of {len(job.indices)} frames"
     return f"{done} ({skipped} skipped)" if skipped else done
 
 
 def _outputs(
-    job: Job, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]
+    job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]
 ) -> dict[str, str | None]:
     """Mixture, curves and pictures of all finished frames: by file, None if made, else why not."""
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
         return {}
-    write_mixture(folder.path, job.source.ufm)
-    write_json_atomic(folder.path / "curves.json", Judge(folder.checkpoint.metrics).curves())
+    write_mixture(folder.path, _ufm(job, folder))
+    write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).figures.curves())
     made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = Finished(folder.path, job.sequence, done, with_error)
@@ -315,7 +251,7 @@ def _outputs(
         for drawn in draw_video(finished, scales) if job.video else ():
             progress(Progress("pictures", drawn, len(done), None, 0))
             if stop():
-                raise _Stopped
+                raise Stopped
         if job.video:
             made["preview.mp4"] = None
     except ImportError as error:  # an optional package; the frames are what a run is for
@@ -325,7 +261,7 @@ def _outputs(
 
 
 def _write_summary(
-    job: Job, folder: RunFolder, ending: Ending, outputs: Mapping[str, str | None] | None = None
+    job: RunJob, folder: RunFolder, ending: Ending, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
     """From what is on disk, so that a continued run says the same."""
     summary = summarise(
@@ -333,13 +269,20 @@ def _write_summary(
         settings=job.settings,
         sequence=job.sequence,
         selected=len(job.indices),
-        source=job.source.identity,
+        source=job.source_identity,
         records=folder.records,
         sessions=folder.checkpoint.sessions,
-        mixture=job.source.ufm.mixture,
-        figures=Judge(folder.checkpoint.metrics).figures(),
+        mixture=_ufm(job, folder).mixture,
+        figures=RunMetrics(UFM, folder.checkpoint.metrics).figures.figures(),
         outputs=outputs or {},
     )
     folder.write_summary(summary)
     plain: dict[str, Any] = to_json(summary)
     return plain
+
+
+def _ufm(job: RunJob, folder: RunFolder) -> UfMStar:
+    """UfM* after the last finished frame. A frame in hand may have changed the running one already."""
+    estimator = job.row(folder.checkpoint.module, folder.checkpoint.position).estimator
+    assert isinstance(estimator, Gaussians)
+    return estimator.ufm

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.estimator import Estimate
+from ufmstar_torch.eval.engine.estimators import Estimate
 from ufmstar_torch.eval.methods.method import ALONE, UFM
 from ufmstar_torch.eval.methods.row import Row
 

@@ -1,4 +1,4 @@
-"""Many rows on one sequence in one pass: every network sees a frame once, and every row sees the same frames.
+"""Many rows on one sequence in one stream: every network sees a frame once, and every row sees the same frames.
 
 A frame that one row cannot use (its file is broken, its pose is no pose, a network has nothing to predict from) is
 left out by all rows, whose tables could not be compared otherwise. Pixels are each row's own: those with ground truth
@@ -9,20 +9,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.frame_pass import FramePass
-from ufmstar_torch.eval.engine.networks import BaseNetwork
-from ufmstar_torch.eval.engine.row_run import RowRun
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.engine.anchors import anchor_sources
+from ufmstar_torch.eval.engine.confident import references
+from ufmstar_torch.eval.engine.estimators import make_estimator
+from ufmstar_torch.eval.engine.judge import RowMetrics
+from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
+from ufmstar_torch.eval.engine.rows import RowRunner
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.results.cache import PredictionCache
-from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
-from ufmstar_torch.eval.sequences.frame import FrameSequence
+from ufmstar_torch.eval.methods.setting import TRACKED
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.frame import FRAME_FAULTS, check_frame
+
+_TOLERANCE = UfMStarConfig().rotation_tolerance
 
 
 class SequenceError(Exception):
@@ -35,10 +43,6 @@ class SequenceError(Exception):
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason
-
-
-class Stopped(Exception):
-    """The caller asked to stop, between two frames; nothing of the sequence counts."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +68,12 @@ class RowResult:
 def evaluate_sequence(
     sequence: FrameSequence,
     rows: Sequence[Row],
-    networks: Mapping[str, BaseNetwork],
+    networks: Mapping[str, DepthSource],
     *,
-    cache: PredictionCache,
     device: torch.device,
+    store: PredictionStore | None = None,
     limit: slice = slice(None),
-    examples: Examples | None = None,
+    sinks: Sequence[Sink] = (),
     confident: float = 0.5,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -80,12 +84,12 @@ def evaluate_sequence(
         sequence: posed frames with ground truth.
         rows: different ones.
         networks: by base.
-        cache: of predictions.
         device: where UfM and UfM* run.
+        store: of predictions; None = all are computed.
         limit: which frames, before a setting's skip.
-        examples: where to leave maps and mixtures of a few frames; None = nowhere.
+        sinks: take the frames after the metrics; a row's key is its slug.
         confident: of the pixels of a frame, the share of which a reference method counts as confident.
-        stop: asked before every frame; True raises ``Stopped``.
+        stop: asked before every frame.
         progress: called with the frames that are done and all of them, at the start and after every one.
 
     Returns:
@@ -93,34 +97,119 @@ def evaluate_sequence(
 
     Raises:
         SequenceError: the sequence cannot be used.
-        Stopped: ``stop`` said so.
+        Stopped: ``stop`` returned True; nothing of the sequence counts.
         ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know.
     """
-    _check(rows, networks, confident)
+    _check_arguments(rows, networks, confident)
     indices = range(len(sequence))[limit]
-    if not indices:
-        raise SequenceError(f"no frame is selected of {len(sequence)}")
-    if all(sequence.entries[index].load_depth is None for index in indices):
-        raise SequenceError("no frame has ground truth")
-    comparing = [row.method.name for row in rows if row.method.fusion != ALONE]
-    if comparing and not sequence.posed:
-        raise SequenceError(f"single images without poses, on which {', '.join(comparing)} cannot compare views")
-    frames = FramePass(sequence, rows, networks, cache, device, confident)
-    writer = None if examples is None else ExampleWriter(examples, len(indices))
-    progress(0, len(indices))
-    for number, index in enumerate(indices):
-        if stop():
-            raise Stopped
-        finished = frames.take(number, index)
-        if writer is not None:
-            writer.after(number + 1, finished, frames.runs)
-        progress(number + 1, len(indices))
-    if writer is not None:
-        writer.end(frames.runs)
-    return [_result(run, sequence) for run in frames.runs]
+    _check_sequence(sequence, rows, indices)
+    used = [networks[base] for base in dict.fromkeys(row.method.base for row in rows)]
+    tracked = any(row.setting.anchors == TRACKED for row in rows)
+
+    def check(frame: Frame) -> None:
+        """Raises FrameError unless all networks and UfM* can use the frame."""
+        if frame.image is None and (tracked or any(source.needs_image for source in used)):
+            raise FrameError(frame.name, "no image")
+        if frame.depth is None and not all(source.needs_image for source in used):
+            raise FrameError(frame.name, "no depth map")
+        fault = frame_fault(frame)
+        if fault is not None:
+            raise FrameError(frame.name, fault)
+
+    anchors = anchor_sources(rows)
+    runners = [
+        RowRunner(
+            row.slug,
+            networks[row.method.base],
+            make_estimator(row, device),
+            every=row.method.every_member,
+            setting=row.setting,
+            anchors=anchors.get(row),
+            device=device,
+        )
+        for row in rows
+    ]
+    named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
+    metrics, accounts = RowMetrics(named, confident), _Accounts()
+    stream = FrameStream(sequence, indices, runners, store=store, device=device, check=check)
+    stream.drive([metrics, accounts, *sinks, ProgressSink(progress)], stop=stop)
+    return [_result(row, accounts.rows[row.slug], metrics, sequence) for row in rows]
 
 
-def _check(rows: Sequence[Row], networks: Mapping[str, BaseNetwork], confident: float) -> None:
+class ProgressSink(FrameSink):
+    """Calls ``progress`` with the frames that are done and all of them, at the start and after every frame."""
+
+    def __init__(self, progress: Callable[[int, int], None]) -> None:
+        self._progress, self._total = progress, 0
+
+    def begin(self, stream: FrameStream) -> None:
+        """See :class:`Sink`."""
+        self._total = len(stream.indices)
+        self._progress(stream.position, self._total)
+
+    def take(self, result: FrameResult) -> None:
+        """See :class:`Sink`."""
+        self._progress(result.number + 1, self._total)
+
+
+@dataclass
+class _Account:
+    """Counts, times and memory of a row over a sequence."""
+
+    done: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    ms: dict[str, list[float]] = field(default_factory=lambda: {"network": [], "anchors": [], "uncertainty": []})
+    last: dict[str, float] = field(default_factory=dict)
+    total: dict[str, float] = field(default_factory=dict)
+    most: dict[str, float] = field(default_factory=dict)
+
+    def add(self, ms: Mapping[str, float], memory: Mapping[str, float]) -> None:
+        """A frame that the row has taken in."""
+        self.done += 1
+        for stage, time in ms.items():
+            self.ms[stage].append(time)
+        self.last = dict(memory)
+        for name, value in memory.items():
+            self.total[name] = self.total.get(name, 0) + value
+            self.most[name] = max(value, self.most.get(name, 0))
+
+    def frames(self, judged: int) -> dict[str, Any]:
+        """Counts, as ``Record`` has them."""
+        skipped = sum(self.reasons.values())
+        counts = {"selected": self.done + skipped, "done": self.done, "judged": judged, "skipped": skipped}
+        return {**counts, "reasons": dict(sorted(self.reasons.items()))}
+
+    def state(self) -> dict[str, float]:
+        """What the method kept over the sequence, as ``Record`` has it."""
+        state: dict[str, float] = {}
+        for name in ("bytes", "count"):
+            if name in self.last:
+                mean = self.total[name] / self.done
+                state |= {f"{name}_mean": mean, f"{name}_max": self.most[name], f"{name}_end": self.last[name]}
+        if "anchors" in self.last:
+            state["anchors_mean"] = self.total["anchors"] / self.done
+        if "smoothing_bytes" in self.last:
+            state["smoothing_bytes"] = self.last["smoothing_bytes"]
+        return state
+
+
+class _Accounts(FrameSink):
+    """The account of every row, by key."""
+
+    def begin(self, stream: FrameStream) -> None:
+        """See :class:`Sink`."""
+        self._runners = {row.key: row for row in stream.rows}
+        self.rows = {key: _Account() for key in self._runners}
+
+    def take(self, result: FrameResult) -> None:
+        """See :class:`Sink`."""
+        for key, reason in result.skipped.items():
+            self.rows[key].reasons[reason] += 1
+        for key, row in result.rows.items():
+            self.rows[key].add(row.ms, self._runners[key].estimator.memory())
+
+
+def _check_arguments(rows: Sequence[Row], networks: Mapping[str, DepthSource], confident: float) -> None:
     """Raises ValueError for what ``evaluate_sequence`` cannot do, whatever the sequence."""
     if not rows or len({row.slug for row in rows}) < len(rows):
         raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
@@ -131,23 +220,43 @@ def _check(rows: Sequence[Row], networks: Mapping[str, BaseNetwork], confident: 
         raise ValueError(f"confident must be a share in (0, 1], got {confident}")
 
 
-def _result(run: RowRun, sequence: FrameSequence) -> RowResult:
+def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range) -> None:
+    """Raises SequenceError where no frame can be judged, or the poses that rows compare views by are not known."""
+    if not indices:
+        raise SequenceError(f"no frame is selected of {len(sequence)}")
+    if all(sequence.entries[index].load_depth is None for index in indices):
+        raise SequenceError("no frame has ground truth")
+    comparing = [row.method.name for row in rows if row.method.fusion != ALONE]
+    if comparing and not sequence.posed:
+        raise SequenceError(f"single images without poses, on which {', '.join(comparing)} cannot compare views")
+
+
+def frame_fault(frame: Frame) -> str | None:
+    """What is wrong with a frame's pose or intrinsics for UfM*, None if nothing is."""
+    pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
+    one = torch.ones(1, 1, 1)
+    checked = check_frame(one, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
+    code = int(checked.fault[0])
+    return FRAME_FAULTS[code] if code else None
+
+
+def _result(row: Row, account: _Account, metrics: RowMetrics, sequence: FrameSequence) -> RowResult:
     """What a row leaves behind.
 
     Raises:
         SequenceError: it has judged nothing.
     """
-    frames = run.frames()
+    key, frames = row.slug, account.frames(metrics.judged[row.slug])
     if not frames["judged"]:
-        told = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
-        raise SequenceError(f"no frame could be judged: {told or 'none of those that were read has ground truth'}")
+        reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
+        raise SequenceError(f"no frame could be judged: {reasons or 'none of those that were read has ground truth'}")
     opened = Counter(skipped.reason for skipped in sequence.skipped)
     return RowResult(
-        row=run.row,
+        row=row,
         frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
-        figures=run.figures(),
-        curves=run.curves(),
-        state=run.state(),
-        ms=run.ms(),
-        sums=run.sums(),
+        figures=metrics.figures(key),
+        curves=metrics.curves(key),
+        state=account.state(),
+        ms={stage: median(times) for stage, times in account.ms.items() if times},
+        sums=metrics.sums(key),
     )

@@ -1,65 +1,209 @@
-"""The figures of a run against ground truth: UfM*'s, and beside them those of the depth network alone."""
+"""Figures against ground truth, as sinks of a stream: of a run, of the rows of an evaluation, of image regions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.pipeline import UncertainPrediction
+from ufmstar_torch.eval.engine.confident import confident_pixels
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, RowFrame
 
 if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence without ground truth need not wait for
-    from ufmstar_torch.eval.metrics import SequenceMetrics
+    from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
+# Of a run: UfM*, and the network alone beside it.
 UFM, ALONE = "ufm", "network_alone"
+# Of a row's sums.
+METRICS, BY_ERROR = "metrics", "nll_by_error"
+Key = TypeVar("Key", bound=Hashable)
 
 
-class Judge:
-    """Metrics by method, made when the first frame with ground truth comes.
+class Figures(Generic[Key]):
+    """``SequenceMetrics`` by key, each made when its first frame with ground truth comes."""
 
-    Args:
-        sums: of an earlier judge, from :meth:`state`.
-    """
+    def __init__(self) -> None:
+        self._metrics: dict[Key, SequenceMetrics] = {}
 
-    def __init__(self, sums: Mapping[str, Mapping[str, Tensor]] | None = None) -> None:
-        self._metrics: dict[str, SequenceMetrics] = {}
-        for name, values in (sums or {}).items():
-            self._of(name).load_state_dict(dict(values))
+    def __iter__(self) -> Iterator[Key]:
+        return iter(self._metrics)
 
-    def update(self, result: UncertainPrediction, truth: NDArray | None) -> None:
-        """Add a frame.
-
-        Args:
-            result: of one stream, [1, h, w].
-            truth: [h, w] ground truth [m], 0 = none; or None.
-        """
-        if truth is None:
-            return
-        target = torch.from_numpy(truth)
-        depth, valid = result.depth[0].cpu(), result.ufm.valid[0].cpu()
-        self._of(UFM).update(depth, result.variance[0].cpu(), target, valid)
-        own = result.prediction.variance
-        if own is not None:
-            self._of(ALONE).update(depth, own[0].cpu(), target, valid)
-
-    def state(self) -> dict[str, dict[str, Tensor]]:
-        """The sums, by method and name. They are exchanged by updates, never changed in place."""
-        return {name: dict(metrics.state_dict()) for name, metrics in self._metrics.items()}
-
-    def figures(self) -> dict[str, dict[str, float]]:
-        """delta1, nll, ece_delta, ece_q, spearman, ... by method; without ground truth nothing."""
-        return {name: metrics.compute() for name, metrics in self._metrics.items()}
-
-    def curves(self) -> dict[str, dict[str, Any]]:
-        """Calibration and sparsification curves and the entropy histogram, by method."""
-        return {name: metrics.curves() for name, metrics in self._metrics.items()}
-
-    def _of(self, name: str) -> SequenceMetrics:
+    def of(self, key: Key, *, with_variance: bool = True) -> SequenceMetrics:
+        """The metrics of a key, made now if there are none."""
         from ufmstar_torch.eval.metrics import SequenceMetrics
 
-        if name not in self._metrics:
-            self._metrics[name] = SequenceMetrics()
-        return self._metrics[name]
+        if key not in self._metrics:
+            self._metrics[key] = SequenceMetrics(with_variance=with_variance)
+        return self._metrics[key]
+
+    def state(self) -> dict[Key, dict[str, Tensor]]:
+        """The sums, by key and name. They are exchanged by updates, never changed in place."""
+        return {key: dict(metrics.state_dict()) for key, metrics in self._metrics.items()}
+
+    def load_state(self, state: Mapping[Key, Mapping[str, Tensor]]) -> None:
+        """Add up further where ``state`` was taken."""
+        for key, sums in state.items():
+            self.of(key).load_state_dict(dict(sums))
+
+    def figures(self) -> dict[Key, dict[str, float]]:
+        """delta1, nll, ece_delta, ece_q, spearman, ... by key; without ground truth nothing."""
+        return {key: metrics.compute() for key, metrics in self._metrics.items()}
+
+    def curves(self) -> dict[Key, dict[str, Any]]:
+        """Calibration and sparsification curves and the entropy histogram, by key."""
+        return {key: metrics.curves() for key, metrics in self._metrics.items()}
+
+
+class RunMetrics(FrameSink):
+    """The figures of a run's row, ``UFM``, and beside them those of its network alone, ``ALONE``.
+
+    Both are of the pixels that the row uses; the others are masked.
+
+    Args:
+        key: of the row.
+        sums: of an earlier part of the run, from ``figures.state``.
+    """
+
+    stage: str | None = "metrics"
+
+    def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
+        self._key = key
+        self.figures: Figures[str] = Figures()
+        self.figures.load_state(sums)
+
+    def take(self, result: FrameResult) -> None:
+        """Add a frame."""
+        row = result.rows.get(self._key)
+        if row is None or row.truth is None:
+            return
+        target, estimate = torch.from_numpy(row.truth), row.estimate
+        self.figures.of(UFM).update(estimate.depth, estimate.variance, target, estimate.valid)
+        own = row.prediction.variance
+        if own is not None:
+            self.figures.of(ALONE).update(estimate.depth, own.cpu(), target, estimate.valid)
+
+
+class RowMetrics(FrameSink):
+    """The figures of every row of an evaluation.
+
+    Pixels that a row leaves out are NaN, not masked, so that the metrics count them.
+
+    Args:
+        references: by row, the rows on whose confident pixels its NLL is binned by error, and their names.
+        confident: of the pixels of a frame, the share of which a reference counts as confident.
+
+    Attributes:
+        judged: frames with ground truth, by row.
+    """
+
+    def __init__(self, references: Mapping[str, Mapping[str, str]], confident: float) -> None:
+        self._references, self._confident = references, confident
+        self._figures: Figures[str] = Figures()
+        self._by_error: dict[str, dict[str, NLLByError]] = {}
+        self.judged = dict.fromkeys(references, 0)
+
+    def take(self, result: FrameResult) -> None:
+        """Add a frame."""
+        targets = {key: torch.from_numpy(row.truth) for key, row in result.rows.items() if row.truth is not None}
+        wanted = {other for key in targets for other in self._references[key]}
+        masks = {
+            other: confident_pixels(result.rows[other].estimate, targets[other], self._confident) for other in wanted
+        }
+        for key, target in targets.items():
+            self._judge(key, result.rows[key], target, masks)
+
+    def _judge(self, key: str, row: RowFrame, target: Tensor, masks: Mapping[str, Tensor]) -> None:
+        from ufmstar_torch.eval.metrics import NLLByError
+
+        self.judged[key] += 1
+        estimate = row.estimate
+        depth = torch.where(estimate.valid, estimate.depth, torch.nan)
+        metrics = self._figures.of(key, with_variance=estimate.variance is not None)
+        metrics.update(depth, estimate.variance, target)
+        if estimate.variance is None:
+            return
+        binned = self._by_error.setdefault(key, {})
+        for other, name in self._references[key].items():
+            by_error = binned.setdefault(name, NLLByError(sync_on_compute=False))
+            by_error.update(depth, estimate.variance, target, masks[other])
+
+    def figures(self, key: str) -> dict[str, float]:
+        """``SequenceMetrics.compute`` of a judged row."""
+        return self._figures.of(key).compute()
+
+    def curves(self, key: str) -> dict[str, Any]:
+        """``SequenceMetrics.curves`` of a judged row, and its NLL and error by reference."""
+        curves: dict[str, Any] = self._figures.of(key).curves()
+        for reference, by_error in self._by_error.get(key, {}).items():
+            curves |= {f"{name}:{reference}": curve.tolist() for name, curve in by_error.compute().items()}
+        return curves
+
+    def sums(self, key: str) -> dict[str, dict[str, Tensor]]:
+        """States of a judged row's metrics on the CPU by name: "metrics" and "nll_by_error:REFERENCE"."""
+        named: dict[str, Any] = {METRICS: self._figures.of(key)}
+        named |= {f"{BY_ERROR}:{reference}": binned for reference, binned in self._by_error.get(key, {}).items()}
+        return {name: {entry: value.cpu() for entry, value in m.state_dict().items()} for name, m in named.items()}
+
+
+class RegionMetrics(FrameSink):
+    """The figures of every row in every region of the images, and those of all regions together.
+
+    Args:
+        rows: their keys.
+        regions: their names.
+        region_of: [h, w] int64, at every pixel of a row's map, the number of its region.
+    """
+
+    def __init__(
+        self, rows: Sequence[str], regions: Sequence[str], region_of: Callable[[FrameResult, RowFrame], Tensor]
+    ) -> None:
+        self._rows, self._regions, self._region_of = tuple(rows), tuple(regions), region_of
+        self._figures: Figures[tuple[str, str]] = Figures()
+        pairs = [(row, region) for row in rows for region in regions]
+        self._variance = dict.fromkeys(pairs, (0.0, 0))
+
+    def take(self, result: FrameResult) -> None:
+        """Add a frame."""
+        for key, row in result.rows.items():
+            if row.truth is None:
+                continue
+            target, numbers = torch.from_numpy(row.truth), self._region_of(result, row)
+            for number, region in enumerate(self._regions):
+                inside = (numbers == number) & (target > 0)
+                if bool(inside.any()):
+                    self._add((key, region), row, target, inside & row.estimate.valid)
+
+    def _add(self, pair: tuple[str, str], row: RowFrame, target: Tensor, use: Tensor) -> None:
+        estimate = row.estimate
+        assert estimate.variance is not None
+        self._figures.of(pair).update(estimate.depth, estimate.variance, target, use)
+        chosen = estimate.variance[use].double()
+        total, pixels = self._variance[pair]
+        self._variance[pair] = (total + float(chosen.sum()), pixels + chosen.numel())
+
+    def overall(self) -> dict[str, SequenceMetrics]:
+        """The metrics of all regions, by row."""
+        from ufmstar_torch.eval.metrics import SequenceMetrics
+
+        merged = {}
+        for row in self._rows:
+            merged[row] = SequenceMetrics()
+            for region in self._regions:
+                merged[row].merge_state(self._figures.of((row, region)))
+        return merged
+
+    def by_region(self) -> dict[str, dict[str, dict[str, float]]]:
+        """By region and row: "rmse" [m], "rms_sigma" (root of the mean variance) [m] and the other figures."""
+        return {
+            region: {
+                row: {**self._figures.of((row, region)).compute(), "rms_sigma": self._rms_sigma(row, region)}
+                for row in self._rows
+            }
+            for region in self._regions
+        }
+
+    def _rms_sigma(self, row: str, region: str) -> float:
+        total, pixels = self._variance[row, region]
+        return (total / pixels) ** 0.5 if pixels else float("nan")

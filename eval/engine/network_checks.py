@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from ufmstar_torch.eval.engine.run_source import stochastic
+from ufmstar_torch.eval.engine.networks import stochastic
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, BatchEnsembleMember
 from ufmstar_torch.models.dropout import DecoderDropout, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.network import DepthNetwork

@@ -1,214 +1,108 @@
-"""The networks behind the rows: chosen by a user as ``BASE=MODEL:FILE[,FILE...]``, loaded, and run one by one."""
+"""Networks as a depth source: members in turn, or samples of MC-Dropout, each inference timed."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, cast
 
 import torch
+from torch import Tensor, nn
 
-from ufmstar_torch.eval.engine.network_checks import check_members, without_sampling
-from ufmstar_torch.eval.engine.network_label import label_of
-from ufmstar_torch.eval.engine.predicted import Predicted, together
-from ufmstar_torch.eval.engine.predictor import MemberPredictor, Predictor, TruthPredictor
-from ufmstar_torch.eval.engine.run_source import load_members, require_same_input, sha256
-from ufmstar_torch.eval.methods.method import BASES
-from ufmstar_torch.eval.sequences.frame import Frame, Size, parse_size
-from ufmstar_torch.models.dropout import SAMPLES
-from ufmstar_torch.models.load import network_names
+from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
+from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.pipeline import NetworksInTurn
 
-TRUTH = "ground-truth"
-_FORM = "BASE=MODEL:FILE[,FILE...]"
-_VERSION = 2  # of the digests: raise it where predictions from the same files change
-
-
-@dataclass(frozen=True)
-class NetworkChoice:
-    """A network for a base, as chosen by a user.
-
-    Attributes:
-        base: a key of ``method.BASES``.
-        model: a name that ``load_network`` knows, or "ground-truth" (of "depth_only": the sequence's own depth, which
-            shows what a method says of perfect depth).
-        files: its weights, one or several files, in the order of the members. Of "trained", "FILE#2" is member 2 of
-            the file alone. A file .json is the spec that goes with the weights. Of "ground-truth" nothing, or "HxW".
-        label: as shown; "" = told from the files.
-
-    Raises:
-        ValueError: no such base or model, no files, or files that do not go together.
-    """
-
-    base: str
-    model: str
-    files: tuple[str, ...] = ()
-    label: str = ""
-
-    def __post_init__(self) -> None:
-        if self.base not in BASES:
-            raise ValueError(f"base must be one of {', '.join(BASES)}, got {self.base!r}; expected {_FORM}")
-        if self.model == TRUTH:
-            if self.base != "depth_only" or len(self.files) > 1:
-                raise ValueError("ground-truth goes with depth_only, as in depth_only=ground-truth[:HxW]")
-            try:
-                parse_size(self.files[0] if self.files else None)
-            except ValueError as error:
-                raise ValueError(f"ground-truth:HxW needs a size in pixels, got {self.files[0]!r}") from error
-            return
-        if self.model not in network_names():
-            known = ", ".join((*network_names(), TRUTH))
-            raise ValueError(f"model must be one of {known}, got {self.model!r}; expected {_FORM}")
-        if not self.weights:
-            raise ValueError(f"{self.base}={self.model} needs the file of its weights: {_FORM}")
-        if len([file for file in self.files if _is_spec(file)]) > 1:
-            raise ValueError(f"{self.base}={self.model} takes one spec, got {self.files}")
-
-    @classmethod
-    def parse(cls, text: str, label: str = "") -> NetworkChoice:
-        """From ``BASE=MODEL:FILE[,FILE...]``.
-
-        Raises:
-            ValueError: another form.
-        """
-        base, equals, rest = text.partition("=")
-        model, _, files = rest.partition(":")
-        if not (base and equals and model):
-            raise ValueError(f"a network must be given as {_FORM}, got {text!r}")
-        return cls(base, model, tuple(file for file in files.split(",") if file), label)
-
-    @property
-    def weights(self) -> tuple[str, ...]:
-        """The files without the spec."""
-        return tuple(file for file in self.files if not _is_spec(file))
-
-    @property
-    def spec(self) -> str | None:
-        """The file that declares what the weights do not say."""
-        return next((file for file in self.files if _is_spec(file)), None)
-
-    @property
-    def size(self) -> Size | None:
-        """(h, w) to which ground truth is brought; None = as it is."""
-        return parse_size(self.files[0]) if self.model == TRUTH and self.files else None
+# Sample n of frame i is seeded by i + 1,000,003 n: another seed for every pair as long as a sequence has fewer
+# frames than that, and below 2^32, the largest seed of torch's generator on the CPU.
+_SAMPLE_STRIDE = 1_000_003
 
 
-class BaseNetwork:
-    """The loaded network(s) of a base.
-
-    An ensemble's or BatchEnsemble's members take turns: image i is member i mod N's. MC-Dropout draws one sample an
-    image, or ``samples`` of them. Its sample n of frame i is seeded by i and n, so that it is the same whatever ran
-    before, on one process or many; the first one is what ``ufmstar run`` draws.
+class NetworkSource:
+    """Depth from networks (a ``DepthSource``).
 
     Args:
-        choice: which.
+        networks: moved to ``device``.
         device: where they run.
-        samples: MC-Dropout's, on every image where a row asks for all.
-
-    Attributes:
-        base: as in ``choice``.
-        label: as shown, "FastDepth".
-        digest: tells these networks from others in a cache.
         identity: plain values for the record of what was run.
-        networks: the members as they are run, on ``device``; none of ground truth.
-        passes: inferences that "all" takes.
-        needs_image: whether it predicts from the image; from the depth map otherwise.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: files that do not fit, or a network that does not say what its base is about; see
-            ``check_members``.
+        seeding: of decoder dropout. "frame": by the frame's index, once for all its passes, so that a continued run
+            draws the same. "sample": by the frame's index and the number of the sample, so that a sample is the same
+            whatever ran before. None: the networks draw nothing.
+        label: as tables show it.
+        digest: distinguishes these networks from others in a store; "" = their predictions are not stored.
     """
 
-    def __init__(self, choice: NetworkChoice, device: torch.device, *, samples: int = SAMPLES) -> None:
-        self.choice, self.base = choice, choice.base
-        self._predictor: Predictor
-        self.networks: tuple[DepthNetwork, ...] = ()
-        if choice.model == TRUTH:
-            self.needs_image, self._members, self.passes = False, 1, 1
-            self._predictor = TruthPredictor(choice.size)
-            self.label = choice.label or "ground truth"
-            self.identity: dict[str, Any] = {"model": TRUTH, "label": self.label, "size": choice.size}
-            self.digest = _digest(self.identity)
-            return
-        members = _load(choice)
-        sampling = self.base == "mc_dropout"
-        check_members(self.base, members, device)
-        self.needs_image, self._members, self.networks = True, len(members), tuple(members)
-        self.passes = samples if sampling else len(members)
-        self._predictor = MemberPredictor(members, device, sampling=sampling)
-        files = [_identity(file) for file in choice.weights]
-        spec = None if choice.spec is None else sha256(Path(choice.spec))
-        made_of = {"model": choice.model, "files": [file | {"name": None} for file in files], "spec": spec}
-        drawn = {"samples": samples} if sampling else {}
-        self.digest = _digest({**made_of, **drawn, "device": device.type, "version": _VERSION})
-        self.label = choice.label or label_of(choice.model, Path(_path(choice.weights[0])[0]), members[0])
-        self.identity = {
-            "model": choice.model, "label": self.label, "files": files, "spec": spec, "members": len(members), **drawn,
-        }  # fmt: skip
+    needs_image, is_truth = True, False
+
+    def __init__(
+        self,
+        networks: NetworksInTurn,
+        device: torch.device,
+        identity: Mapping[str, Any],
+        *,
+        seeding: Literal["frame", "sample"] | None = "frame",
+        label: str = "",
+        digest: str = "",
+    ) -> None:
+        self._turns = networks.to(device)
+        self._members = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
+        self._device, self._seeding = device, seeding
+        self.identity, self.label, self.digest = dict(identity), label, digest
+        self._timer = StageTimer(device)
+        self._generator = torch.Generator(device)
+        self._input: tuple[Frame, Tensor, Tensor] | None = None
+        for network in stochastic(networks.networks) if seeding is not None else ():
+            set_sampling(network, True, self._generator)
+
+    @property
+    def networks(self) -> tuple[DepthNetwork, ...]:
+        """The members, on the device and in eval mode."""
+        return self._members
+
+    @property
+    def passes(self) -> int:
+        """Inferences that all members, or all samples, take."""
+        return self._turns.passes
 
     @property
     def cacheable(self) -> bool:
-        """Whether keeping its predictions saves anything."""
-        return self.needs_image
+        """Whether a store may keep the predictions."""
+        return bool(self.digest)
 
     def turn(self, position: int) -> int:
-        """Whose turn it is on the image that a row uses after ``position`` others."""
-        return position % self._members
+        """The member for the image that a row uses after ``position`` others."""
+        return self._turns.turn(position)
 
-    def one(self, frame: Frame, n: int) -> Predicted:
-        """What member (or sample) n says, from one inference.
-
-        Raises:
-            FrameError: the frame has nothing to predict from.
-        """
-        return self._predictor.one(frame, n)
-
-    def predict(self, frame: Frame, position: int, every_member: bool) -> Predicted:
-        """What a row gets: all members (or samples) put together, or the one whose turn it is.
+    def one(self, frame: Frame, n: int) -> Prediction:
+        """One inference, of member (or sample) n.
 
         Raises:
-            FrameError: the frame has nothing to predict from.
+            FrameError: the frame has no image.
         """
-        if every_member:
-            return together([self.one(frame, n) for n in range(self.passes)])
-        return self.one(frame, self.turn(position))
+        with torch.no_grad():
+            x, K = self._prepared(frame)
+            if self._seeding == "sample":
+                self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
+            with self._timer.stage("network"):
+                prediction = self._turns.member(x, n)
+            return Prediction.of(prediction, K[0], self._timer.take()["network"])
+
+    def _prepared(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3]; once for all members."""
+        if self._input is None or self._input[0] is not frame:
+            image, K = image_tensor(frame).to(self._device), torch.from_numpy(frame.intrinsics)[None]
+            x, K = self._turns.prepare(image, K)
+            if self._seeding == "frame":
+                self._generator.manual_seed(frame.index)
+            self._input = (frame, x, K)
+        return self._input[1], self._input[2]
 
 
-def _load(choice: NetworkChoice) -> list[DepthNetwork]:
-    """The members that the files hold, in their order."""
-    try:
-        members: list[DepthNetwork] = []
-        for file in choice.weights:
-            path, member = _path(file)
-            found = load_members(choice.model, [path], spec=choice.spec)
-            if member is not None and member >= len(found):
-                raise ValueError(f"{path} has {len(found)} members, there is no {member} (counted from 0)")
-            members += found if member is None else [found[member]]
-        require_same_input(members)
-    except ValueError as error:
-        raise ValueError(f"{choice.base}={choice.model}: {error}") from error
-    return members if choice.base == "mc_dropout" else [without_sampling(member) for member in members]
-
-
-def _path(file: str) -> tuple[str, int | None]:
-    """A file and the member of it that is meant; None = all of them."""
-    path, mark, number = file.rpartition("#")
-    if mark and path and number.isdecimal() and not Path(file).exists():
-        return path, int(number)
-    return file, None
-
-
-def _identity(file: str) -> dict[str, Any]:
-    path, member = _path(file)
-    return {"name": Path(path).name, "sha256": sha256(Path(path)), "member": member}
-
-
-def _is_spec(file: str) -> bool:
-    return file.endswith(".json")
-
-
-def _digest(values: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+def stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:
+    """Those of the networks that sample."""
+    opened = [network.network() if isinstance(network, LazyMember) else network for network in networks]
+    return [network for network in opened if isinstance(network, MonteCarloDropout)]

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.setting import Setting
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 # What is drawn of a frame beside its noise, as a third number of the seed; 1 and 2 are of its anchors.
 _DRIFT = 3
+# Of a walk's state.
+_KEPT = ("index", "T_world_cam", "drifted")
 
 
 def selects(setting: Setting, number: int) -> bool:
@@ -90,6 +97,21 @@ class Drift:
             drifted = drifted_before @ np.linalg.solve(T_before, T_world_cam) @ step
         self._last = index, T_world_cam, drifted
         return drifted
+
+    def state(self) -> dict[str, Tensor]:
+        """The last frame's index, pose and pose with drift; {} before the first frame, and without drift."""
+        import torch
+
+        if self._last is None:
+            return {}
+        return {name: torch.tensor(value) for name, value in zip(_KEPT, self._last, strict=True)}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue where ``state`` was taken, with the same poses to the last bit."""
+        self._last = None
+        if state:
+            index, T_world_cam, drifted = (state[name].numpy() for name in _KEPT)
+            self._last = int(index), T_world_cam, drifted
 
     def _increment(self, index: int) -> NDArray[np.float64]:
         return np.random.default_rng([self._setting.seed, index, _DRIFT]).standard_normal(6)

@@ -34,7 +34,7 @@ class Setting(Checked):
         anchors: what UfM* is anchored by (``UfMStarConfig.anchored`` follows): "" nothing; "tracked": corners of the
             images, triangulated with the row's poses; "truth": ground truth at pixels drawn at random, the upper bound.
         anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
-        track_noise: standard deviation of noise on tracked positions [px of the image]; see ``anchor_source``.
+        track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
 
     Raises:

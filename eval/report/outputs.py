@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.demo_methods import NETWORK, UFM_STAR, Compared
+from ufmstar_torch.eval.engine.stream import FrameResult
+from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
@@ -27,6 +28,8 @@ from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
 from ufmstar_torch.ufmstar import UfMStar
 
+# Rows of the demo beside UfM and UfM*: the member in turn alone, and all members on every image.
+NETWORK, ENSEMBLE = "network", "ensemble"
 SHEET, CURVES, PLY, ELLIPSOIDS, NPZ = (
     "contact_sheet.png",
     "calibration.png",
@@ -160,22 +163,25 @@ def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: 
 # ---- the demo ----
 
 
-def panel(name: str, note: str, image: NDArray[np.uint8], compared: Compared, truth: NDArray[np.float32]) -> FramePanel:
+def panel(name: str, note: str, result: FrameResult) -> FramePanel:
     """One row of the demo's sheet: the network's depth, its own sigma, that of UfM*, and the true error.
 
     Args:
         name: of the frame.
         note: the kind of room.
-        image: [H, W, 3] uint8 RGB.
-        compared: the frame by all methods.
-        truth: [h, w] [m], 0 = none.
+        result: the frame through the demo's rows, with an image and ground truth.
     """
-    own, star = compared.estimates[NETWORK], compared.estimates[UFM_STAR]
+    own, star, truth = result.rows[NETWORK].estimate, result.rows[UFM_STAR].estimate, result.rows[UFM_STAR].truth
+    assert result.frame is not None
+    assert result.frame.image is not None
+    assert truth is not None
+    assert star.variance is not None
+    assert own.variance is not None
     depth = star.depth.float().numpy()
     return FramePanel(
         name=name,
         note=note,
-        image=image,
+        image=result.frame.image,
         depth=depth,
         sigma=star.variance.float().sqrt().numpy(),
         own_sigma=own.variance.float().sqrt().numpy(),

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.engine.demo_methods import ENSEMBLE, NETWORK, UFM, UFM_STAR
+from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, PLY, SHEET
+from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, ENSEMBLE, NETWORK, PLY, SHEET
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report

@@ -8,54 +8,27 @@ from __future__ import annotations
 
 import hashlib
 import io
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.engine.predicted import Predicted
+from ufmstar_torch.eval.engine.predictions import Prediction, PredictionKey
 from ufmstar_torch.eval.results.files import write_atomic
-from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 
 _DIGEST = 32  # bytes of a SHA-256
-_SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
 
 
 class CacheError(Exception):
     """The folder cannot be used; says which one and why."""
 
 
-@dataclass(frozen=True)
-class PredictionKey:
-    """What a prediction depends on.
-
-    Attributes:
-        network: digest of the network(s).
-        sequence: ``sequence_digest``.
-        frame: its name.
-        member: "0", "1", ..., or "all".
-        content: ``frame_digest``.
-    """
-
-    network: str
-    sequence: str
-    frame: str
-    member: str
-    content: str
-
-    @property
-    def path(self) -> Path:
-        """Within the cache's folder."""
-        return Path(self.network[:_SHOWN], self.sequence[:_SHOWN], f"{self.frame}@{self.member}.maps")
-
-
 class PredictionCache:
-    """Files of predictions. Several processes may use one folder: a file is whole or absent, and those who write
-    the same one write the same.
+    """A ``PredictionStore`` in files. Several processes may use one folder: a file is whole or absent, and processes
+    that write the same file write the same content.
 
     Args:
-        folder: made if it is not there; None = nothing is kept.
+        folder: made if it does not exist.
 
     Attributes:
         hits: predictions that were read.
@@ -66,11 +39,9 @@ class PredictionCache:
         CacheError: the folder cannot be made or written.
     """
 
-    def __init__(self, folder: Path | None) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.hits = self.misses = self.damaged = 0
-        if folder is None:
-            return
         try:
             folder.mkdir(parents=True, exist_ok=True)
             # Asked by writing: permissions do not tell of file systems that are mounted read-only.
@@ -79,10 +50,8 @@ class PredictionCache:
         except OSError as error:
             raise CacheError(_cannot(folder, error)) from error
 
-    def load(self, key: PredictionKey, device: torch.device) -> Predicted | None:
+    def load(self, key: PredictionKey, device: torch.device) -> Prediction | None:
         """The prediction, or None where it has to be made."""
-        if self.folder is None:
-            return None
         try:
             content = (self.folder / key.path).read_bytes()
         except FileNotFoundError:
@@ -102,18 +71,16 @@ class PredictionCache:
         self.hits += 1
         K = torch.from_numpy(arrays.pop("intrinsics"))
         maps = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
-        return Predicted(maps["depth"], maps.get("aleatoric"), maps.get("epistemic"), K)
+        return Prediction(maps["depth"], maps.get("aleatoric"), maps.get("epistemic"), K)
 
-    def store(self, key: PredictionKey, predicted: Predicted) -> None:
+    def store(self, key: PredictionKey, prediction: Prediction) -> None:
         """Keep a prediction.
 
         Raises:
             CacheError: it cannot be written.
         """
-        if self.folder is None:
-            return
-        arrays = {name: value.cpu().numpy() for name, value in predicted.maps().items()}
-        arrays["intrinsics"] = predicted.intrinsics.numpy()
+        arrays = {name: value.cpu().numpy() for name, value in prediction.maps().items()}
+        arrays["intrinsics"] = prediction.intrinsics.numpy()
         arrays["content"] = np.frombuffer(key.content.encode(), np.uint8)
         packed = io.BytesIO()
         np.savez(packed, allow_pickle=False, **arrays)
@@ -124,21 +91,6 @@ class PredictionCache:
             write_atomic(path, lambda file: file.write(hashlib.sha256(body).digest() + body))
         except OSError as error:
             raise CacheError(_cannot(self.folder, error)) from error
-
-
-def sequence_digest(sequence: FrameSequence) -> str:
-    """Hex digest of a sequence's name, layout, camera and frames' names."""
-    told = (sequence.name, sequence.layout, sequence.image_size, sequence.intrinsics.tolist(), sequence.names)
-    return hashlib.sha256(repr(told).encode()).hexdigest()
-
-
-def frame_digest(frame: Frame) -> str:
-    """Hex digest of what a network sees of a frame: pixels and intrinsics (and the index, which seeds samples)."""
-    digest = hashlib.sha256(repr((frame.index, None if frame.image is None else frame.image.shape)).encode())
-    digest.update(np.ascontiguousarray(frame.intrinsics).tobytes())
-    if frame.image is not None:
-        digest.update(np.ascontiguousarray(frame.image).tobytes())
-    return digest.hexdigest()
 
 
 def _cannot(folder: Path, error: OSError) -> str:

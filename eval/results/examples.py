@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.engine.estimator import Estimate, Gaussians
-from ufmstar_torch.eval.engine.row_run import RowRun
-from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.engine.estimators import Gaussians
+from ufmstar_torch.eval.engine.rows import RowFrame
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.sequences.frame import Frame, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
@@ -57,89 +57,67 @@ class Examples:
             raise ValueError(f"frames must be at least 0, got {self.frames}")
 
 
-@dataclass(frozen=True, eq=False)
-class FinishedFrame:
-    """A frame that all rows have taken in.
+class ExampleWriter(FrameSink):
+    """A sink that writes what ``Examples`` asks for."""
 
-    Attributes:
-        frame: as it was read.
-        estimates: by row.
-        truths: ground truth at the rows' pixels, [h, w] float32 [m], 0 = none.
-        intrinsics: [3, 3] float64 of the rows' maps [px].
-    """
-
-    frame: Frame
-    estimates: Mapping[Row, Estimate]
-    truths: Mapping[Row, NDArray[np.float32]]
-    intrinsics: Mapping[Row, NDArray[np.float64]]
-
-
-class ExampleWriter:
-    """Writes what ``Examples`` asks for while a sequence is evaluated.
-
-    Args:
-        examples: where and what.
-        total: number of frames to be judged.
-    """
-
-    def __init__(self, examples: Examples, total: int) -> None:
+    def __init__(self, examples: Examples) -> None:
         self._examples = examples
+        self._paths: dict[str, list[NDArray[np.float64]]] = {}
+        self._last: dict[str, tuple[str, NDArray[np.float64]]] = {}
+
+    def begin(self, stream: FrameStream) -> None:
+        """See ``Sink``."""
+        examples, total = self._examples, len(stream.indices)
         self._frames = _Schedule([(n + 0.5) / examples.frames for n in range(examples.frames)], total)
         self._rooms = _Schedule(ROOM_SHARES if examples.room else (), total)
-        self._paths: dict[str, list[NDArray[np.float64]]] = {}
+        self._gaussians = {row.key: row.estimator for row in stream.rows if isinstance(row.estimator, Gaussians)}
 
-    def after(self, done: int, finished: FinishedFrame | None, runs: Sequence[RowRun]) -> None:
-        """After each frame.
-
-        Args:
-            done: frames so far.
-            finished: the last one; None if no row has taken it in.
-            runs: all rows.
+    def take(self, result: FrameResult) -> None:
+        """After each frame; one that no row has taken in hands its place to the next.
 
         Raises:
             OSError: see ``write_atomic``.
         """
-        if finished is None:
+        if not result.rows or result.frame is None:
             return
-        for run in runs:
-            if self._examples.room and isinstance(run.estimator, Gaussians) and run.last is not None:
-                self._paths.setdefault(run.row.slug, []).append(np.asarray(run.last[1])[:3, 3].copy())
-        if self._frames.due(done):
-            self._write_frame(finished)
-        if self._rooms.due(done):
-            self._write_rooms(runs)
+        for key in self._gaussians if self._examples.room else ():
+            if key in result.rows:
+                self._last[key] = result.name, result.rows[key].T_world_cam
+            if key in self._last:
+                self._paths.setdefault(key, []).append(self._last[key][1][:3, 3].copy())
+        if self._frames.due(result.number + 1):
+            self._write_frame(result, result.frame)
+        if self._rooms.due(result.number + 1):
+            self._write_rooms()
 
-    def end(self, runs: Sequence[RowRun]) -> None:
+    def end(self) -> None:
         """After the last frame.
 
         Raises:
             OSError: see ``write_atomic``.
         """
         if self._examples.room:
-            self._write_rooms(runs)
+            self._write_rooms()
 
-    def _write_frame(self, finished: FinishedFrame) -> None:
+    def _write_frame(self, result: FrameResult, frame: Frame) -> None:
         folder = self._examples.folder / "examples"
         folder.mkdir(parents=True, exist_ok=True)
-        name, scenes = finished.frame.name, {row: _scene(finished, row) for row in finished.estimates}
+        scenes = {key: _scene(frame, row) for key, row in result.rows.items()}
         first = next(iter(scenes.values()))
-        _write(folder / f"{name}.npz", {**first, "index": np.array(finished.frame.index)})
-        for row, estimate in finished.estimates.items():
-            maps = {part: getattr(estimate, part) for part in _MAPS}
+        _write(folder / f"{frame.name}.npz", {**first, "index": np.array(frame.index)})
+        for key, row in result.rows.items():
+            maps = {part: getattr(row.estimate, part) for part in _MAPS}
             arrays = {part: value.float().numpy() for part, value in maps.items() if value is not None}
-            scene = scenes[row]
+            scene = scenes[key]
             alike = scene["truth"].shape == first["truth"].shape and np.array_equal(scene["K"], first["K"])
-            _write(folder / f"{name}@{row.slug}.npz", arrays if alike else {**arrays, **scene})
+            _write(folder / f"{frame.name}@{key}.npz", arrays if alike else {**arrays, **scene})
 
-    def _write_rooms(self, runs: Sequence[RowRun]) -> None:
+    def _write_rooms(self) -> None:
         folder = self._examples.folder / "room"
         folder.mkdir(parents=True, exist_ok=True)
-        for run in runs:
-            if isinstance(run.estimator, Gaussians) and run.last is not None:
-                name, T_world_cam = run.last
-                path = np.array(self._paths[run.row.slug])
-                arrays = {**_room(run.estimator), "T_world_cam": T_world_cam, "path": path}
-                _write(folder / f"{run.row.slug}_{name}.npz", arrays)
+        for key, (name, T_world_cam) in self._last.items():
+            arrays = {**_room(self._gaussians[key]), "T_world_cam": T_world_cam, "path": np.array(self._paths[key])}
+            _write(folder / f"{key}_{name}.npz", arrays)
 
 
 class _Schedule:
@@ -173,10 +151,10 @@ def _room(estimator: Gaussians) -> dict[str, NDArray]:
     return {name: value[0][world.valid[0]].cpu().numpy() for name, value in named.items()}
 
 
-def _scene(finished: FinishedFrame, row: Row) -> dict[str, NDArray]:
-    """What was to be seen, at the pixels of a row's maps."""
-    frame, truth, K = finished.frame, finished.truths[row], finished.intrinsics[row]
-    size = (truth.shape[0], truth.shape[1])
+def _scene(frame: Frame, row: RowFrame) -> dict[str, NDArray]:
+    """The image and the ground truth at the pixels of a row's maps."""
+    size, K = row.prediction.size, row.prediction.intrinsics.numpy()
+    truth = np.zeros(size, np.float32) if row.truth is None else row.truth
     image = np.zeros((*size, 3), np.uint8) if frame.image is None else _seen(frame.image, frame.intrinsics, K, size)
     return {"image": image, "truth": truth, "K": K}
 

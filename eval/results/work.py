@@ -12,14 +12,16 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.engine.confident import references
-from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, Stopped, evaluate_sequence
-from ufmstar_torch.eval.engine.networks import BaseNetwork, NetworkChoice
+from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
+from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
-from ufmstar_torch.eval.results.examples import Examples
+from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
 from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
@@ -65,17 +67,17 @@ class EvalJob:
     examples: int = 3
     samples: int | None = None
 
-    def load(self, device: torch.device) -> dict[str, BaseNetwork]:
+    def load(self, device: torch.device) -> dict[str, DepthSource]:
         """The networks that the rows need.
 
         Raises:
-            FileNotFoundError, ValueError, ImportError: see ``BaseNetwork``.
+            FileNotFoundError, ValueError, ImportError: see ``NetworkChoice.load``.
         """
         passes = {} if self.samples is None else {"samples": self.samples}
         needed = [self.networks[base] for base in self.suite.bases]
-        return {choice.base: BaseNetwork(choice, device, **passes) for choice in needed}
+        return {choice.base: choice.load(device, **passes) for choice in needed}
 
-    def about(self, networks: Mapping[str, BaseNetwork]) -> dict[str, Any]:
+    def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """eval.json."""
         suite, f = self.suite, self.frames
         opening = {name: value for item in self.items for name, value in item.opening}
@@ -152,7 +154,7 @@ class WorkerContext:
     evaluate: Evaluate = evaluate_sequence
 
 
-def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, BaseNetwork], context: WorkerContext) -> bool:
+def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext) -> bool:
     """Evaluate the sequences one after another.
 
     Args:
@@ -200,7 +202,7 @@ class _Worker:
 
     job: EvalJob
     folder: EvalFolder
-    networks: Mapping[str, BaseNetwork]
+    networks: Mapping[str, DepthSource]
     context: WorkerContext
     cache: PredictionCache
 
@@ -247,10 +249,10 @@ class _Worker:
             sequence,
             with_references(todo, possible) if todo else missing,
             self.networks,
-            cache=self.cache,
+            store=self.cache,
             device=torch.device(job.device),
             limit=job.frames,
-            examples=Examples(self.folder.place(item)) if job.keeps_examples(item) else None,
+            sinks=[ExampleWriter(Examples(self.folder.place(item)))] if job.keeps_examples(item) else [],
             confident=job.confident,
             stop=self.context.stop,
             progress=lambda done, total: self.context.progress(item.label, done, total),

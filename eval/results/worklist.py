@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.results.cache import sequence_digest
+from ufmstar_torch.eval.engine.predictions import sequence_digest
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 
 TOUR = "tour"

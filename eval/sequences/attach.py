@@ -42,7 +42,7 @@ def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajector
 
     Args:
         names: of all images on disk, in order.
-        times: [N] of the images [s], or None where nothing but the names tells them.
+        times: [N] of the images [s], or None where only the names may hold them.
         trajectory: the poses.
         options: ``max_pose_gap``, ``fps`` and ``time_offset``.
 

@@ -19,11 +19,11 @@ class Convention:
     """A way to write poses.
 
     Attributes:
-        told: in words.
+        description: in words.
         convert: [..., 4, 4] as written -> camera-to-world, x right, y down, z forward.
     """
 
-    told: str
+    description: str
     convert: Callable[[np.ndarray], np.ndarray]
 
 

@@ -96,8 +96,8 @@ class DepthFolder:
         """The maps of a sequence's frames: by stem, or by the numbers in the names, or else in sorted order.
 
         Args:
-            names: the frames' names (:attr:`Sequence.names`).
-            names_on_disk: the same with the frames that the sequence skips (:attr:`Sequence.names_on_disk`);
+            names: the frames' names (:attr:`FrameSequence.names`).
+            names_on_disk: the same with the frames that the sequence skips (:attr:`FrameSequence.names_on_disk`);
                 sorted order counts on there being as many maps as one of the two.
 
         Raises:
@@ -116,8 +116,8 @@ def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
     files = list_files(folder, suffixes)
     found = sorted({file.suffix.lower() for file in files})
     if len(found) != 1:
-        told = f"several formats, {', '.join(found)}" if found else f"no map ({', '.join(suffixes)})"
-        raise ValueError(f"{what}: the folder {folder} holds {told}")
+        content = f"several formats, {', '.join(found)}" if found else f"no map ({', '.join(suffixes)})"
+        raise ValueError(f"{what}: the folder {folder} holds {content}")
     return files
 
 

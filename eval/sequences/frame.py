@@ -19,19 +19,23 @@ Size = tuple[int, int]
 # A principal point outside this share of the image, on either axis, belongs to another image size: real
 # cameras and the usual crops stay within it, a K given for twice or half the size does not.
 _CENTRE_RANGE = (0.2, 0.8)
+# A map of so many pixels takes 1 GiB in double precision: more is a slip of the keyboard.
+_MAX_PIXELS = 2**27
 
 
 def parse_size(text: str | None, option: str = "--size") -> Size | None:
     """HxW as (H, W), None for None.
 
     Raises:
-        ValueError: another form; the message names ``option``.
+        ValueError: another form, or more pixels than an image can have; the message names ``option``.
     """
     if text is None:
         return None
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdigit() and int(part) for part in parts):
         raise ValueError(f"{option} must be HxW in pixels, 240x320 say, got {text!r}")
+    if int(parts[0]) * int(parts[1]) > _MAX_PIXELS:
+        raise ValueError(f"{option} must be at most {_MAX_PIXELS / 1e6:.0f} million pixels, got {text!r}")
     return int(parts[0]), int(parts[1])
 
 
@@ -200,8 +204,8 @@ def make_sequence(
     skipped = tuple(frame for frame in listed if isinstance(frame, Skipped))
     if not entries:
         reasons = Counter(frame.reason for frame in skipped).most_common(3)
-        told = "; ".join(f"{count} x {reason}" for reason, count in reasons) or "no frame was found"
-        raise ValueError(f"{layout} sequence {name!r} has no usable frame: {told}")
+        summary = "; ".join(f"{count} x {reason}" for reason, count in reasons) or "no frame was found"
+        raise ValueError(f"{layout} sequence {name!r} has no usable frame: {summary}")
     names = tuple(frame.name for frame in listed)
     repeated = [frame_name for frame_name, count in Counter(names).items() if count > 1]
     if repeated:

@@ -144,15 +144,15 @@ def _intrinsics(root: Path, options: Options) -> np.ndarray:
 
 
 def _images(path: Path, options: Options) -> tuple[list[str], list[Loader], Size | None, np.ndarray | None]:
-    """Names, loaders, (H, W) and timestamps (None where nothing tells them) of the images."""
+    """Names, loaders, (H, W) and timestamps (None where they are not known) of the images."""
     source = path
     if options.images is not None:
         source = resolve(path, options.images)
     elif path.is_dir():
         found = _image_sources(path)
         if len(found) != 1:
-            told = f"found {[str(f) for f in found]}" if found else f"looked for {IMAGES} and a video file"
-            raise ValueError(f"{path}: pass images, there must be one folder of them or one video ({told})")
+            listing = f"found {[str(f) for f in found]}" if found else f"looked for {IMAGES} and a video file"
+            raise ValueError(f"{path}: pass images, there must be one folder of them or one video ({listing})")
         source = found[0]
     if source.is_file():
         video = Video(source)
@@ -225,6 +225,6 @@ def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...]
         return resolve(root, given)
     found = [root / name for name in names if (root / name).is_file()]
     if len(found) != 1:
-        told = f"found {[file.name for file in found]}" if found else f"looked for {', '.join(names)}"
-        raise ValueError(f"{root}: pass {option}, exactly one file must be it ({told})")
+        listing = f"found {[file.name for file in found]}" if found else f"looked for {', '.join(names)}"
+        raise ValueError(f"{root}: pass {option}, exactly one file must be it ({listing})")
     return found[0]

@@ -26,15 +26,15 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
         ValueError: the file or array has another shape.
     """
     if isinstance(source, str | Path):
-        values, told = read_matrix(source), f"intrinsics file {source}"
+        values, source_name = read_matrix(source), f"intrinsics file {source}"
     else:
-        values, told = np.array(source, dtype=np.float64), "intrinsics"
+        values, source_name = np.array(source, dtype=np.float64), "intrinsics"
     if values.shape in ((4,), (1, 4), (4, 1)):
         return pinhole(*values.ravel())
     if values.size == 9:
         values = values.reshape(3, 3)
     if values.shape not in ((3, 3), (3, 4), (4, 4)):
-        raise ValueError(f"{told}: expected a 3x3 matrix or fx fy cx cy, got shape {list(values.shape)}")
+        raise ValueError(f"{source_name}: expected a 3x3 matrix or fx fy cx cy, got shape {list(values.shape)}")
     return np.ascontiguousarray(values[:3, :3])
 
 

@@ -75,7 +75,7 @@ def open_sequence(
             customary for a layout (TartanAir's NED) is known.
 
     Returns:
-        The frames with a usable pose; ``skipped`` tells the others.
+        The frames with a usable pose; ``skipped`` has the others.
 
     Raises:
         FileNotFoundError: ``path`` does not exist.

@@ -3,7 +3,7 @@
 ``rgb`` is uint8 [3, H, W], ``depth`` floating-point [H, W] in metres along the optical axis, registered to ``rgb``;
 0 or not finite = none. The images are single ones: the sequence has ``posed`` False, and its poses, the identity, mean
 nothing. A network's own variance can be judged on it; rows that compare views (UfM, UfM*) must be refused, by looking
-at ``Sequence.posed`` and not at the poses. What networks see of an image is ``Preprocess.nyu()``.
+at ``FrameSequence.posed`` and not at the poses. What networks see of an image is ``Preprocess.nyu()``.
 """
 
 from __future__ import annotations

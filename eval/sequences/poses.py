@@ -1,6 +1,6 @@
 """Trajectories: reading the common text formats, interpolation, association by timestamp.
 
-All poses are camera-to-world. Formats are told apart by the number of columns of a line:
+All poses are camera-to-world. The number of columns of a line is the format:
 
 ====  ==========================================================
 7     ``tx ty tz qx qy qz qw`` (TartanAir)

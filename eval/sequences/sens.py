@@ -41,7 +41,7 @@ _BEYOND = "beyond the end of the truncated file"
 
 @dataclass(frozen=True, eq=False)
 class SensHeader:
-    """What the file says before its frames; sizes are (H, W), matrices [4, 4]."""
+    """The header before the frames; sizes are (H, W), matrices [4, 4]."""
 
     sensor: str
     K_color: np.ndarray

@@ -1,22 +1,22 @@
-"""What judges a row's views: nothing (the network's own variance), UfM or UfM*."""
+"""How a row gets its variance: from the network alone, from UfM or from UfM*."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.predicted import Predicted
+from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
+from ufmstar_torch.output import FrameStatistics
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -25,38 +25,56 @@ class Estimate:
     """A row's answer for one frame: maps [h, w] on the CPU.
 
     Attributes:
-        depth: as predicted, or corrected by what anchors say, where the row is about that [m].
+        depth: as predicted, or corrected by the anchors' bias, where the row is about that [m].
         variance: total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
         valid: bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
         aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
         disagreement: M of UfM* [m^2], or None.
+        anchored: B of UfM* with anchors [m^2], or None.
+        bias: r of UfM* with anchors, or None.
+        statistics: of UfM*, [1] per count, or None.
     """
 
     depth: Tensor
     variance: Tensor | None
     valid: Tensor
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-    disagreement: Tensor | None
+    aleatoric: Tensor | None = None
+    epistemic: Tensor | None = None
+    disagreement: Tensor | None = None
+    anchored: Tensor | None = None
+    bias: Tensor | None = None
+    statistics: FrameStatistics | None = None
 
 
-class Estimator(ABC):
+class Estimator(Protocol):
     """Turns the predictions of a sequence, one after the other, into variances."""
 
-    @abstractmethod
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
+    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """Take in the next frame.
 
         Args:
-            predicted: [h, w] maps on the estimator's device.
+            prediction: [h, w] maps on the estimator's device.
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
-            anchors: [1, N] of the frame, where the row's setting has some.
+            anchors: [1, N] of the frame in the map's pixels; None = none.
         """
+        ...
 
-    @abstractmethod
-    def state(self) -> dict[str, float]:
+    def memory(self) -> dict[str, float]:
         """What is kept for the next frame: "bytes" and "count" of points or components, "smoothing_bytes" of the map
         kept for smoothing [B]; {} if nothing is. With anchors also "anchors", those used of the frame."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors on which the next frame depends."""
+        ...
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue where ``state`` was taken.
+
+        Raises:
+            ValueError: it is the state of another kind of estimator.
+        """
+        ...
 
 
 def make_estimator(row: Row, device: torch.device) -> Estimator:
@@ -73,9 +91,11 @@ def make_estimator(row: Row, device: torch.device) -> Estimator:
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
-        return Pointwise(method.max_points, device, uses_variances=method.uses_aleatoric)
-    config = ufm_star_config(row)
-    return Gaussians(config, device, uses_variances=method.uses_aleatoric, corrected=row.setting.corrected)
+        config = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
+        return Pointwise(config, device, uses_variances=method.uses_aleatoric)
+    return Gaussians(
+        ufm_star_config(row), device, uses_variances=method.uses_aleatoric, corrected=row.setting.corrected
+    )
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:
@@ -126,57 +146,74 @@ def _names(values: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 @dataclass(frozen=True)
-class Alone(Estimator):
+class Alone:
     """The network's own variance, A + E of what it has.
 
     Attributes:
         uses_variances: False leaves A and E aside, so that there is no variance.
     """
 
-    uses_variances: bool
+    uses_variances: bool = True
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
+    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """See :meth:`Estimator.update`; pose and anchors do not matter."""
-        a, e = _variances(predicted, self.uses_variances)
+        a, e = _variances(prediction, self.uses_variances)
         parts = [part for part in (a, e) if part is not None]
-        valid = (predicted.depth > 0) & predicted.depth.isfinite()
+        valid = (prediction.depth > 0) & prediction.depth.isfinite()
         for part in parts:
             valid = valid & part.isfinite() & (part >= 0)
         variance = torch.where(valid, sum(parts[1:], start=parts[0]), torch.nan) if parts else None
-        return _estimate(predicted.depth, variance, valid, a, e, None)
+        return _estimate(depth=prediction.depth, variance=variance, valid=valid, aleatoric=a, epistemic=e)
 
-    def state(self) -> dict[str, float]:
+    def memory(self) -> dict[str, float]:
         """Nothing."""
         return {}
 
+    def state(self) -> dict[str, Tensor]:
+        """Nothing."""
+        return {}
 
-class Pointwise(Estimator):
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """See :meth:`Estimator.load_state`."""
+        if state:
+            raise ValueError(f"the saved state has {sorted(state)} too many")
+
+
+class Pointwise:
     """UfM.
 
     Args:
-        max_points: None = unpruned.
+        config: its settings.
         device: of the points.
         uses_variances: False leaves A and E aside.
     """
 
-    def __init__(self, max_points: int | None, device: torch.device, *, uses_variances: bool) -> None:
-        self.ufm = UfM(UfMConfig(max_points=max_points, on_bad_frame="skip"), device=device)
+    def __init__(self, config: UfMConfig, device: torch.device, *, uses_variances: bool = True) -> None:
+        self.ufm = UfM(config, device=device)
         self._uses_variances = uses_variances
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`."""
-        a, e = _variances(predicted, self._uses_variances)
-        out = self.ufm(predicted.depth[None], T_world_cam, predicted.intrinsics, _one(a), _one(e))
-        return _estimate(predicted.depth, out.variance[0], out.valid[0], a, e, None)
+    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
+        """See :meth:`Estimator.update`; anchors do not matter."""
+        a, e = _variances(prediction, self._uses_variances)
+        out = self.ufm(prediction.depth[None], T_world_cam, prediction.intrinsics, _one(a), _one(e))
+        return _estimate(depth=prediction.depth, variance=out.variance[0], valid=out.valid[0], aleatoric=a, epistemic=e)
 
-    def state(self) -> dict[str, float]:
+    def memory(self) -> dict[str, float]:
         """Bytes and number of the points."""
         cloud = self.ufm.clouds()[0] if len(self.ufm.points) else None
         count = 0 if cloud is None else len(cloud.count)
         return {"bytes": count * (cloud.bytes_per_point if cloud else 0), "count": count, "smoothing_bytes": 0}
 
+    def state(self) -> dict[str, Tensor]:
+        """See :meth:`Estimator.state`."""
+        return dict(self.ufm.state_dict())
 
-class Gaussians(Estimator):
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """See :meth:`Estimator.load_state`."""
+        _load(self.ufm, state)
+
+
+class Gaussians:
     """UfM*.
 
     Args:
@@ -187,37 +224,57 @@ class Gaussians(Estimator):
     """
 
     def __init__(
-        self, config: UfMStarConfig, device: torch.device, *, uses_variances: bool, corrected: bool = False
+        self, config: UfMStarConfig, device: torch.device, *, uses_variances: bool = True, corrected: bool = False
     ) -> None:
         self.ufm = UfMStar(config, device=device)
         self._uses_variances, self._corrected = uses_variances, corrected
         self._anchors = 0
 
-    def update(self, predicted: Predicted, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
+    def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """See :meth:`Estimator.update`."""
-        a, e = _variances(predicted, self._uses_variances)
-        K = predicted.intrinsics[None]
-        out = self.ufm(predicted.depth[None], T_world_cam[None], K, _one(a), _one(e), anchors=anchors)
+        a, e = _variances(prediction, self._uses_variances)
+        K = prediction.intrinsics[None]
+        out = self.ufm(prediction.depth[None], T_world_cam[None], K, _one(a), _one(e), anchors=anchors)
         self._anchors = int(out.statistics.anchors_used[0])
-        depth, variance = out.corrected() if self._corrected else (predicted.depth[None], out.variance)
-        return _estimate(depth[0], variance[0], out.valid[0], a, e, out.disagreement[0])
+        depth, variance = out.corrected() if self._corrected else (prediction.depth[None], out.variance)
+        return _estimate(
+            depth=depth[0],
+            variance=variance[0],
+            valid=out.valid[0],
+            aleatoric=a,
+            epistemic=e,
+            disagreement=out.disagreement[0],
+            anchored=None if out.anchored is None else out.anchored[0],
+            bias=None if out.bias is None else out.bias[0],
+            statistics=out.statistics,
+        )
 
-    def state(self) -> dict[str, float]:
-        """Bytes and number of the occupied components, with what anchors taught of them; the bytes of the moving
+    def memory(self) -> dict[str, float]:
+        """Bytes and number of the occupied components, with what anchors added to them; the bytes of the moving
         average beside them."""
         mixture, smoothed = self.ufm.mixture, self.ufm.smoothed
         count = int(mixture.components.sum())
-        smoothing = smoothed.numel() * smoothed.element_size()
-        bytes_ = count * mixture.bytes_per_component()
-        found: dict[str, float] = {"bytes": bytes_, "count": count, "smoothing_bytes": smoothing}
-        if not self.ufm.config.anchored:
-            return found
-        learnt = (count + 1) * self.ufm.overall_evidence.numel() * self.ufm.overall_evidence.element_size()
-        return {**found, "bytes": bytes_ + learnt, "anchors": self._anchors}
+        kept: dict[str, float] = {
+            "bytes": count * mixture.bytes_per_component(),
+            "count": count,
+            "smoothing_bytes": smoothed.nbytes,
+        }
+        if self.ufm.config.anchored:
+            kept["bytes"] += (count + 1) * self.ufm.overall_evidence.nbytes
+            kept["anchors"] = self._anchors
+        return kept
+
+    def state(self) -> dict[str, Tensor]:
+        """See :meth:`Estimator.state`."""
+        return dict(self.ufm.state_dict())
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """See :meth:`Estimator.load_state`."""
+        _load(self.ufm, state)
 
 
-def _variances(predicted: Predicted, used: bool) -> tuple[Tensor | None, Tensor | None]:
-    return (predicted.aleatoric, predicted.epistemic) if used else (None, None)
+def _variances(prediction: Prediction, used: bool) -> tuple[Tensor | None, Tensor | None]:
+    return (prediction.aleatoric, prediction.epistemic) if used else (None, None)
 
 
 def _one(value: Tensor | None) -> Tensor | None:
@@ -225,7 +282,14 @@ def _one(value: Tensor | None) -> Tensor | None:
     return None if value is None else value[None]
 
 
-def _estimate(depth: Tensor, variance: Tensor | None, valid: Tensor, *parts: Tensor | None) -> Estimate:
-    """On the CPU."""
-    a, e, m = (None if part is None else part.cpu() for part in parts)
-    return Estimate(depth.cpu(), None if variance is None else variance.cpu(), valid.cpu(), a, e, m)
+def _estimate(*, statistics: FrameStatistics | None = None, **maps: Tensor | None) -> Estimate:
+    """With all maps on the CPU."""
+    on_cpu: dict[str, Any] = {name: None if value is None else value.cpu() for name, value in maps.items()}
+    return Estimate(**on_cpu, statistics=statistics)
+
+
+def _load(module: nn.Module, state: Mapping[str, Tensor]) -> None:
+    """Raises ValueError where the state is not the module's."""
+    result = module.load_state_dict(dict(state), strict=False)
+    if result.missing_keys or result.unexpected_keys:
+        raise ValueError(f"the saved state lacks {result.missing_keys} and has {result.unexpected_keys} too many")

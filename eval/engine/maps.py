@@ -1,5 +1,5 @@
-"""Depth that is already there as a run's source: a folder of maps that another program predicted, or the sequence's
-own depth."""
+"""Depth maps that exist already as a source: a folder of maps that another program predicted, or the sequence's own
+depth."""
 
 from __future__ import annotations
 
@@ -13,15 +13,12 @@ import numpy as np
 import torch
 
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.eval.engine.run_source import Source
+from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
-from ufmstar_torch.pipeline import UncertainPrediction
-from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.ufmstar import UfMStar
+from ufmstar_torch.models.network import DepthNetwork
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,55 +45,57 @@ class PredictedMap:
         return PredictedMap(resample_nearest(self.depth, self.intrinsics, K, size), variance, K)
 
 
-class MapSource(Source):
-    """Depth that is already there.
+class MapSource:
+    """Depth maps that exist already, as a ``DepthSource``.
 
     Args:
         read: the map of a frame.
-        config: of UfM*.
+        identity: plain values that distinguish these maps from others.
         size: (h, w) to which the maps are brought; None = as they are.
-        device, identity: see :class:`Source`.
         is_truth: the maps are the sequence's own depth.
+        label: as tables show it.
+        digest: of the identity.
     """
+
+    needs_image, cacheable, passes = False, False, 1
+    networks: tuple[DepthNetwork, ...] = ()
 
     def __init__(
         self,
         read: Callable[[Frame], PredictedMap],
-        config: UfMStarConfig,
-        device: torch.device,
         identity: Mapping[str, Any],
         *,
         size: Size | None = None,
         is_truth: bool = False,
+        label: str = "",
+        digest: str = "",
     ) -> None:
-        ufm = UfMStar(config)
-        super().__init__(ufm, ufm, device, identity)
-        self._read, self._size, self.is_truth = read, size, is_truth
+        self._read, self._size = read, size
+        self.identity, self.is_truth, self.label, self.digest = dict(identity), is_truth, label, digest
 
-    def predict(self, frame: Frame) -> UncertainPrediction:
-        """See :meth:`Source.predict`."""
-        found = self._read(frame).resized(self._size)
-        depth = torch.from_numpy(found.depth)[None].to(self.device)
-        variance = None if found.variance is None else torch.from_numpy(found.variance)[None].to(self.device)
-        pose, K = torch.from_numpy(frame.T_world_cam)[None], torch.from_numpy(found.intrinsics)[None]
-        anchors = self.anchors_of(frame)
-        if anchors is not None:
-            anchors = anchors.moved(torch.from_numpy(frame.intrinsics), K)
-        with torch.no_grad():
-            ufm = self.ufm(depth, pose, K, variance, anchors=anchors)
-        return UncertainPrediction(DepthPrediction(depth, variance), ufm, K, None)
+    def turn(self, position: int) -> int:
+        """0: maps have no members."""
+        return 0
+
+    def one(self, frame: Frame, n: int) -> Prediction:
+        """The frame's map; no network runs.
+
+        Raises:
+            FrameError: it has none, or it cannot be read.
+        """
+        given = self._read(frame).resized(self._size)
+        variance = None if given.variance is None else torch.from_numpy(given.variance)
+        return Prediction(torch.from_numpy(given.depth), variance, None, torch.from_numpy(given.intrinsics).double())
 
 
 def folder_source(
     sequence: FrameSequence,
     folder: str | Path,
-    config: UfMStarConfig,
     *,
     variance: str | Path | None = None,
     scale: float | None = None,
     intrinsics: IntrinsicsLike | None = None,
     size: Size | None = None,
-    device: str = "cpu",
 ) -> MapSource:
     """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
 
@@ -106,9 +105,8 @@ def folder_source(
     Args:
         sequence: the frames.
         folder, scale, variance: as :class:`DepthFolder` takes them.
-        config: of UfM*.
         intrinsics: of the maps [px], where the network saw a part of the image.
-        size, device: see :class:`MapSource`.
+        size: see :class:`MapSource`.
 
     Raises:
         NotADirectoryError: no such folder.
@@ -137,7 +135,7 @@ def folder_source(
         "intrinsics": K_given,
         "size": size,
     }
-    return MapSource(read, config, torch.device(device), identity, size=size)
+    return MapSource(read, identity, size=size)
 
 
 def _check_first(sequence: FrameSequence, maps: DepthMaps, any_shape: bool) -> None:
@@ -160,13 +158,20 @@ def _cropped(sequence: FrameSequence, depth: np.ndarray) -> str:
     )
 
 
-def own_depth_source(config: UfMStarConfig, *, size: Size | None = None, device: str = "cpu") -> MapSource:
-    """The sequence's own depth as the prediction: what UfM* says of perfect depth, the method's floor."""
+def own_depth(
+    size: Size | None = None, identity: Mapping[str, Any] | None = None, *, label: str = "", digest: str = ""
+) -> MapSource:
+    """The sequence's own depth as the prediction: what UfM* makes of perfect depth, the method's floor.
+
+    Args:
+        size, label, digest: see :class:`MapSource`.
+        identity: None = as ``ufmstar run`` writes it down.
+    """
 
     def read(frame: Frame) -> PredictedMap:
         if frame.depth is None:
             raise FrameError(frame.name, "no depth map")
         return PredictedMap(frame.depth, None, depth_camera(frame))
 
-    identity = {"maps": "the sequence's own depth", "size": size}
-    return MapSource(read, config, torch.device(device), identity, size=size, is_truth=True)
+    plain = {"maps": "the sequence's own depth", "size": size}
+    return MapSource(read, identity or plain, size=size, is_truth=True, label=label, digest=digest)

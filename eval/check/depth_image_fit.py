@@ -21,14 +21,14 @@ _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
 
 
 @dataclass(frozen=True)
-class Alignment:
+class DepthImageFit:
     """How well depth edges meet image edges.
 
     Attributes:
         quality: 1 where no displacement is better than none, 0 where none is as bad as a random one; NaN
             without edges.
         contrast: mean gradient rank (0 to 1) at the best displacement less that at a random one; small
-            where image edges are everywhere, so that nothing can be told.
+            where image edges are everywhere, so that the fit is undetermined.
         zoom, shift_x, shift_y: the best displacement of the depth map: zoom about the centre, then shift
             [px].
         edges: number of edge pixels compared.
@@ -42,8 +42,8 @@ class Alignment:
     edges: int
 
 
-def alignment(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> Alignment:
-    """Alignment over pairs of an image [H, W, 3] uint8 and a depth map [H, W] [m] (0 = invalid).
+def depth_image_fit(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> DepthImageFit:
+    """The fit over pairs of an image [H, W, 3] uint8 and a depth map [H, W] [m] (0 = invalid).
 
     Each edge pixel scores the rank of the image gradient there (ranks, because a lamp's gradient would
     outweigh all others); scores are averaged over all frames, for each displacement. Observed quality: at
@@ -62,7 +62,7 @@ def alignment(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> Alignment:
         count = count + np.stack([n for _, n in scores])
         edges += len(v)
     if edges == 0:
-        return Alignment(float("nan"), 0.0, 1.0, 0.0, 0.0, 0)
+        return DepthImageFit(float("nan"), 0.0, 1.0, 0.0, 0.0, 0)
     mean = total / np.maximum(count, 1)
     dx, dy = _shifts(width)
     at = np.unravel_index(np.argmax(mean), mean.shape)
@@ -70,7 +70,9 @@ def alignment(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> Alignment:
     typical = np.median(mean)
     contrast = mean.max() - typical
     quality = (here - typical) / max(contrast, 1e-12)
-    return Alignment(float(quality), float(contrast), float(_ZOOMS[at[0]]), float(dx[at[2]]), float(dy[at[1]]), edges)
+    return DepthImageFit(
+        float(quality), float(contrast), float(_ZOOMS[at[0]]), float(dx[at[2]]), float(dy[at[1]]), edges
+    )
 
 
 def depth_edges(depth: np.ndarray) -> np.ndarray:

@@ -1,0 +1,201 @@
+"""Anchors of a row: corners tracked in the sequence's own images, or ground truth as the upper bound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker
+from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, Setting
+from ufmstar_torch.eval.sequences.frame import Frame
+
+# Anchors of ground truth in a frame, about as many as a tracker finds, and their standard deviation as a share of the
+# depth: a range sensor's. Their depths are exact.
+TRUTH_COUNT, TRUTH_SIGMA = 100, 0.01
+# What is drawn of a frame: which anchors are taken, and noise. Poses have the seed without a third number.
+_TAKEN, _NOISE = 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class FrameAnchors:
+    """The anchors of one frame.
+
+    Attributes:
+        anchors: [1, N] in the pixels of the depth map, on its device; None where there is no image to track in.
+        tracked: corners that were followed from the frame before; 0 of ground truth.
+        triangulated: those of them with a depth; of ground truth, all.
+        ms: of the tracker [ms]; None of ground truth.
+    """
+
+    anchors: Anchors | None
+    tracked: int = 0
+    triangulated: int = 0
+    ms: float | None = None
+
+
+class Tracks:
+    """A tracker of rows that see the same images at the same poses: each image is tracked once."""
+
+    def __init__(self) -> None:
+        self._tracker = LandmarkTracker()
+        self._before: dict[str, Tensor] = {}
+        self._last: tuple[Frame, Landmarks, float] | None = None
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Plain values on which the landmarks depend."""
+        return {"anchors": TRACKED, "tracker": self._tracker.config.to_dict()}
+
+    @property
+    def pixel_noise(self) -> float:
+        """Standard deviation of a position that the tracker's variances assume [px]."""
+        return self._tracker.config.pixel_noise
+
+    def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
+        """Landmarks of a frame, which follows those that were asked for before, and the time that they took [ms].
+
+        Args:
+            frame: without an image there are none, and the tracker stays as it is.
+            T_world_cam: [4, 4], noise included [m].
+
+        Raises:
+            ModuleNotFoundError: OpenCV is not installed.
+            ValueError: the image is not of the size of those before.
+        """
+        if self._last is not None and self._last[0] is frame:
+            return self._last[1:]
+        self._before = self._tracker.state()
+        if frame.image is None:
+            return None
+        started = perf_counter()
+        landmarks = self._tracker.update(frame.image, T_world_cam, frame.intrinsics)
+        self._last = frame, landmarks, 1000 * (perf_counter() - started)
+        return self._last[1:]
+
+    def undo(self) -> None:
+        """Forget the last frame: UfM* skipped it, and its pose is not to be trusted."""
+        self._tracker.load_state(self._before)
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors on which the next frame's landmarks depend."""
+        return self._tracker.state()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue where ``state`` was taken.
+
+        Raises:
+            ValueError: it is of a tracker of another size.
+        """
+        self._tracker.load_state(state)
+        self._last = None
+
+
+class AnchorSource:
+    """The anchors of a row.
+
+    Noise on tracked positions acts where it would in the end: an anchor is moved in the image by it, and its depth
+    errs by as much as one of that many pixels in every view makes it, to first order (``track_noise`` times the
+    standard deviation that the tracker states for ``pixel_noise``). The variance is left as the tracker states it,
+    which does not know of the noise. Frames are disturbed independently of each other.
+
+    Args:
+        setting: of the row, with anchors.
+        tracks: where they are tracked; None = ground truth at random pixels.
+    """
+
+    def __init__(self, setting: Setting, tracks: Tracks | None) -> None:
+        self._setting, self.tracks = setting, tracks
+
+    def of(
+        self,
+        frame: Frame,
+        T_world_cam: NDArray[np.float64],
+        prediction: Prediction,
+        truth: NDArray[np.float32] | None,
+    ) -> FrameAnchors:
+        """The anchors of the next frame.
+
+        Args:
+            frame: the next one.
+            T_world_cam: [4, 4] as the row sees it [m].
+            prediction: with the camera of the maps.
+            truth: [h, w] at their pixels [m], 0 = none; None = nowhere.
+        """
+        device = prediction.depth.device
+        if self.tracks is None:
+            known = np.zeros(prediction.size, np.float32) if truth is None else truth
+            sampled = self._sampled(known, frame.index).to(device)
+            return FrameAnchors(sampled, triangulated=sampled.depth.shape[1])
+        tracked = self.tracks.of(frame, T_world_cam)
+        if tracked is None:
+            return FrameAnchors(None)
+        landmarks, ms = self._thinned(self._disturbed(tracked[0], frame.index), frame.index), tracked[1]
+        anchors = landmarks.anchors(frame.intrinsics, prediction.intrinsics).to(device)
+        return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms)
+
+    def undo(self) -> None:
+        """Forget the last frame (:meth:`Tracks.undo`)."""
+        if self.tracks is not None:
+            self.tracks.undo()
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors on which the next frame's anchors depend."""
+        return {} if self.tracks is None else self.tracks.state()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue where ``state`` was taken (:meth:`Tracks.load_state`)."""
+        if self.tracks is not None:
+            self.tracks.load_state(state)
+
+    def _sampled(self, truth: NDArray[np.float32], index: int) -> Anchors:
+        v, u = np.nonzero(truth > 0)
+        count = TRUTH_COUNT if self._setting.anchor_count is None else self._setting.anchor_count
+        taken = self._drawn(index, _TAKEN).permutation(len(v))[:count]
+        depth = truth[v[taken], u[taken]].astype(np.float64)
+        pixel = np.stack([u[taken], v[taken]], axis=-1).astype(np.float64)
+        values = (pixel, depth, np.square(TRUTH_SIGMA * depth))
+        return Anchors(*(torch.from_numpy(array)[None] for array in values))
+
+    def _disturbed(self, landmarks: Landmarks, index: int) -> Landmarks:
+        size = self._setting.track_noise
+        if not size or self.tracks is None:
+            return landmarks
+        drawn = size * self._drawn(index, _NOISE).standard_normal((len(landmarks.depth), 3))
+        of_one_pixel = np.sqrt(landmarks.variance) / self.tracks.pixel_noise
+        return replace(
+            landmarks, pixel=landmarks.pixel + drawn[:, :2], depth=landmarks.depth + of_one_pixel * drawn[:, 2]
+        )
+
+    def _thinned(self, landmarks: Landmarks, index: int) -> Landmarks:
+        count = self._setting.anchor_count
+        if count is None or len(landmarks.depth) <= count:
+            return landmarks
+        taken = self._drawn(index, _TAKEN).permutation(len(landmarks.depth))[:count]
+        parts = {name: getattr(landmarks, name)[taken] for name in ("pixel", "depth", "variance")}
+        return replace(landmarks, **parts)
+
+    def _drawn(self, index: int, what: int) -> np.random.Generator:
+        return np.random.default_rng([self._setting.seed, index, what])
+
+
+def anchor_sources(rows: Iterable[Row]) -> dict[Row, AnchorSource]:
+    """The source of every row with anchors; rows of the same images and poses share a tracker."""
+    tracks: dict[tuple[object, ...], Tracks] = {}
+    sources = {}
+    for row in rows:
+        setting = row.setting
+        if setting.anchors == TRUTH:
+            sources[row] = AnchorSource(setting, None)
+        elif setting.anchors == TRACKED:
+            sources[row] = AnchorSource(setting, tracks.setdefault((setting.skip, setting.pose_noise), Tracks()))
+    return sources

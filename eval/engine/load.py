@@ -1,0 +1,307 @@
+"""Depth sources from files: a user's choice for a base of a suite, and the networks of ``ufmstar run``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ufmstar_torch.eval.engine.maps import MapSource, own_depth
+from ufmstar_torch.eval.engine.network_checks import check_members, without_sampling
+from ufmstar_torch.eval.engine.networks import NetworkSource, stochastic
+from ufmstar_torch.eval.methods.method import BASES
+from ufmstar_torch.eval.sequences.frame import Size, parse_size
+from ufmstar_torch.models.dropout import SAMPLES
+from ufmstar_torch.models.load import DIRECTORIES, load_network, network_names
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.trained import load_trained, read_info
+from ufmstar_torch.pipeline import NetworksInTurn
+
+TRUTH = "ground-truth"
+_FORM = "BASE=MODEL:FILE[,FILE...]"
+_VERSION = 2  # of the digests: raise it where predictions from the same files change
+
+
+@dataclass(frozen=True)
+class NetworkChoice:
+    """A network for a base, as chosen by a user.
+
+    Attributes:
+        base: a key of ``method.BASES``.
+        model: a name that ``load_network`` knows, or "ground-truth" (of "depth_only": the sequence's own depth, which
+            shows what a method makes of perfect depth).
+        files: its weights, one or several files, in the order of the members. Of "trained", "FILE#2" is member 2 of
+            the file alone. A file .json is the spec that goes with the weights. Of "ground-truth" nothing, or "HxW".
+        label: as shown; "" = derived from the files.
+
+    Raises:
+        ValueError: no such base or model, no files, or files that do not go together.
+    """
+
+    base: str
+    model: str
+    files: tuple[str, ...] = ()
+    label: str = ""
+
+    def __post_init__(self) -> None:
+        if self.base not in BASES:
+            raise ValueError(f"base must be one of {', '.join(BASES)}, got {self.base!r}; expected {_FORM}")
+        if self.model == TRUTH:
+            if self.base != "depth_only" or len(self.files) > 1:
+                raise ValueError("ground-truth goes with depth_only, as in depth_only=ground-truth[:HxW]")
+            try:
+                parse_size(self.files[0] if self.files else None)
+            except ValueError as error:
+                raise ValueError(f"ground-truth:HxW needs a size in pixels, got {self.files[0]!r}") from error
+            return
+        if self.model not in network_names():
+            known = ", ".join((*network_names(), TRUTH))
+            raise ValueError(f"model must be one of {known}, got {self.model!r}; expected {_FORM}")
+        if not self.weights:
+            raise ValueError(f"{self.base}={self.model} needs the file of its weights: {_FORM}")
+        if len([file for file in self.files if _is_spec(file)]) > 1:
+            raise ValueError(f"{self.base}={self.model} takes one spec, got {self.files}")
+
+    @classmethod
+    def parse(cls, text: str, label: str = "") -> NetworkChoice:
+        """From ``BASE=MODEL:FILE[,FILE...]``.
+
+        Raises:
+            ValueError: another form.
+        """
+        base, equals, rest = text.partition("=")
+        model, _, files = rest.partition(":")
+        if not (base and equals and model):
+            raise ValueError(f"a network must be given as {_FORM}, got {text!r}")
+        return cls(base, model, tuple(file for file in files.split(",") if file), label)
+
+    @property
+    def weights(self) -> tuple[str, ...]:
+        """The files without the spec."""
+        return tuple(file for file in self.files if not _is_spec(file))
+
+    @property
+    def spec(self) -> str | None:
+        """The file that declares what the weights do not say."""
+        return next((file for file in self.files if _is_spec(file)), None)
+
+    @property
+    def size(self) -> Size | None:
+        """(h, w) to which ground truth is brought; None = as it is."""
+        return parse_size(self.files[0]) if self.model == TRUTH and self.files else None
+
+    def load(self, device: torch.device, *, samples: int = SAMPLES) -> NetworkSource | MapSource:
+        """The depth source.
+
+        An ensemble's or BatchEnsemble's members take turns: image i is member i mod N's. MC-Dropout draws one sample
+        an image, or ``samples`` of them. Its sample n of frame i is seeded by i and n, so that it is the same whatever
+        ran before, on one process or many; the first one is what ``ufmstar run`` draws.
+
+        Args:
+            device: where networks run.
+            samples: MC-Dropout's, on every image where a row asks for all.
+
+        Raises:
+            FileNotFoundError: a file is missing.
+            ValueError: files that do not fit, or a network that does not predict what its base is about; see
+                ``check_members``.
+        """
+        if self.model == TRUTH:
+            label = self.label or "ground truth"
+            identity: dict[str, Any] = {"model": TRUTH, "label": label, "size": self.size}
+            return own_depth(self.size, identity, label=label, digest=_digest(identity))
+        members, sampling = self._members(), self.base == "mc_dropout"
+        check_members(self.base, members, device)
+        files = [_identity(file) for file in self.weights]
+        spec = None if self.spec is None else sha256(Path(self.spec))
+        made_of = {"model": self.model, "files": [file | {"name": None} for file in files], "spec": spec}
+        drawn = {"samples": samples} if sampling else {}
+        label = self.label or _label(self.model, Path(_path(self.weights[0])[0]), members[0])
+        identity = {
+            "model": self.model, "label": label, "files": files, "spec": spec, "members": len(members), **drawn,
+        }  # fmt: skip
+        turns = NetworksInTurn(members, samples=samples if sampling else None, preprocess=members[0].preprocess)
+        return NetworkSource(
+            turns,
+            device,
+            identity,
+            seeding="sample" if sampling else None,
+            label=label,
+            digest=_digest({**made_of, **drawn, "device": device.type, "version": _VERSION}),
+        )
+
+    def _members(self) -> list[DepthNetwork]:
+        """The members that the files hold, in their order."""
+        try:
+            members: list[DepthNetwork] = []
+            for file in self.weights:
+                path, member = _path(file)
+                loaded = load_members(self.model, [path], spec=self.spec)
+                if member is not None and member >= len(loaded):
+                    raise ValueError(f"{path} has {len(loaded)} members, there is no {member} (counted from 0)")
+                members += loaded if member is None else [loaded[member]]
+            _require_same_input(members)
+        except ValueError as error:
+            raise ValueError(f"{self.base}={self.model}: {error}") from error
+        return members if self.base == "mc_dropout" else [without_sampling(member) for member in members]
+
+
+def network_source(
+    model: str,
+    weights: Iterable[str | Path],
+    *,
+    spec: str | Path | None = None,
+    mode: str = "alternate",
+    samples: int | None = None,
+    offload: bool = False,
+    threads: int | None = None,
+    device: str = "cpu",
+) -> NetworkSource:
+    """One network, or the members of an ensemble, from files, as ``ufmstar run`` runs them.
+
+    Args:
+        model: a name that ``load_network`` knows.
+        weights: one file for each member (a directory for networks of ``transformers``); those of "trained" may hold
+            several.
+        spec: declares what an ONNX file or saved program does not say.
+        mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
+            passes of a network that samples).
+        samples: None: as many as the paper's baseline.
+        offload: of "trained": weights stay in host memory and come to the device for their turn only.
+        threads: CPU threads of ONNX Runtime; None = its own choice.
+        device: "cpu", "cuda", ...
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: unknown model, files that do not fit it, members that want different inputs, mode "full"
+            of one network that does not sample, ``samples`` for any other.
+    """
+    files = [Path(file) for file in weights]
+    members = load_members(model, files, spec=spec, offload=offload, threads=threads)
+    samples = _passes(members, mode, samples)
+    identity = {
+        "model": model,
+        "weights": [{"name": file.name, "sha256": sha256(file)} for file in files],
+        "mode": mode,
+        "samples": samples,
+        "spec": None if spec is None else sha256(Path(spec)),
+    }
+    turns = NetworksInTurn(members, samples=samples, preprocess=members[0].preprocess)
+    return NetworkSource(turns, torch.device(device), identity)
+
+
+def load_members(
+    model: str,
+    files: Iterable[str | Path],
+    *,
+    spec: str | Path | None = None,
+    offload: bool = False,
+    threads: int | None = None,
+) -> list[DepthNetwork]:
+    """The networks in the files, in their order, in eval mode and on the CPU. They want the same input.
+
+    Args:
+        model, spec, offload, threads: as :func:`network_source` has them.
+        files: of weights.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`network_source`.
+    """
+    paths = [Path(file) for file in files]
+    for folder in paths if model in DIRECTORIES else []:
+        if not folder.is_dir():
+            fetch = "`hf download NAME --local-dir DIR` fetches a checkpoint from the hub"
+            raise FileNotFoundError(f"no such directory: {folder}; {fetch}")
+    for file in [*(paths if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
+        if not file.is_file():
+            raise FileNotFoundError(f"no such file: {file}")
+    options: dict[str, Any] = {} if spec is None else {"spec": spec}
+    if model == "onnx" and threads is not None:
+        options["threads"] = threads
+    members = _loaded(model, paths, options, offload)
+    _require_same_input(members)
+    return members
+
+
+def _loaded(model: str, files: list[Path], options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
+    """The networks in the files.
+
+    Raises:
+        ValueError: as :func:`network_source`.
+    """
+    if model == "trained" and not options:
+        return load_trained(files, offload=offload)
+    try:
+        return [load_network(model, file, **options) for file in files]
+    except TypeError as error:
+        raise ValueError(f"model {model!r} does not take {sorted(options)}: {error}") from error
+
+
+def _require_same_input(members: Iterable[DepthNetwork]) -> None:
+    """Raises ValueError unless the members of an ensemble want the same input."""
+    wanted = [member.preprocess for member in members]
+    if any(other != wanted[0] for other in wanted[1:]):
+        raise ValueError(f"weights: the members of an ensemble must want the same input, got {wanted}")
+
+
+def _passes(members: list[DepthNetwork], mode: str, samples: int | None) -> int | None:
+    """Passes per image of a network that samples, None of others.
+
+    Raises:
+        ValueError: mode or samples ask for what the members cannot do.
+    """
+    alone = len(members) == 1 and mode == "full"
+    if alone and not stochastic(members):
+        raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
+    if samples is not None and not alone:
+        raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
+    return (samples or SAMPLES) if alone else None
+
+
+def sha256(file: Path) -> str:
+    """Hex digest of a file's content; of a directory's files and their names, but for hidden ones (a download's)."""
+    if file.is_dir():
+        names = sorted(path.relative_to(file) for path in file.rglob("*") if path.is_file())
+        shown = [name for name in names if not any(part.startswith(".") for part in name.parts)]
+        listing = "\n".join(f"{name.as_posix()} {sha256(file / name)}" for name in shown)
+        return hashlib.sha256(listing.encode()).hexdigest()
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def _label(model: str, file: Path, network: DepthNetwork) -> str:
+    """ "FastDepth", "ResNet50-Monodepth2", "Depth Anything V2", or the name of the file with the (first) weights."""
+    if model == "trained":
+        spec = read_info(file).spec
+        return "FastDepth" if spec.architecture == "fastdepth" else f"ResNet{spec.layers}-Monodepth2"
+    if model == "fastdepth":
+        return "FastDepth"
+    if model == "monodepth2":
+        return f"ResNet{getattr(network, 'layers', 50)}-Monodepth2"
+    return "Depth Anything V2" if model == "depth_anything" else file.stem
+
+
+def _path(file: str) -> tuple[str, int | None]:
+    """A file and the member of it that is meant; None = all of them."""
+    path, mark, number = file.rpartition("#")
+    if mark and path and number.isdecimal() and not Path(file).exists():
+        return path, int(number)
+    return file, None
+
+
+def _identity(file: str) -> dict[str, Any]:
+    path, member = _path(file)
+    return {"name": Path(path).name, "sha256": sha256(Path(path)), "member": member}
+
+
+def _is_spec(file: str) -> bool:
+    return file.endswith(".json")
+
+
+def _digest(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

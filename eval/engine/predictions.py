@@ -1,0 +1,232 @@
+"""What depth sources predict for one frame: each inference is made once, and may be kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.pipeline import combine
+from ufmstar_torch.prediction import DepthPrediction
+
+_ALL = "all"  # the member's name of all predictions combined, in a store
+_SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """A depth map with the variances that come with it.
+
+    Attributes:
+        depth: [h, w] [m].
+        aleatoric: [h, w] A [m^2], or None.
+        epistemic: [h, w] E [m^2], or None.
+        intrinsics: [3, 3] float64 of the depth map [px], on the CPU.
+        ms: of the inference, or of all of them together [ms]; None where no network ran.
+    """
+
+    depth: Tensor
+    aleatoric: Tensor | None
+    epistemic: Tensor | None
+    intrinsics: Tensor
+    ms: float | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        return self.depth.shape[0], self.depth.shape[1]
+
+    @property
+    def variance(self) -> Tensor | None:
+        """[h, w] the network's own variance A + E [m^2], None if it states neither."""
+        a, e = self.aleatoric, self.epistemic
+        if a is None or e is None:
+            return e if a is None else a
+        return a + e
+
+    def to(self, to: torch.device | torch.dtype) -> Prediction:
+        """With its maps on a device, or of a type."""
+        maps: dict[str, Any] = {name: value.to(to) for name, value in self.maps().items()}
+        return replace(self, **maps)
+
+    def maps(self) -> dict[str, Tensor]:
+        """Those of depth, aleatoric and epistemic that are not None."""
+        named = {"depth": self.depth, "aleatoric": self.aleatoric, "epistemic": self.epistemic}
+        return {name: value for name, value in named.items() if value is not None}
+
+    @classmethod
+    def of(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> Prediction:
+        """What a network returned for one image, [1, h, w]; ``intrinsics`` [3, 3]."""
+        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+        a, e = (None if value is None else value[0].detach() for value in (a, e))
+        return cls(prediction.depth[0].detach(), a, e, intrinsics.cpu().double(), ms)
+
+
+def combined(predictions: Sequence[Prediction]) -> Prediction:
+    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added.
+
+    Raises:
+        ValueError: no prediction.
+    """
+
+    def batch(value: Tensor | None) -> Tensor | None:
+        return None if value is None else value[None]
+
+    joint = combine([DepthPrediction(p.depth[None], batch(p.aleatoric), batch(p.epistemic)) for p in predictions])
+    times = [p.ms for p in predictions if p.ms is not None]
+    return Prediction.of(joint, predictions[0].intrinsics, sum(times) if len(times) == len(predictions) else None)
+
+
+class DepthSource(Protocol):
+    """Where depth comes from: networks, or maps that exist already.
+
+    Attributes:
+        label: as tables show it.
+        networks: that it runs; () of maps.
+        identity: plain values that distinguish this source from another one.
+        digest: the same as a hex digest, the source's name in a store; "" where nothing is stored.
+        passes: inferences that all members (or samples) take.
+        needs_image: whether it predicts from the image; from the depth map otherwise.
+        cacheable: whether a store may keep its predictions. They are then of single precision, read or computed.
+        is_truth: whether it is the sequence's own depth, which has no error.
+    """
+
+    @property
+    def label(self) -> str: ...
+    @property
+    def networks(self) -> tuple[DepthNetwork, ...]: ...
+    @property
+    def identity(self) -> Mapping[str, Any]: ...
+    @property
+    def digest(self) -> str: ...
+    @property
+    def passes(self) -> int: ...
+    @property
+    def needs_image(self) -> bool: ...
+    @property
+    def cacheable(self) -> bool: ...
+    @property
+    def is_truth(self) -> bool: ...
+
+    def turn(self, position: int) -> int:
+        """The member for the image that a row uses after ``position`` others; 0 for maps."""
+        ...
+
+    def one(self, frame: Frame, n: int) -> Prediction:
+        """One timed inference, of member (or sample) n.
+
+        Raises:
+            FrameError: the frame has nothing to predict from.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PredictionKey:
+    """What a prediction depends on.
+
+    Attributes:
+        network: digest of the network(s).
+        sequence: ``sequence_digest``.
+        frame: its name.
+        member: "0", "1", ..., or "all".
+        content: ``frame_digest``.
+    """
+
+    network: str
+    sequence: str
+    frame: str
+    member: str
+    content: str
+
+    @property
+    def path(self) -> Path:
+        """Within the store's folder."""
+        return Path(self.network[:_SHOWN], self.sequence[:_SHOWN], f"{self.frame}@{self.member}.maps")
+
+
+class PredictionStore(Protocol):
+    """Keeps predictions, so that a network sees an image once, however often the rows on it change."""
+
+    def load(self, key: PredictionKey, device: torch.device) -> Prediction | None:
+        """The prediction bit for bit as it was stored, or None where it has to be computed."""
+        ...
+
+    def store(self, key: PredictionKey, prediction: Prediction) -> None:
+        """Keep a prediction."""
+        ...
+
+
+class FramePredictions:
+    """The predictions for one frame: each is looked up in memory, then in the store, then computed.
+
+    Args:
+        frame: which.
+        device: of the maps that are returned.
+        store: None = nothing is read or kept.
+        sequence: digest of the sequence, for the store.
+    """
+
+    def __init__(self, frame: Frame, device: torch.device, store: PredictionStore | None, sequence: str) -> None:
+        self._frame, self._device, self._store, self._sequence = frame, device, store, sequence
+        self._content = "" if store is None else frame_digest(frame)
+        self._known: dict[tuple[object, str], Prediction] = {}
+
+    def of(self, source: DepthSource, position: int, every: bool) -> Prediction:
+        """What a row gets that has used ``position`` images before: of all members, or of the one in turn.
+
+        Raises:
+            FrameError: the frame has nothing to predict from.
+        """
+        n = None if every and source.passes > 1 else source.turn(position)
+        member = _ALL if n is None else str(n)
+        known = (source.digest or source, member)
+        if known not in self._known:
+            self._known[known] = self._loaded(source, n, member)
+        return self._known[known]
+
+    def _loaded(self, source: DepthSource, n: int | None, member: str) -> Prediction:
+        if self._store is None or not source.cacheable:
+            return self._computed(source, n)
+        key = PredictionKey(source.digest, self._sequence, self._frame.name, member, self._content)
+        stored = self._store.load(key, self._device)
+        if stored is None:
+            stored = self._computed(source, n)
+            self._store.store(key, stored)
+        return stored
+
+    def _computed(self, source: DepthSource, n: int | None) -> Prediction:
+        # Members that other rows use alone are not run again; the store keeps only what a row asked for.
+        if n is None:
+            return combined([self._inference(source, i) for i in range(source.passes)])
+        return self._inference(source, n)
+
+    def _inference(self, source: DepthSource, n: int) -> Prediction:
+        known = (source.digest or source, f"inference {n}")
+        if known not in self._known:
+            made = source.one(self._frame, n).to(self._device)
+            self._known[known] = made.to(torch.float32) if source.cacheable else made
+        return self._known[known]
+
+
+def sequence_digest(sequence: FrameSequence) -> str:
+    """Hex digest of a sequence's name, layout, camera and frames' names."""
+    told = (sequence.name, sequence.layout, sequence.image_size, sequence.intrinsics.tolist(), sequence.names)
+    return hashlib.sha256(repr(told).encode()).hexdigest()
+
+
+def frame_digest(frame: Frame) -> str:
+    """Hex digest of what a network sees of a frame: pixels and intrinsics (and the index, which seeds samples)."""
+    digest = hashlib.sha256(repr((frame.index, None if frame.image is None else frame.image.shape)).encode())
+    digest.update(np.ascontiguousarray(frame.intrinsics).tobytes())
+    if frame.image is not None:
+        digest.update(np.ascontiguousarray(frame.image).tobytes())
+    return digest.hexdigest()

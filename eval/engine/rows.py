@@ -1,0 +1,143 @@
+"""One row in the middle of a sequence: which frames it uses, at which poses, and what it makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.eval.engine.anchors import AnchorSource, FrameAnchors
+from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.estimators import Estimate, Estimator
+from ufmstar_torch.eval.engine.predictions import DepthSource, FramePredictions, Prediction
+from ufmstar_torch.eval.methods.perturb import Drift, perturbed, selects
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.frame import FRAME_FAULTS
+
+# Prefixes of the tensors of a row's state, as files of ``ufmstar run`` have them since its first version.
+_IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."
+
+
+@dataclass(frozen=True, eq=False)
+class RowFrame:
+    """A frame that a row has taken in.
+
+    Attributes:
+        prediction: the depth map, on the estimator's device.
+        estimate: what the row makes of it, on the CPU.
+        truth: [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
+        T_world_cam: [4, 4] the pose as the row sees it [m].
+        member: which network predicted; None where all did.
+        anchors: of the frame; None of a row without anchors.
+        ms: "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms].
+    """
+
+    prediction: Prediction
+    estimate: Estimate
+    truth: NDArray[np.float32] | None
+    T_world_cam: NDArray[np.float64]
+    member: int | None
+    anchors: FrameAnchors | None
+    ms: Mapping[str, float]
+
+
+class RowRunner:
+    """A row in the middle of a sequence.
+
+    Args:
+        key: its name, unique in its stream.
+        source: of its depth.
+        estimator: of its variance, in its initial state.
+        every: all members (or samples) predict on every image, instead of one in turn.
+        setting: which images it leaves out, and how poses and anchors are disturbed.
+        anchors: None = it has none.
+        skips_faults: the estimator decides by its own config whether pose and intrinsics can be used. A frame that it
+            refuses is skipped, and counts as an image for the turns all the same.
+        device: of the estimator, whose work is timed.
+
+    Attributes:
+        images: that the estimator was given so far.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        source: DepthSource,
+        estimator: Estimator,
+        *,
+        every: bool = False,
+        setting: Setting = DEFAULT,
+        anchors: AnchorSource | None = None,
+        skips_faults: bool = False,
+        device: torch.device | None = None,
+    ) -> None:
+        self.key, self.source, self.estimator, self.every, self.setting = key, source, estimator, every, setting
+        self.anchors, self._skips_faults = anchors, skips_faults
+        self.images = 0
+        self._drift = Drift(setting)
+        self._timer = StageTimer(device or torch.device("cpu"))
+
+    def selects(self, number: int) -> bool:
+        """Whether the row uses image ``number`` of those that the stream selects."""
+        return selects(self.setting, number)
+
+    def predict(self, predictions: FramePredictions) -> Prediction:
+        """The prediction that the row gets for the next frame.
+
+        Raises:
+            FrameError: the frame has nothing to predict from.
+        """
+        return predictions.of(self.source, self.images, self.every)
+
+    def take(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowFrame:
+        """Take in the next frame; its ground truth is for anchors of it alone.
+
+        Raises:
+            FrameError: the estimator refuses the pose or the intrinsics, and the row skips such frames.
+        """
+        T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
+        anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
+        with self._timer.stage("uncertainty"):
+            estimate = self.estimator.update(
+                prediction, torch.from_numpy(T), None if anchors is None else anchors.anchors
+            )
+        member = None if self.every else self.source.turn(self.images)
+        self.images += 1
+        ms = self._timer.take()
+        if self._skips_faults and estimate.statistics is not None and int(estimate.statistics.fault[0]):
+            if self.anchors is not None:
+                self.anchors.undo()
+            raise FrameError(frame.name, FRAME_FAULTS[int(estimate.statistics.fault[0])])
+        if prediction.ms is not None:
+            ms["network"] = prediction.ms
+        if anchors is not None and anchors.ms is not None:
+            ms["anchors"] = anchors.ms
+        return RowFrame(prediction, estimate, truth, T, member, anchors, ms)
+
+    def state(self) -> dict[str, Tensor]:
+        """All tensors on which the next frame depends, networks left aside: they remember nothing."""
+        anchors = {} if self.anchors is None else self.anchors.state()
+        parts = ((_ESTIMATOR, self.estimator.state()), (_TRACKER, anchors), (_DRIFT, self._drift.state()))
+        kept = {prefix + name: value for prefix, state in parts for name, value in state.items()}
+        return {_IMAGES: torch.tensor(self.images), **kept}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue where ``state`` was taken.
+
+        Raises:
+            ValueError: it is the state of another kind of row.
+        """
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+        self.images = int(state[_IMAGES])
+        self.estimator.load_state(part(_ESTIMATOR))
+        if self.anchors is not None:
+            self.anchors.load_state(part(_TRACKER))
+        self._drift.load_state(part(_DRIFT))

@@ -1,0 +1,198 @@
+"""What a run keeps of its frames: the sinks that write their maps, their lines of frames.jsonl and the checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from time import perf_counter
+from typing import Any
+
+from torch import Tensor
+
+from ufmstar_torch.eval.engine.anchors import FrameAnchors
+from ufmstar_torch.eval.engine.estimators import Estimate
+from ufmstar_torch.eval.engine.rows import RowFrame
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.results.run_folder import Checkpoint, RunFolder
+from ufmstar_torch.eval.results.summary import NEAR_ZERO
+from ufmstar_torch.eval.results.writers import FrameWriter, WrittenFrame
+
+_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
+# A run on maps saves UfM*'s tensors under their own names, and no turn: its files have done so since the first version.
+_TURN, _UFM = "image_index", "ufm."
+
+
+class MapWriter(FrameSink):
+    """Writes the maps of a row's frames.
+
+    Args:
+        key: of the row.
+        writer: of the files.
+
+    Attributes:
+        written: what became of the last frame.
+    """
+
+    stage: str | None = "write"
+
+    def __init__(self, key: str, writer: FrameWriter) -> None:
+        self._key, self._writer = key, writer
+        self.written = WrittenFrame(0, 0)
+
+    def take(self, result: FrameResult) -> None:
+        """Write a frame.
+
+        Raises:
+            OSError: see :meth:`FrameWriter.write`.
+        """
+        if self._key in result.rows:
+            estimate = result.rows[self._key].estimate
+            names = ("depth", "variance", "disagreement", "anchored", "bias", "valid")
+            maps = {name: getattr(estimate, name) for name in names}
+            self.written = self._writer.write(result.name, **maps)
+
+
+class Journal(FrameSink):
+    """Commits every frame to the run's folder, with the state that the next one depends on.
+
+    Args:
+        key: of the row.
+        folder: of the run.
+        sums: the metrics' sums so far.
+        maps: the sink that has written the frame.
+        bare: the row's depth comes from maps.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        folder: RunFolder,
+        sums: Callable[[], dict[str, dict[str, Tensor]]],
+        maps: MapWriter,
+        *,
+        bare: bool,
+    ) -> None:
+        self._key, self._folder, self._sums, self._maps, self._bare = key, folder, sums, maps, bare
+        self._earlier = list(folder.checkpoint.sessions)
+        self._saving = 0.0
+
+    def begin(self, stream: FrameStream) -> None:
+        """The clock of this session starts."""
+        self._first, self._started = stream.position, perf_counter()
+        [self._row] = [row for row in stream.rows if row.key == self._key]
+
+    def take(self, result: FrameResult) -> None:
+        """Commit a frame.
+
+        Raises:
+            OSError: see :meth:`RunFolder.commit`.
+        """
+        session = {
+            "first": self._first,
+            "frames": result.number + 1 - self._first,
+            "seconds": perf_counter() - self._started,
+        }
+        checkpoint = Checkpoint(
+            position=result.number + 1,
+            module=saved_state(self._row.state(), bare=self._bare),
+            metrics=self._sums(),
+            sessions=[*self._earlier, session],
+        )
+        before = perf_counter()
+        self._folder.commit(self._record(result), checkpoint)
+        self._saving = 1000 * (perf_counter() - before)
+
+    def _record(self, result: FrameResult) -> dict[str, Any]:
+        """The frame's line of frames.jsonl."""
+        about = {"index": result.index, "name": result.name}
+        if self._key not in result.rows:
+            return {**about, "state": "skipped", "reason": result.skipped[self._key]}
+        row = result.rows[self._key]
+        written = {"depth": self._maps.written.depth_saturated, "sigma": self._maps.written.sigma_saturated}
+        times = {"ms": _times(result, row, self._saving)}
+        return {**about, "state": "done", **_figures(row), "saturated": written, **times, **_anchor_figures(row)}
+
+
+def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
+    """A row's state as state.pt holds it; ``bare``: of a run on maps."""
+    return {k.removeprefix(_UFM): v for k, v in state.items() if k != _TURN} if bare else dict(state)
+
+
+def row_state(saved: Mapping[str, Tensor], *, bare: bool, images: Tensor) -> dict[str, Tensor]:
+    """The row's state from what :func:`saved_state` returned; ``images`` that a run on maps has seen."""
+    if not bare:
+        return dict(saved)
+    return {_TURN: images, **{k if k.startswith("tracker.") else _UFM + k: v for k, v in saved.items()}}
+
+
+def _figures(row: RowFrame) -> dict[str, Any]:
+    """Counts and means of a frame."""
+    estimate, prediction = row.estimate, row.prediction
+    statistics, own, K = estimate.statistics, prediction.variance, prediction.intrinsics.tolist()
+    assert statistics is not None
+    assert estimate.variance is not None
+    assert estimate.disagreement is not None
+    std, valid = estimate.variance.sqrt(), estimate.valid
+    return {
+        "size": list(prediction.size),
+        "intrinsics": [K[0][0], K[1][1], K[0][2], K[1][2]],
+        "member": row.member,
+        **{count: int(getattr(statistics, count)[0]) for count in _COUNTS},
+        "rotation_deviation": float(statistics.rotation_deviation[0]),
+        "mean_disagreement": _mean(estimate.disagreement, valid),
+        "mean_sigma": _mean(std, valid),
+        "mean_network_sigma": None if own is None else _mean(own.cpu().sqrt(), valid),
+        "near_zero": int(((std > 0) & (std < NEAR_ZERO)).sum()),
+        "ground_truth": row.truth is not None,
+    }
+
+
+def _times(result: FrameResult, row: RowFrame, saving: float) -> dict[str, float]:
+    """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
+    this frame's is not known yet."""
+    ms = result.ms
+    optional = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
+    return {
+        "read": ms["read"],
+        **optional,
+        "ufm": row.ms["uncertainty"],
+        "metrics": ms["truth"] + ms["metrics"],
+        "write": ms["write"],
+        "save": saving,
+        "prepare": ms["predict"] - row.ms.get("network", 0.0),
+    }
+
+
+def _anchor_figures(row: RowFrame) -> dict[str, Any]:
+    """Of a run with anchors: what became of the frame's corners, and the means of B [m^2] and of r.
+
+    ``tracked`` were followed from the frame before, of which ``found`` were triangulated; ``usable`` lie on a pixel
+    with a depth, and ``used`` agree with others. Without any used, ``without`` says why.
+    """
+    anchors, estimate = row.anchors, row.estimate
+    if anchors is None or estimate.anchored is None or estimate.bias is None:
+        return {}
+    return {
+        "anchors": _corners(anchors, estimate),
+        "mean_anchored": _mean(estimate.anchored, estimate.valid),
+        "mean_bias": _mean(estimate.bias, estimate.valid),
+    }
+
+
+def _corners(anchors: FrameAnchors, estimate: Estimate) -> dict[str, Any]:
+    assert estimate.statistics is not None
+    used, usable = int(estimate.statistics.anchors_used[0]), int(estimate.statistics.anchors[0])
+    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
+    return {**counts, "without": None if used else why_none(anchors.tracked, anchors.triangulated, usable)}
+
+
+def why_none(tracked: int, triangulated: int, usable: int) -> str:
+    """Why a frame has no anchors, from how many were left at each stage."""
+    if not tracked:
+        return "no corner followed from the frame before"
+    if not triangulated:
+        return "no parallax, or no track that fits the poses"
+    return "none lies on a pixel with a depth" if not usable else "they contradict each other"
+
+
+def _mean(values: Tensor, valid: Tensor) -> float:
+    return float(values[valid].double().mean()) if bool(valid.any()) else float("nan")
