@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -86,6 +87,11 @@ def test_help_of_run_names_every_setting(ufmstar, capfd):
     for name in SPGFConfig().to_dict():
         assert f"--ufm.segment.{name}" in text
     assert "(0, 1]" in text
+    words = " ".join(text.split())
+    assert "smallest variance of a pixel v_min [m^2], [0, inf]" in words
+    for config in (UfMStarConfig, SPGFConfig):
+        for field in dataclasses.fields(config):
+            assert f" {field.name}: " in (config.__doc__ or ""), "the docstring's attributes are the help"
 
 
 @pytest.mark.slow

@@ -45,8 +45,8 @@ from ufmstar_torch.eval.report.pictures import (
 )
 from ufmstar_torch.eval.report.rooms import (
     SIGMAS,
+    Projection,
     Snapshot,
-    View,
     below_ceiling,
     choose_times,
     draw_room,
@@ -226,7 +226,7 @@ class TestCompare:
 
 class TestProjection:
     def test_axis_aligned(self) -> None:
-        view = View(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "from above")
+        view = Projection(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "from above")
         found = project(view, np.array([[1.0, 2.0, 3.0]]), np.diag([0.04, 9.0, 0.25])[None])
         np.testing.assert_allclose(found.centre, [[1.0, 3.0]])
         np.testing.assert_allclose(found.axes, [[0.5 * SIGMAS, 0.2 * SIGMAS]])
@@ -234,7 +234,7 @@ class TestProjection:
 
     def test_a_line_at_thirty_degrees(self) -> None:
         along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
-        view = View(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), "")
+        view = Projection(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), "")
         found = project(view, np.zeros((1, 3)), np.outer(along, along)[None])
         assert found.angle[0] == pytest.approx(30)
         np.testing.assert_allclose(found.axes, [[SIGMAS, 0.0]], atol=1e-7)
@@ -245,7 +245,7 @@ class TestProjection:
         """In every direction n of the picture its extent is that of the marginal: sigmas sqrt(n^T P S P^T n)."""
         rng = np.random.default_rng(seed)
         R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-        view = View(R[0], R[1], "")
+        view = Projection(R[0], R[1], "")
         A = rng.normal(size=(4, 3, 3))
         covariance = A @ A.transpose(0, 2, 1)
         found = project(view, rng.normal(size=(4, 3)), covariance)
@@ -285,7 +285,7 @@ def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float =
 
 class TestRooms:
     def test_the_nearest_is_painted_last(self) -> None:
-        view = View(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "")  # seen from -y
+        view = Projection(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "")  # seen from -y
         ellipses, order = painted(view, snapshot("f", [[1, -2, 0], [2, 5, 0], [3, 0, 0]], [0, 0, 0]))
         assert order.tolist() == [1, 2, 0]
         assert ellipses.centre[:, 0].tolist() == [2, 3, 1]

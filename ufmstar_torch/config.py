@@ -19,6 +19,27 @@ class SPGFConfig(Checked):
     Lengths are metres. Thresholds in pixels, and ``adaptive_thresh_scale``, which multiplies 1/f,
     are stated for an image of ``reference_size`` seen with ``reference_focal``; with
     ``scale_with_image`` they follow the image they are applied to (see :meth:`scaled_to`).
+
+    Attributes:
+        adaptive_thresh_scale: quadratic growth of the thresholds with depth, t = a z^2 / f
+        noise_floor: smallest threshold, and largest distance of a fused segment from a Gaussian's plane
+        noise_thresh: largest threshold of the distance in depth within a row
+        line_thresh: largest threshold of the distance from a segment's line
+        occlusion_gap: gap in a row that ends a segment
+        n_check: a segment of up to so many pixels is continued near its last point, a longer one near its line
+        max_open: segments of a row that are open at the same time
+        angle_cosine: smallest cosine of the angle between two segments that are fused
+        sparse: segments of at most so many pixels are dropped
+        min_gaussian_length: length of the first depth bin, the longest that a near segment may be
+        frame_max_scale: largest length of a segment, in multiples of min_gaussian_length
+        max_depth: depth beyond which pixels are not segmented
+        min_pixels: pixels below which a Gaussian is too small
+        min_rows: segments below which a Gaussian is too small
+        prune: drop a Gaussian if it is too small in both respects, in either of them, or none
+        scale_with_image: whether the thresholds follow the image's size and focal length
+        reference_focal: focal length for which the thresholds are stated
+        reference_height: image height for which the thresholds are stated
+        reference_width: image width for which the thresholds are stated
     """
 
     adaptive_thresh_scale: float = number(2.4, "a", "px/m", 0.0, open_low=True)
@@ -107,8 +128,37 @@ class SPGFConfig(Checked):
 
 @dataclass(frozen=True)
 class UfMStarConfig(Checked):
-    """Everything UfM* can be told. The defaults are the paper's, with two exceptions, each explained where it
-    stands: the pruning rule (``segment.prune``, docs/segmentation.md) and ``regression``.
+    """All settings of UfM*. The defaults are the paper's, with two exceptions, each explained where it stands: the
+    pruning rule (``segment.prune``, docs/segmentation.md) and ``regression``.
+
+    Attributes:
+        segment: thresholds of the segmentation
+        aleatoric_in_moments: add the network's variance per pixel to the Gaussians' covariance
+        eta: overlap from which on two Gaussians correspond
+        eta_occlusion: overlap with a nearer Gaussian from which on a Gaussian counts as hidden
+        near_plane: Gaussians nearer to the camera are not in view
+        overlap_weighted: weight a fusion by the overlap of its Gaussians
+        disagreement: between views: squared 2-Wasserstein distance (w2), or squared depth difference where both
+            Gaussians are seen (overlap)
+        prior_weight: weight of the prior in the regression
+        prior_mean: disagreement where no Gaussian is near
+        regression: exact sum over the Gaussians in view, or the paper's neighbourhood
+        near_radius: neighbourhood: Gaussians whose extent comes this near to a pixel's point are summed
+        far_radius: neighbourhood: the same where none comes within near_radius
+        neighbourhood_sigmas: neighbourhood: extent of a Gaussian in standard deviations
+        ema_alpha: weight of the new disagreement map in the running average
+        variance_floor: smallest variance of a pixel
+        add_aleatoric: add the network's aleatoric variance to the result
+        add_epistemic: add the network's epistemic variance to the result
+        anchored: use anchors, sparse measured depths (an extension)
+        anchor_half_life: age after which an anchor's evidence counts half
+        anchor_shrinkage: anchors that a Gaussian needs to be believed half
+        features: additional regressed quantities per Gaussian
+        initial_capacity: slots for Gaussians at the start; the number grows as needed
+        max_components: largest number of Gaussians; null = no limit
+        rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix
+        on_bad_frame: refuse a frame with a fault, or skip and count it
+        backend: implementation of the kernels
     """
 
     segment: SPGFConfig = field(default_factory=SPGFConfig)

@@ -39,7 +39,7 @@ from ufmstar_torch.eval.report.style import (
     short_name,
     style_of,
 )
-from ufmstar_torch.eval.report.sweeps import Line, Point, Rest, change, default_value, level, sweep_lines
+from ufmstar_torch.eval.report.sweeps import Point, Rest, SweepLine, change, default_value, level, sweep_lines
 
 SHOWN = (NLL, ECE_DELTA, ECE_Q)
 # Lines of the same method by what is fixed; they differ from all of ``style_of``'s.
@@ -81,10 +81,10 @@ class _Below:
     """
 
     to: str
-    pairs: tuple[tuple[Line, tuple[tuple[Point, Point], ...]], ...]
+    pairs: tuple[tuple[SweepLine, tuple[tuple[Point, Point], ...]], ...]
 
     @classmethod
-    def of(cls, drawn: Sequence[Line], alone: Line | None, name: str) -> _Below:
+    def of(cls, drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) -> _Below:
         """To the base alone on the same images where these change with the value; else of lines with something fixed
         to those without it, at the same value where that matters; else to the default."""
         plain = {line.method: line for line in drawn if not line.rest}
@@ -101,8 +101,8 @@ class _Below:
 
 
 def _paired(
-    lines: Iterable[Line], reference: Callable[[Line, float], Point | None]
-) -> tuple[tuple[Line, tuple[tuple[Point, Point], ...]], ...]:
+    lines: Iterable[SweepLine], reference: Callable[[SweepLine, float], Point | None]
+) -> tuple[tuple[SweepLine, tuple[tuple[Point, Point], ...]], ...]:
     paired = []
     for line in lines:
         pairs = ((point, reference(line, point.value)) for point in line.points)
@@ -114,8 +114,8 @@ def _paired(
 def _draw_levels(
     axes: Any,
     results: Results,
-    drawn: Sequence[Line],
-    alone: Line | None,
+    drawn: Sequence[SweepLine],
+    alone: SweepLine | None,
     styles: Mapping[tuple[Method, Rest], Style],
     name: str,
     quantity: Quantity,
@@ -159,7 +159,9 @@ def _draw_changes(
     label_ends(axes, ends)
 
 
-def _dashed(axes: Any, line: Line, means: Sequence[Mean], label: str, style: Style) -> list[tuple[float, str, str]]:
+def _dashed(
+    axes: Any, line: SweepLine, means: Sequence[Mean], label: str, style: Style
+) -> list[tuple[float, str, str]]:
     """A line for reference, level where it has one point; what to write at its end."""
     if all(math.isnan(mean.value) for mean in means):
         return []
@@ -185,12 +187,12 @@ def _line(
     return [(float(y[-1]), end, style.colour)]
 
 
-def _end(line: Line) -> str:
+def _end(line: SweepLine) -> str:
     """What stands at a line's end: "UfM*", "anchored", "UfM-100K, overlap threshold η 0.3"."""
     return line.words or short_name(line.method)
 
 
-def _styles(lines: Iterable[Line]) -> Iterator[Style]:
+def _styles(lines: Iterable[SweepLine]) -> Iterator[Style]:
     """The method's own look, or one that says what is fixed."""
     others = cycle(_OTHERS)
     for line in lines:

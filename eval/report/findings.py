@@ -34,7 +34,7 @@ QUALITY = (NLL, ECE_DELTA, ECE_Q)
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PairedComparison:
     """A row against another one in one figure, in pairs on the same sequences.
 
     Attributes:
@@ -77,18 +77,18 @@ class Comparison:
         return f"{q.name} {values} ({change}{half})"
 
 
-def compare(results: Results, row: Row, reference: Row, dataset: str | None = None) -> list[Comparison]:
+def compare(results: Results, row: Row, reference: Row, dataset: str | None = None) -> list[PairedComparison]:
     """A row against a reference in all figures that both have."""
     made = []
     for quantity in DIFFERENCES:
         delta = difference(results, row, reference, quantity, dataset)
         if delta.sequences:
             mine, theirs = _on_common(results, row, reference, quantity, dataset)
-            made.append(Comparison(row, reference, quantity, mine, theirs, delta))
+            made.append(PairedComparison(row, reference, quantity, mine, theirs, delta))
     return made
 
 
-def comparisons(results: Results, dataset: str | None = None) -> dict[tuple[Row, Row], list[Comparison]]:
+def comparisons(results: Results, dataset: str | None = None) -> dict[tuple[Row, Row], list[PairedComparison]]:
     """Every row of UfM* with its default settings against its references."""
     rows = [row for row in results.rows if row.method.fusion == UFM_STAR and row.setting == DEFAULT]
     pairs = ((row, reference) for row in rows for reference in references(results, row))
@@ -153,7 +153,7 @@ def _on_common(
     return mine, theirs
 
 
-def _tally(name: str, made: Sequence[Comparison]) -> str:
+def _tally(name: str, made: Sequence[PairedComparison]) -> str:
     """How often UfM* is better than one kind of reference, in the paper's figures, and by how much on average."""
     judged = [c for c in made if c.quantity in QUALITY]
     if not judged:
@@ -171,7 +171,7 @@ def _tally(name: str, made: Sequence[Comparison]) -> str:
     return f"{about}: {counts}, undecided in {verdicts.count(OPEN)}. On average {join(changes)}."
 
 
-def _mean_change(made: Sequence[Comparison]) -> str:
+def _mean_change(made: Sequence[PairedComparison]) -> str:
     """How a figure changes on average over the bases: in its own unit where it can be negative, else in percent."""
     quantity = made[0].quantity
     change = math.fsum(c.difference.value for c in made) / len(made)
@@ -182,7 +182,7 @@ def _mean_change(made: Sequence[Comparison]) -> str:
     return f"{quantity.name} {way} by {100 * abs(change) / before:.0f} %"
 
 
-def _losses(made: Iterable[Comparison]) -> str:
+def _losses(made: Iterable[PairedComparison]) -> str:
     """Where UfM* does not win."""
     judged = [c for c in made if c.verdict != UNDECIDED]
     worse = [c for c in judged if c.verdict == WORSE]
@@ -249,7 +249,7 @@ def _settings(results: Results) -> list[str]:
     return sentences
 
 
-def _change(c: Comparison) -> str:
+def _change(c: PairedComparison) -> str:
     decimals = c.quantity.decimals
     return f"{number(c.difference.value, decimals, signed=True)} ± {number(c.difference.half, decimals)}"
 

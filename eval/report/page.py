@@ -15,7 +15,7 @@ from typing import Any
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables
-from ufmstar_torch.eval.report.findings import Comparison, best_rows, caveats, comparisons, count, headlines, join
+from ufmstar_torch.eval.report.findings import PairedComparison, best_rows, caveats, comparisons, count, headlines, join
 from ufmstar_torch.eval.report.means import MIN_SEQUENCES, value_of
 from ufmstar_torch.eval.report.names import DIFFERENCES, row_label
 from ufmstar_torch.eval.report.pictures import BREAKDOWN, COMPARE, ROOM, STRIP, Picture
@@ -171,7 +171,7 @@ def _findings(results: Results) -> Part:
     }
 
 
-def _board(pairs: Mapping[tuple[Row, Row], Sequence[Comparison]], title: str) -> Part:
+def _board(pairs: Mapping[tuple[Row, Row], Sequence[PairedComparison]], title: str) -> Part:
     """A line for each pair of rows, with a verdict for each figure."""
     shown = [q for q in DIFFERENCES if any(c.quantity is q for made in pairs.values() for c in made)]
     rows = []
@@ -183,7 +183,7 @@ def _board(pairs: Mapping[tuple[Row, Row], Sequence[Comparison]], title: str) ->
     return {"title": title, "heads": ["UfM*, beside", *(q.heading for q in shown)], "rows": rows}
 
 
-def _verdict(c: Comparison) -> dict[str, str]:
+def _verdict(c: PairedComparison) -> dict[str, str]:
     means = f"{number(c.theirs, c.quantity.decimals)} → {number(c.mine, c.quantity.decimals)}"
     return {"verdict": c.verdict, "means": means, "words": c.words}
 

@@ -300,7 +300,7 @@ class PanelScales:
 
 
 @dataclass(frozen=True)
-class Column:
+class MapColumn:
     """One kind of map: its name, its scale, and the field of ``FramePanel`` that holds it."""
 
     label: str
@@ -326,13 +326,13 @@ def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
 
 def map_columns(
     scales: PanelScales, *, with_error: bool, with_anchored: bool = False, with_own: bool = False
-) -> list[Column]:
+) -> list[MapColumn]:
     """The columns right of the image: depth, sigma (of the network alone too), what anchors add, the error."""
-    columns = [Column("depth", scales.depth, "depth")]
-    columns += [Column("σ, network alone", scales.length, "own_sigma")] if with_own else []
-    columns += [Column("σ, UfM*" if with_own else "σ", scales.length, "sigma")]
-    columns += [Column("√B", scales.length, "anchored")] if with_anchored else []
-    return columns + ([Column("|error|", scales.length, "error")] if with_error else [])
+    columns = [MapColumn("depth", scales.depth, "depth")]
+    columns += [MapColumn("σ, network alone", scales.length, "own_sigma")] if with_own else []
+    columns += [MapColumn("σ, UfM*" if with_own else "σ", scales.length, "sigma")]
+    columns += [MapColumn("√B", scales.length, "anchored")] if with_anchored else []
+    return columns + ([MapColumn("|error|", scales.length, "error")] if with_error else [])
 
 
 def contact_sheet(
@@ -341,7 +341,7 @@ def contact_sheet(
     *,
     title: str = "",
     scales: PanelScales | None = None,
-    columns: Sequence[Column] | None = None,
+    columns: Sequence[MapColumn] | None = None,
     dpi: int = 110,
 ) -> PanelScales:
     """Draw the frames below each other and write the picture (PNG), atomically.
@@ -387,5 +387,5 @@ def contact_sheet(
     return used
 
 
-def _map_panel(column: Column, panel: FramePanel) -> Panel:
+def _map_panel(column: MapColumn, panel: FramePanel) -> Panel:
     return Panel(column.rgb(panel), absent="no ground truth" if column.field == "error" else "none")

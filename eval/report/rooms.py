@@ -135,13 +135,13 @@ def below_ceiling(snapshot: Snapshot, up: Array, all_times: Sequence[Snapshot]) 
     return Snapshot(snapshot.frame, *chosen, snapshot.T_world_cam, snapshot.path)
 
 
-def painted(view: View, snapshot: Snapshot) -> tuple[Ellipses, NDArray[np.intp]]:
+def painted(view: Projection, snapshot: Snapshot) -> tuple[Ellipses, NDArray[np.intp]]:
     """The ellipses in the order in which they are painted, the farthest first, and that order [K]."""
     order = np.argsort(view.nearness(snapshot.mean), kind="stable")
     return project(view, snapshot.mean[order], snapshot.covariance[order]), order
 
 
-def _draw_view(axes: Any, view: View, snapshot: Snapshot, scale: ColourScale) -> None:
+def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourScale) -> None:
     from matplotlib.collections import EllipseCollection
 
     axes.set_aspect("equal", adjustable="box")
@@ -170,7 +170,7 @@ def _draw_view(axes: Any, view: View, snapshot: Snapshot, scale: ColourScale) ->
     _draw_camera(axes, view, snapshot.T_world_cam)
 
 
-def _draw_camera(axes: Any, view: View, T_world_cam: Array) -> None:
+def _draw_camera(axes: Any, view: Projection, T_world_cam: Array) -> None:
     """A dot where the camera is, and which way it looks."""
     here = view.plane(T_world_cam[:3, 3])
     ahead = view.plane(T_world_cam[:3, 3] + 0.45 * T_world_cam[:3, 2])
@@ -187,7 +187,7 @@ def _draw_ruler(axes: Any, low: Array, high: Array) -> None:
     axes.text(x + length / 2, y + 0.02 * (high[1] - low[1]), f"{length:g} m", size=7.5, color=INK, ha="center")
 
 
-def _limits(view: View, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
+def _limits(view: Projection, snapshots: Sequence[Snapshot]) -> tuple[Array, Array]:
     """[2] lower and upper corner of what the picture shows, the same at all times [m].
 
     A Gaussian of a wrong depth can lie far outside; hence percentiles, and all of the camera's path.
@@ -224,7 +224,7 @@ def _load(file: Path, frame: str) -> Snapshot:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Projection:
     """An orthographic camera.
 
     Attributes:
@@ -267,7 +267,7 @@ class Ellipses:
     angle: Array
 
 
-def project(view: View, mean: Array, covariance: Array, sigmas: float = SIGMAS) -> Ellipses:
+def project(view: Projection, mean: Array, covariance: Array, sigmas: float = SIGMAS) -> Ellipses:
     """The ellipses of Gaussians: P Sigma P^T is the covariance in the picture, P the view's two rows.
 
     Args:
@@ -285,7 +285,7 @@ def project(view: View, mean: Array, covariance: Array, sigmas: float = SIGMAS) 
     return Ellipses(view.plane(mean), axes, np.degrees(np.arctan2(2 * b, a - c) / 2))
 
 
-def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[View, View]:
+def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[Projection, Projection]:
     """From above, and obliquely from behind the first camera.
 
     Data sets differ in which axis points up; a camera's own up (-y) is right on average.
@@ -301,8 +301,8 @@ def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[View, View]:
     forward = _unit(first - up * (first @ up), _unit(fallback - up * (fallback @ up), fallback))
     right = np.cross(forward, up)
     tilt = np.radians(elevation)
-    oblique = View(right, np.cos(tilt) * up + np.sin(tilt) * forward, "obliquely")
-    return View(right, forward, "from above"), oblique
+    oblique = Projection(right, np.cos(tilt) * up + np.sin(tilt) * forward, "obliquely")
+    return Projection(right, forward, "from above"), oblique
 
 
 def _unit(vector: Array, otherwise: Array) -> Array:

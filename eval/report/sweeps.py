@@ -34,7 +34,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Line:
+class SweepLine:
     """A method over the values of a setting, nothing else being changed along it.
 
     Attributes:
@@ -69,7 +69,7 @@ def sweeps(results: Results) -> list[tuple[str, str]]:
     ]
 
 
-def sweep_lines(results: Results, base: str, name: str) -> list[Line]:
+def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
     """The lines of a base over the values of a setting, those of one point too, in the order of the rows."""
     groups: dict[tuple[Method, Rest], dict[float, list[Row]]] = {}
     for row in results.rows:
@@ -79,7 +79,7 @@ def sweep_lines(results: Results, base: str, name: str) -> list[Line]:
     if name == COUNT:
         _begin_without_anchors(groups)
     return [
-        Line(method, rest, tuple(Point(value, tuple(rows[value])) for value in sorted(rows)))
+        SweepLine(method, rest, tuple(Point(value, tuple(rows[value])) for value in sorted(rows)))
         for (method, rest), rows in groups.items()
     ]
 

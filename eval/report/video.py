@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.report.colours import ColourScale, colour_table, require_matplotlib
-from ufmstar_torch.eval.report.panels import Column, FramePanel, PanelScales, map_columns
+from ufmstar_torch.eval.report.panels import FramePanel, MapColumn, PanelScales, map_columns
 
 GAP, HEAD, FOOT, BAR = 4, 22, 36, 8  # pixels
 PAPER, INK, FAINT = (255, 255, 255), (26, 26, 26), (107, 107, 107)
@@ -62,7 +62,7 @@ def preview_frame(
     return np.asarray(canvas)
 
 
-def _draw_bar(canvas: Any, draw: Any, left: int, width: int, top: int, column: Column) -> None:
+def _draw_bar(canvas: Any, draw: Any, left: int, width: int, top: int, column: MapColumn) -> None:
     """Name above the cell; below it the colour bar with the values of its ends, beyond which colours do not change."""
     from PIL import Image
 
