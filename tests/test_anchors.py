@@ -231,10 +231,10 @@ def test_anchors_that_make_no_sense_are_left_out_and_counted():
     [
         ({"pixel": torch.zeros(1, 4)}, ValueError, r"anchors.pixel must be \[1, N, 2\]"),
         ({"depth": torch.zeros(1, 5)}, ValueError, "anchors.depth must have shape"),
-        ({"depth": torch.zeros(1, 4, dtype=torch.int64)}, TypeError, "anchors.depth must be a floating"),
+        ({"depth": torch.zeros(1, 4, dtype=torch.int64)}, TypeError, "anchors.depth must have a floating"),
         ({"variance": torch.zeros(4)}, ValueError, "anchors.variance must have shape"),
-        ({"valid": torch.ones(1, 4)}, TypeError, "anchors.valid must be a bool"),
-        ({"pixel": None}, TypeError, "anchors.pixel must be a floating-point tensor, got NoneType"),
+        ({"valid": torch.ones(1, 4)}, TypeError, "anchors.valid must be a torch.bool"),
+        ({"pixel": None}, TypeError, "anchors.pixel must be a torch.Tensor, got NoneType"),
     ],
 )
 def test_wrong_anchors_are_refused_before_anything_changes(change, error, told):

@@ -73,5 +73,5 @@ def test_a_mask_on_another_device_is_named():
     pixel, one = torch.zeros(1, 4, 2), torch.ones(1, 4)
     K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
     mask = torch.ones(1, 4, dtype=torch.bool, device="meta")
-    with pytest.raises(ValueError, match=r"anchors\.valid lies on meta but the depth on cpu"):
+    with pytest.raises(ValueError, match=r"anchors\.valid must lie on the depth\'s device cpu, got meta"):
         UfMStar(ON)(torch.full((1, H, W), 2.0), torch.eye(4), K, anchors=Anchors(pixel, one, 0 * one, mask))

@@ -202,6 +202,8 @@ def test_own_depth_has_no_error_and_shows_the_floor(path, tmp_path):
     assert summary["metrics"]["rmse"] == 0
     assert 0 < summary["uncertainty"]["mean_disagreement"] < 0.2
     assert summary["time"]["median_ms"]["network"] is None
+    lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
+    assert all(line["member"] is None for line in lines)
 
 
 def test_without_ground_truth(tmp_path):

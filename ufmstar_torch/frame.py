@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ufmstar_torch.arguments import require_float, require_mask
 from ufmstar_torch.camera import nearest_rotation, rotation_deviation
 
 # Index = code. Each text finishes the sentence "stream b: ...".
@@ -83,8 +84,12 @@ def check_frame(
         raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}")
     dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
     plain = depth.detach().reshape(shape[0], *shape[-2:]).to(dtype)
-    a = _like_depth("aleatoric", aleatoric, depth, plain)
-    e = _like_depth("epistemic", epistemic, depth, plain)
+    shapes = [shape, tuple(plain.shape)]
+
+    def own(name: str, value: Tensor | None) -> Tensor | None:
+        return None if value is None else require_float(name, value, shapes, depth).reshape(plain.shape).to(plain.dtype)
+
+    a, e = own("aleatoric", aleatoric), own("epistemic", epistemic)
     extra = _features(features, feature_count, plain)
 
     T = _matrix("pose", pose, 4, plain)
@@ -100,7 +105,8 @@ def check_frame(
     if extra is not None:
         use = use & extra.isfinite().all(1)
     if valid is not None:
-        use = use & _mask(valid, depth).reshape(plain.shape)
+        either = [*shapes, (shape[0], 1, *shape[-2:])]
+        use = use & require_mask("valid", valid, either, depth).reshape(plain.shape)
     T_safe, K_safe = _harmless(_moved(T, plain.device), _moved(K, plain.device), fine)
     safe_depth = torch.where(use, plain, torch.zeros_like(plain))
     return FrameInput(safe_depth, T_safe, K_safe, a, e, extra, use, fault, _moved(deviation, plain.device))
@@ -120,52 +126,13 @@ def raise_faults(faults: Sequence[int]) -> None:
         raise ValueError("; ".join(bad))
 
 
-def require_float(name: str, value: object) -> None:
-    """Raise a TypeError unless ``value`` is a tensor of a floating-point dtype."""
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
-    if not value.is_floating_point():
-        raise TypeError(f"{name} must have a floating-point dtype, got {value.dtype}")
-
-
-def _on_device(name: str, value: Tensor, depth: Tensor) -> None:
-    if value.device != depth.device:
-        raise ValueError(f"{name} must lie on the depth's device {depth.device}, got {value.device}")
-
-
-def _like_depth(name: str, value: Tensor | None, depth: Tensor, plain: Tensor) -> Tensor | None:
-    if value is None:
-        return None
-    require_float(name, value)
-    _on_device(name, value, depth)
-    if value.shape not in (depth.shape, plain.shape):
-        raise ValueError(f"{name} must have the depth's shape {tuple(depth.shape)}, got {tuple(value.shape)}")
-    return value.reshape(plain.shape).to(plain.dtype)
-
-
-def _mask(valid: object, depth: Tensor) -> Tensor:
-    if not isinstance(valid, Tensor) or valid.dtype != torch.bool:
-        kind = valid.dtype if isinstance(valid, Tensor) else type(valid).__name__
-        raise TypeError(f"valid must be a torch.bool tensor (True = use), got {kind}")
-    _on_device("valid", valid, depth)
-    if valid.numel() != depth.numel() or valid.shape[0] != depth.shape[0] or valid.shape[-2:] != depth.shape[-2:]:
-        raise ValueError(f"valid must have the depth's shape {tuple(depth.shape)}, got {tuple(valid.shape)}")
-    return valid
-
-
 def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | None:
     expected = (plain.shape[0], count, *plain.shape[1:])
     if features is None:
         if count:
             raise ValueError(f"features must be given with shape {expected}: the config asks for {count}")
         return None
-    require_float("features", features)
-    _on_device("features", features, plain)
-    if tuple(features.shape) != expected:
-        raise ValueError(
-            f"features must have shape {expected} (config.features = {count}), got {tuple(features.shape)}"
-        )
-    return features.detach().to(plain.dtype)
+    return require_float("features", features, [expected], plain).detach().to(plain.dtype)
 
 
 def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ufmstar_torch.arguments import require_float, require_mask
 from ufmstar_torch.config import SPGFConfig, UfMStarConfig
-from ufmstar_torch.frame import FrameInput, require_float
+from ufmstar_torch.frame import FrameInput
 
 # Bins are walked one by one; more than this would be a mistake in the units, not a wish.
 MAX_DEPTH_BINS = 10_000
@@ -59,14 +60,14 @@ class SegmentInput:
         if depth.dim() != 3 or 0 in depth.shape:
             raise ValueError(f"depth must be [B, H, W] with no empty dimension, got {tuple(depth.shape)}")
         b, height, width = depth.shape
-        _require_like("intrinsics", intrinsics, (b, 3, 3), depth)
+        require_float("intrinsics", intrinsics, [(b, 3, 3)], depth)
         if variance is not None:
-            _require_like("variance", variance, (b, height, width), depth)
+            require_float("variance", variance, [(b, height, width)], depth)
         if features is not None:
-            channels = features.shape[1] if isinstance(features, Tensor) and features.dim() == 4 else "F"
-            _require_like("features", features, (b, channels, height, width), depth)
+            channels = features.shape[1] if isinstance(features, Tensor) and features.dim() == 4 else -1
+            require_float("features", features, [(b, channels, height, width)], depth)
         if valid is not None:
-            _require_mask(valid, depth)
+            require_mask("valid", valid, [(b, height, width)], depth)
         if depth.device.type == "cpu":
             _require_camera(intrinsics)
         stored = depth.dtype in (torch.float32, torch.float64)
@@ -118,29 +119,6 @@ def _spgf_config(config: SPGFConfig | UfMStarConfig | None) -> SPGFConfig:
     if not isinstance(config, SPGFConfig):
         raise TypeError(f"config must be an SPGFConfig, a UfMStarConfig or None, got {type(config).__name__}")
     return config
-
-
-def _require_like(name: str, value: object, shape: tuple[object, ...], depth: Tensor) -> None:
-    require_float(name, value)
-    assert isinstance(value, Tensor)
-    if tuple(value.shape) != shape:
-        expected = "[" + ", ".join(str(n) for n in shape) + "]"
-        raise ValueError(f"{name} must be {expected} for this depth, got {list(value.shape)}")
-    _require_device(name, value, depth)
-
-
-def _require_device(name: str, value: Tensor, depth: Tensor) -> None:
-    if value.device != depth.device:
-        raise ValueError(f"{name} must lie on depth's device {depth.device}, got {value.device}")
-
-
-def _require_mask(valid: object, depth: Tensor) -> None:
-    if not isinstance(valid, Tensor) or valid.dtype != torch.bool:
-        kind = valid.dtype if isinstance(valid, Tensor) else type(valid).__name__
-        raise TypeError(f"valid must be a torch.bool tensor (True = use), got {kind}")
-    if valid.shape != depth.shape:
-        raise ValueError(f"valid must be {list(depth.shape)} as depth is, got {list(valid.shape)}")
-    _require_device("valid", valid, depth)
 
 
 def _require_camera(intrinsics: Tensor) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
@@ -44,6 +44,21 @@ class StatefulModule(nn.Module):
     def _store(self, state: Mapping[str, Tensor]) -> None:
         """Exchange all buffers."""
         self._buffers.update({name: state[name] for name in self.STATE})
+
+    def _chosen(self, streams: Sequence[int] | Tensor, count: int) -> Tensor:
+        """Bool mask [count] of streams given as indices or as a mask, on the state's device.
+
+        Raises:
+            IndexError: an index is out of range.
+            ValueError: a mask of the wrong length.
+        """
+        device = getattr(self, self.STATE[0]).device
+        given = torch.as_tensor(streams, device=device)
+        if given.dtype == torch.bool and given.shape != (count,):
+            raise ValueError(f"streams as a mask must have shape ({count},), got {tuple(given.shape)}")
+        chosen = torch.zeros(count, dtype=torch.bool, device=device)
+        chosen[given if given.numel() else given.long()] = True
+        return chosen
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """``.to()`` and friends, with the exceptions that the class states."""

@@ -229,12 +229,7 @@ class UfMStar(StatefulModule):
         if streams is None:
             new = UfMStarState.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
         else:
-            chosen = torch.as_tensor(streams, device=old.mean.device)
-            if chosen.dtype == torch.bool and chosen.shape != (b,):
-                raise ValueError(f"streams as a mask must have shape ({b},), got {tuple(chosen.shape)}")
-            again = torch.zeros(b, dtype=torch.bool, device=old.mean.device)
-            again[chosen if chosen.numel() else chosen.long()] = True
-            new = old.restarted(again)
+            new = old.restarted(self._chosen(streams, b))
         self._store(new.tensors() | ({"overall_evidence": old.overall_evidence} if keep_evidence else {}))
 
     def _anchors(self, anchors: Anchors | None, frame: FrameInput) -> AnchorInput | None:

@@ -32,7 +32,7 @@ class RowFrame:
         estimate: what the row makes of it, on the CPU.
         truth: [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
         T_world_cam: [4, 4] the pose as the row sees it [m].
-        member: which network predicted; None where all did.
+        member: which network predicted; None where all did, and of maps.
         anchors: of the frame; None of a row without anchors.
         ms: "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms].
     """
@@ -106,7 +106,8 @@ class RowRunner:
             estimate = self.estimator.update(
                 prediction, torch.from_numpy(T), None if anchors is None else anchors.anchors
             )
-        member = None if self.every else self.source.turn(self.images)
+        single = self.source.networks and not self.every
+        member = self.source.turn(self.images) if single else None
         self.images += 1
         ms = self._timer.take()
         if self._skips_faults and estimate.statistics is not None and int(estimate.statistics.fault[0]):

@@ -211,11 +211,7 @@ class UfM(StatefulModule):
             if streams is None:
                 self._store(_empty(0, dtype, device))
                 return
-            chosen = torch.as_tensor(streams, device=device)
-            if chosen.dtype == torch.bool and chosen.shape != (b,):
-                raise ValueError(f"streams as a mask must have shape ({b},), got {tuple(chosen.shape)}")
-            keep = torch.ones(b, dtype=torch.bool, device=device)
-            keep[chosen if chosen.numel() else chosen.long()] = False
+            keep = ~self._chosen(streams, b)
             of_point = keep.repeat_interleave(self.points)
             fresh = _empty(b, dtype, device)
             kept = {"moments": self.moments[of_point], "count": self.count[of_point]}

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ufmstar_torch.arguments import require_float, require_mask
 from ufmstar_torch.fixed_order import apply, product
 from ufmstar_torch.frame import FrameInput
 
@@ -62,19 +63,18 @@ class Anchors:
             TypeError: points or variance are not of a floating dtype, or ``valid`` is not bool.
             ValueError: a wrong shape.
         """
-        points = _floating("points_cam", points_cam)
+        points = require_float("points_cam", points_cam).detach().double()
         if points.dim() != 3 or points.shape[2] != 3:
             raise ValueError(f"points_cam must be [B, N, 3], got {tuple(points.shape)}")
-        spread = _like(_floating("variance", variance), "variance", points.shape[:2], "points_cam")
-        K = _floating("intrinsics", intrinsics).to(points.device)
-        if K.shape not in ((3, 3), (points.shape[0], 3, 3)):
-            raise ValueError(f"intrinsics must be [3, 3] or [{points.shape[0]}, 3, 3], got {tuple(K.shape)}")
+        b, n, _ = points.shape
+        spread = require_float("variance", variance, [(b, n)]).detach().double()
+        K = require_float("intrinsics", intrinsics, [(3, 3), (b, 3, 3)]).detach().double().to(points.device)
         z = points[..., 2]
         fine = points.isfinite().all(-1) & (z > 0) & spread.isfinite() & (spread >= 0)
         if valid is not None:
-            fine = fine & _like(_mask("valid", valid), "valid", points.shape[:2], "points_cam")
+            fine = fine & require_mask("valid", valid, [(b, n)])
         safe = torch.where(fine[..., None], points, torch.ones_like(points))
-        pixel = apply(K.expand(len(points), 3, 3)[:, None], safe)[..., :2] / safe[..., 2:]
+        pixel = apply(K.expand(b, 3, 3)[:, None], safe)[..., :2] / safe[..., 2:]
         fine = fine & _inside(pixel, size)
         zero = torch.zeros_like(z)
         return cls(
@@ -95,7 +95,7 @@ class Anchors:
             TypeError: ``pixel`` is not of a floating dtype.
             ValueError: ``pixel`` is not [B, N, 2].
         """
-        pixel = _floating("anchors.pixel", self.pixel)
+        pixel = require_float("anchors.pixel", self.pixel).detach().double()
         if pixel.dim() != 3 or pixel.shape[2] != 2:
             raise ValueError(f"anchors.pixel must be [B, N, 2], got {tuple(pixel.shape)}")
         # inv_ex does not wait for a device; of intrinsics that make no sense, what comes out is not finite.
@@ -148,17 +148,16 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
         ValueError: a field has the wrong shape or lies on another device.
     """
     b, (height, width) = frame.depth.shape[0], frame.size
-    pixel = _on_device("anchors.pixel", anchors.pixel, frame)
+    pixel = require_float("anchors.pixel", anchors.pixel, like=frame.depth).detach().double()
     if pixel.dim() != 3 or pixel.shape[0] != b or pixel.shape[2] != 2:
         raise ValueError(f"anchors.pixel must be [{b}, N, 2], got {tuple(pixel.shape)}")
-    shape = pixel.shape[:2]
-    depth = _like(_on_device("anchors.depth", anchors.depth, frame), "anchors.depth", shape)
-    variance = _like(_on_device("anchors.variance", anchors.variance, frame), "anchors.variance", shape)
+    shape = [(b, pixel.shape[1])]
+    depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
+    variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
     # Compared as standard deviations: the square of a large depth overflows.
     valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & pixel.isfinite().all(-1)
     if anchors.valid is not None:
-        mask = _like(_mask("anchors.valid", anchors.valid), "anchors.valid", shape)
-        valid = valid & _same_device("anchors.valid", mask, frame)
+        valid = valid & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
     pixel = torch.where(valid[..., None], pixel, torch.zeros_like(pixel))
     u, v = pixel.round().long().unbind(-1)
     index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
@@ -182,31 +181,3 @@ def _inside(pixel: Tensor, size: tuple[int, int]) -> Tensor:
     """[B, N] whether the pixel [B, N, 2] nearest to a position belongs to an image of ``size`` (H, W)."""
     u, v = pixel.round().unbind(-1)
     return (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
-
-
-def _floating(name: str, value: object) -> Tensor:
-    if not isinstance(value, Tensor) or not value.is_floating_point():
-        raise TypeError(f"{name} must be a floating-point tensor, got {getattr(value, 'dtype', type(value).__name__)}")
-    return value.detach().double()
-
-
-def _on_device(name: str, value: object, frame: FrameInput) -> Tensor:
-    return _same_device(name, _floating(name, value), frame)
-
-
-def _same_device(name: str, value: Tensor, frame: FrameInput) -> Tensor:
-    if value.device != frame.depth.device:
-        raise ValueError(f"{name} lies on {value.device} but the depth on {frame.depth.device}")
-    return value
-
-
-def _mask(name: str, value: object) -> Tensor:
-    if not isinstance(value, Tensor) or value.dtype != torch.bool:
-        raise TypeError(f"{name} must be a bool tensor (True = use) or None")
-    return value
-
-
-def _like(value: Tensor, name: str, shape: torch.Size, told_by: str = "anchors.pixel") -> Tensor:
-    if value.shape != shape:
-        raise ValueError(f"{name} must have shape {tuple(shape)} as {told_by} says, got {tuple(value.shape)}")
-    return value

@@ -267,26 +267,9 @@ def _accumulate(coefficient, x, y, z, evidence, total, density):
 
 @compiled
 def _tile(
-    depth,
-    valid,
-    K,
-    v0,
-    v1,
-    u0,
-    u1,
-    origin,
-    kept,
-    n,
-    index,
-    local,
-    log_peak,
-    m,
-    features,
-    prior,
-    prior_mean,
-    out,
-    out_f,
-):
+    depth, valid, K, v0, v1, u0, u1, origin, kept, n, index, local, log_peak, m, features, prior, prior_mean,
+    out, out_f,
+):  # fmt: skip
     """Regress one tile; ``local`` holds mean and whitening of the occupied components."""
     count = (v1 - v0) * (u1 - u0)
     x, y, z = np.empty(count, out.dtype), np.empty(count, out.dtype), np.empty(count, out.dtype)

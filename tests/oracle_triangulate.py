@@ -1,39 +1,11 @@
-"""Points from tracks seen by posed cameras: position, depth, its variance, and whether to believe them.
-
-NumPy, float64, all tracks at once. The start is the point nearest to all rays; a few Gauss-Newton steps on the
-reprojection error follow, whose normal matrix is the information on the point: Cov X = sigma^2 (J^T J)^-1.
-"""
+"""Triangulation in NumPy, all tracks at once: the oracle of ``ufmstar_torch.kernels.triangulate_cpu``."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-# From the rays' nearest point the reprojection error converges quadratically; three steps reach rounding on all but the
-# worst geometry, which the tests of parallax refuse anyway.
-STEPS = 3
-# Added to the normal matrix's diagonal, relative to its trace, so that rays without parallax stay solvable; their huge
-# variance then tells.
-DAMPING = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class Triangulated:
-    """N points in world coordinates.
-
-    Attributes:
-        point: [N, 3] [m].
-        covariance: [N, 3, 3] [m^2] for a noise of one pixel.
-        error: [N] root mean square reprojection error over the views [px].
-        ahead: [N] bool, in front of every camera that saw it.
-    """
-
-    point: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    error: NDArray[np.float64]
-    ahead: NDArray[np.bool_]
+from ufmstar_torch.kernels.triangulate_cpu import DAMPING, STEPS, Triangulated
 
 
 def triangulate(
