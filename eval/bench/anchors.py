@@ -15,7 +15,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench.frames import FrameSource, PosedDepth
-from ufmstar_torch.eval.bench.memory import state_memory, tensor_bytes, weight_bytes
+from ufmstar_torch.eval.bench.memory import state_memory, tensor_bytes
 from ufmstar_torch.eval.bench.step import build_up
 from ufmstar_torch.eval.bench.timing import TimedCalls, pinned_threads, spread_of_counts
 from ufmstar_torch.eval.engine.clock import CallTimes
@@ -141,7 +141,7 @@ def measure_anchored_step(built: UfMStar, frames: Sequence[PosedDepth], points: 
 
     Returns:
         "plain" and "anchored": times [ms]; "ratio" of the two; "used": anchors that were not rejected; "extra_bytes":
-        by how much the state is larger, in all and per slot of the mixture.
+        what the state keeps of anchors, in all and per slot of the mixture.
     """
     plain, anchored = copy.deepcopy(built), copy.deepcopy(built)
     plain.config = built.config.replace(anchored=False)
@@ -161,7 +161,7 @@ def measure_anchored_step(built: UfMStar, frames: Sequence[PosedDepth], points: 
         **{name: _spread(timed.times, name) for name in calls},
         "ratio": timed.times.ratio("anchored", "plain"),
         "extra_bytes": {
-            "total": weight_bytes(anchored) - weight_bytes(plain),
+            "total": anchored.evidence.nbytes + anchored.overall_evidence.nbytes,
             "per_slot": anchored.evidence[0, 0].nbytes,
         },
     }

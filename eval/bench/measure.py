@@ -216,7 +216,8 @@ def _work(
     work: dict[tuple[str, str], tuple[str, Work]] = {}
     for base, inputs in race.given.items():
         for part in parts_of(base, rows):
-            calls = [partial(networks[base].predict, part, given.x, turn) for turn, given in enumerate(inputs)]
+            one = partial(networks[base].predict, part)
+            calls = [partial(one, given.x, given.intrinsics, turn=turn) for turn, given in enumerate(inputs)]
             work[base, part] = (_unit(device), repeated(calls, partial(synchronize, device)))
     for row in rows:
         if row.method.fusion != ALONE:

@@ -17,7 +17,7 @@ from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import DepthOnlyNetwork, UncertaintyNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.pipeline import NetworksInTurn
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 DEPTH, ONCE, EVERY = "depth", "once", "every"
 
@@ -64,19 +64,23 @@ class TimedNetwork:
         except Inseparable as error:
             self.why_whole = str(error)
 
-    def predict(self, part: str, x: Tensor, turn: int = 0) -> DepthPrediction:
+    def predict(self, part: str, x: Tensor, intrinsics: Tensor | None = None, *, turn: int = 0) -> DepthPrediction:
         """One of the three forms of inference.
 
         Args:
             part: "depth" without uncertainty; "once" with it, by the member whose turn it is; "every" member (or
                 sample) one after the other, combined.
             x: [1, 3, H, W] the networks' input.
+            intrinsics: [1, 3, 3] of the input [px], for networks that take them.
             turn: number of the image, for "once".
         """
         with torch.inference_mode():
             if part == DEPTH:
-                return self.depth(x)
-            return self._turns.every(x) if part == EVERY else self._turns.member(x, turn)
+                prediction: DepthPrediction = infer(self.depth, x, intrinsics)
+                return prediction
+            if part == EVERY:
+                return self._turns.every(x, intrinsics)
+            return self._turns.member(x, turn, intrinsics)
 
     def memory(self) -> NetworkMemory | None:
         """Of depth alone and of the rest, or None where the weights are not torch's tensors (ONNX Runtime's)."""

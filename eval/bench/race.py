@@ -184,7 +184,8 @@ def run_race(
         for base, needed in parts.items():
             given = NetworkInput.of(frame, networks[base], device)
             race.given.setdefault(base, []).append(given)
-            calls |= {f"{base}/{part}": partial(networks[base].predict, part, given.x, turn) for part in needed}
+            one = partial(networks[base].predict, x=given.x, intrinsics=given.intrinsics, turn=turn)
+            calls |= {f"{base}/{part}": partial(one, part) for part in needed}
         predicted = timed.call(calls, device=device)
         for base, needed in parts.items():
             for part in needed[1:]:
