@@ -100,18 +100,18 @@ def test_a_batch_ensemble_adds_its_factors_and_the_head():
     memory = one.memory()
     assert memory.depth == weight_bytes(plain.backbone)
     assert memory.uncertainty == factors + biases + head
-    x = torch.rand(1, 3, 64, 64)
-    torch.testing.assert_close(one.predict(DEPTH, x).depth, one.predict(ONCE, x).depth, rtol=1e-4, atol=1e-4)
+    x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
+    torch.testing.assert_close(one.predict(DEPTH, x, K).depth, one.predict(ONCE, x, K).depth, rtol=1e-4, atol=1e-4)
 
 
 def test_mc_dropout_adds_a_head_and_depth_alone_does_not_sample():
     sampling = MonteCarloDropout(fast_depth("aleatoric", dropout=0.2))
     one = TimedNetwork("mc_dropout", [sampling], "FastDepth", samples=3)
-    x = torch.rand(1, 3, 64, 64)
+    x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
     assert one.memory().uncertainty == weight_bytes(sampling.network.head)
-    assert torch.equal(one.predict(DEPTH, x).depth, one.predict(DEPTH, x).depth)
-    assert not torch.equal(one.predict(ONCE, x).depth, one.predict(ONCE, x).depth)
-    assert one.predict(EVERY, x).epistemic_variance.max() > 0
+    assert torch.equal(one.predict(DEPTH, x, K).depth, one.predict(DEPTH, x, K).depth)
+    assert not torch.equal(one.predict(ONCE, x, K).depth, one.predict(ONCE, x, K).depth)
+    assert one.predict(EVERY, x, K).epistemic_variance.max() > 0
     assert one.passes == 3
 
 

@@ -64,7 +64,7 @@ class TimedNetwork:
         except Inseparable as error:
             self.why_whole = str(error)
 
-    def predict(self, part: str, x: Tensor, intrinsics: Tensor | None = None, *, turn: int = 0) -> DepthPrediction:
+    def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
         """One of the three forms of inference.
 
         Args:
@@ -80,7 +80,7 @@ class TimedNetwork:
                 return prediction
             if part == EVERY:
                 return self._turns.every(x, intrinsics)
-            return self._turns.member(x, turn, intrinsics)
+            return self._turns.member(x, intrinsics, turn)
 
     def memory(self) -> NetworkMemory | None:
         """Of depth alone and of the rest, or None where the weights are not torch's tensors (ONNX Runtime's)."""
