@@ -68,7 +68,7 @@ class TimedCalls:
     of a frame alike.
 
     Args:
-        before: untimed predecessors by name: one of them in turn runs before every call, as a network runs before a
+        before: predecessors by name: one of them in turn runs before every call, as a network runs before a
             step in use, on the same arguments. Each is timed the first time that it runs on a frame.
 
     Attributes:
