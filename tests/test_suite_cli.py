@@ -116,7 +116,7 @@ def test_an_evaluation_ends_with_its_table_and_report(ufmstar, rooms, tmp_path):
     assert code == 0, err
     assert "3 sequences of rooms" in text
     assert all(name in text for name in ("DepthOnly", "UfM-DepthOnly-100K", "UfM\\*-DepthOnly"))
-    assert "95 % confidence" in text
+    assert "3 sequences, fewer than 5: no confidence intervals." in text
     assert f"{out}: eval.json, records/DATASET/SEQUENCE/" in text
     assert (out / "tables" / "main.md").is_file()
     assert err.count("rooms/") == 3

@@ -117,8 +117,14 @@ class TrainOptions:
             raise ValueError(f"--data {d.data} {'takes no' if d.root else 'needs'} --root")
         augmentation = None if d.no_augmentation else AugmentationConfig(**d.augment)
         data = DataConfig(kind=d.data, paths=d.root, augmentation=augmentation, **d.config)
-        shown = {"progress": not s.no_progress, "tensorboard": not s.no_tensorboard}
-        return Job(recipe, data, FitSettings(out=self.out, trainable=s.trainable, **shown, **s.settings))
+        settings = FitSettings(
+            out=self.out,
+            trainable=s.trainable,
+            progress=not s.no_progress,
+            tensorboard=not s.no_tensorboard,
+            **s.settings,
+        )
+        return Job(recipe, data, settings)
 
 
 @dataclass(frozen=True, kw_only=True)
