@@ -11,7 +11,7 @@ import pytest
 from hypothesis import settings
 
 # One thread per worker, set before torch is imported; .ci/run sets another number for the numerical tests.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
 
 KERNELS = Path(__file__).resolve().parents[1] / "ufmstar_torch" / "kernels"
 MAX_WORKERS = 4  # each takes up to 3 GB
@@ -60,6 +60,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     slow = [item for item in items if item.get_closest_marker("slow")]
     config.hook.pytest_deselected(items=slow)
     items[:] = [item for item in items if not item.get_closest_marker("slow")]
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Take back what the test before did to torch's threads; numba changes their number when its own threads start."""
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.get_num_threads() != THREADS:
+        torch.set_num_threads(THREADS)
 
 
 def _names_files(config: pytest.Config) -> bool:

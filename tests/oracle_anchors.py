@@ -6,7 +6,7 @@ import numpy as np
 
 import oracle
 
-NEIGHBOURS, SUPPORT, SIGMAS, QUARTILE, LEAST = 8, 3, 2.5, 0.4506, 0.02
+NEIGHBOURS, SUPPORT, SIGMAS, QUARTILE, LEAST, CLAIM = 8, 3, 2.5, 0.4506, 0.02, 4.0
 
 
 def believed(anchors):
@@ -27,6 +27,12 @@ def believed(anchors):
         agree = sum(abs(ratio[i] - ratio[j]) <= limit for j, limit in zip(near, limits, strict=True))
         found.append(agree >= SUPPORT)
     return found
+
+
+def weight(claim, others):
+    """How much an anchor with the relative variance ``claim`` counts beside others with the errors ``others``."""
+    limit = min(CLAIM, len(others)) * max(LEAST**2, np.mean(np.square(others))) if others else 1.0
+    return min(1.0, limit / claim) ** 2 if claim > 0 else 1.0
 
 
 class AnchoredOracle(oracle.Oracle):
@@ -63,9 +69,10 @@ class AnchoredOracle(oracle.Oracle):
         if used:
             self.sums = [self.memory * row for row in self.sums]
             self.total = self.memory * self.total
-        for u, v, g, s2, d in used:
-            r = (g - d) / d
-            row = np.array([1.0, r, r**2 - (s2 + own[round(v), round(u)]) / d**2])
+        errors = [(g - d) / d for *_, g, _, d in used]
+        for i, (u, v, _, s2, d) in enumerate(used):
+            r, claim = errors[i], (s2 + own[round(v), round(u)]) / d**2
+            row = weight(claim, errors[:i] + errors[i + 1 :]) * np.array([1.0, r, r**2 - claim])
             self.total = self.total + row
             for k, w in enumerate(self._shares(mixture, depth, K, round(u), round(v))):
                 self.sums[k] = self.sums[k] + w * row

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracle_anchors import weight
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
@@ -164,11 +165,13 @@ def test_sums_and_means_by_hand(seed, memory, kappa):
             lambda values, share=share: torch.einsum("nk,bnc->bkc", torch.tensor(share), values),
             memory,
         )
-        assert bool(used.all())
+        errors = list((g - d) / d)
         sums, total = sums * memory, total * memory
         for a in range(n):
-            r = (g[a] - d[a]) / d[a]
-            row = np.array([1, r, r**2 - (s2[a] + own[a]) / d[a] ** 2])
+            r, claim = errors[a], (s2[a] + own[a]) / d[a] ** 2
+            w = weight(claim, errors[:a] + errors[a + 1 :])
+            assert bool(used[0, a]) == (w >= 0.5)
+            row = w * np.array([1, r, r**2 - claim])
             total += row
             for c in range(k):
                 sums[c] += share[a, c] * row

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.evidence import inliers
+from ufmstar_torch.anchors.evidence import Evidence, inliers, observe
 from ufmstar_torch.anchors.given import AnchorInput, Anchors
 
 H, W = 48, 64
@@ -46,6 +50,47 @@ def test_one_anchor_that_says_nothing_teaches_nothing(spoilt, without):
     assert used >= 30
     # The frame with the bad anchor alone teaches nothing, so the rest stays within what a frame's forty change.
     np.testing.assert_allclose(found, without, rtol=0.25)
+
+
+def anchored_std(claim, frames=6, every=False):
+    """std [m] where a network is 1 m too far, of frames with 60 anchors; it claims ``claim`` [m^2] at one of them."""
+    depths, poses, K = scenes.sequence(frames, H, W, 0.0)
+    rng, ufm, found = np.random.default_rng(1), UfMStar(ON), []
+    for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
+        v, u = rng.integers(0, H, 60), rng.integers(0, W, 60)
+        depth = torch.tensor(truth[v, u])[None]
+        anchors = Anchors(torch.tensor(np.stack([u, v], -1)[None].astype(float)), depth, torch.full_like(depth, 1e-4))
+        aleatoric = torch.full((1, H, W), 1e-4, dtype=torch.float64)
+        if claim is not None and (every or i == 0):
+            aleatoric[0, v[7], u[7]] = claim
+        out = ufm(torch.tensor(truth + 1.0)[None], torch.tensor(T), torch.tensor(K), aleatoric, anchors=anchors)
+        found.append(float(out.std[out.valid].median()))
+    return found, out.statistics
+
+
+@pytest.mark.parametrize("every", [False, True])
+@given(st.floats(-4, 12))
+@settings(max_examples=8, deadline=None)
+def test_one_large_claim_does_not_switch_anchors_off(every, exponent):
+    found, statistics = anchored_std(10.0**exponent, every=every)
+    np.testing.assert_allclose(found, anchored_std(None)[0], rtol=0.1)
+    assert 60 >= int(statistics.anchors[0]) >= int(statistics.anchors_used[0]) >= 50
+    if every and exponent > 2:
+        assert int(statistics.anchors_used[0]) < int(statistics.anchors[0]), "the statistics count it out"
+
+
+def test_no_weighted_claim_exceeds_the_other_anchors_errors():
+    rng = np.random.default_rng(3)
+    for n in (1, 2, 3, 4, 5, 9, 300):
+        for _ in range(30):
+            d = np.full(n, 3.0)
+            rows = stream(np.stack([5.0 * np.arange(n), np.zeros(n)], -1), rng.normal(0.1, 0.01, n), n)
+            own = torch.tensor(10.0 ** rng.uniform(-6, 12, n))[None]
+            spoilt = replace(rows, predicted=rows.predicted * torch.tensor(d), depth=rows.depth * 3, own_variance=own)
+            evidence = Evidence.empty(1, 1, dtype=torch.float64, device="cpu")
+            sums, _ = observe(evidence, spoilt, lambda values: values.sum(1, keepdim=True), 1.0)
+            squares = (spoilt.depth / spoilt.predicted - 1).square().sum()
+            assert -max(1.0, 4 * float(squares)) <= float(sums.overall[0, 2]) <= float(squares)
 
 
 def stream(pixel, log_ratio, padded):

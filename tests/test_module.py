@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,6 +80,67 @@ def test_loading_into_another_config_warns():
     ufm = UfMStar(CONFIG)
     with pytest.warns(UserWarning, match="another config: eta differ"):
         UfMStar(CONFIG.replace(eta=0.4)).load_state_dict(ufm.state_dict())
+
+
+def put(index, value):
+    """An edit that writes a value (a number, or a function of the old ones) at an index of a tensor."""
+
+    def edit(tensor):
+        tensor[index] = value(tensor[index]) if callable(value) else value
+        return tensor
+
+    return edit
+
+
+SPOILT = {
+    "shape": ("mean", lambda v: v[:, :-1]),
+    "streams": ("T_world_first", lambda v: v.repeat(2, 1, 1)),
+    "NaN": ("mean", put((0, 0), torch.nan)),
+    "infinite": ("disagreement", put((0, 0), torch.inf)),
+    "negative": ("weight", put((0, 0), -1.0)),
+    "hole": ("weight", put((0, 0), 0.0)),
+    "not positive definite": ("covariance", put((0, 0), lambda v: -v)),
+    "not symmetric": ("covariance", put((0, 0, 0, 1), 9.0)),
+    "not rigid": ("T_world_first", put(0, lambda v: 2 * v)),
+    "features": ("features", lambda v: v.new_zeros(*v.shape[:2], 3)),
+    "integers": ("mean", lambda v: v.long()),
+    "no tensor": ("frames", lambda _: 3),
+    "config: no bytes": ("_extra_state", lambda _: {"eta": 0.5}),
+    "config: no JSON": ("_extra_state", lambda v: v[:-1]),
+    "config: no object": ("_extra_state", lambda _: torch.tensor(list(b"[1]"), dtype=torch.uint8)),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_bad_state_is_refused_before_anything_is_replaced(name):
+    whole = UfMStar(CONFIG)
+    for i in range(2):
+        whole(*frame(i))
+    key, edit = SPOILT[name]
+    ufm = UfMStar(CONFIG)
+    ufm(*frame(3))
+    before = snapshot(ufm)
+    with pytest.raises(RuntimeError, match=f"UfMStar keeps its state: .*{key.strip('_')}"):
+        ufm.load_state_dict(whole.state_dict() | {key: edit(whole.state_dict()[key].clone())})
+    assert unchanged(ufm, before)
+    ufm.load_state_dict(whole.state_dict())
+    assert same(ufm(*frame(2)).variance, whole(*frame(2)).variance)
+
+
+def test_a_state_of_too_many_components_or_other_keys_is_refused_whole():
+    whole, few = UfMStar(CONFIG), UfMStar(CONFIG.replace(max_components=2))
+    whole(*frame(0))
+    few(*frame(1))
+    before = snapshot(few)
+    state = whole.state_dict()
+    for changed, match in (
+        (state, "256 slots exceed max_components = 2"),
+        (state | {"other": torch.zeros(1)}, "Unexpected key"),
+        ({key: value for key, value in state.items() if key != "count"}, "Missing key"),
+    ):
+        with pytest.raises(RuntimeError, match=match):
+            few.load_state_dict(changed)
+        assert unchanged(few, before)
 
 
 def test_deepcopy_is_independent():
@@ -586,3 +648,22 @@ def test_float32_follows_float64():
     _, double = run(CONFIG, DEPTHS, POSES, K_, dtype=torch.float64)
     for a, b in zip(single, double, strict=True):
         torch.testing.assert_close(a.std, b.std, rtol=0, atol=1e-4, equal_nan=True)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@given(st.floats(-6, 10), st.sampled_from([torch.float32, torch.float64]), st.integers(0, 99))
+@settings(max_examples=12, deadline=None)
+def test_components_with_a_large_variance_in_their_moments_stay_positive_definite(backend, exponent, dtype, seed):
+    segment = replace(CONFIG.segment, prune="none")
+    ufm = UfMStar(CONFIG.replace(backend=backend, aleatoric_in_moments=True, segment=segment), dtype=dtype)
+    generator = torch.Generator().manual_seed(seed)
+    for i in range(2):
+        depth, pose, intrinsics = frame(i, dtype)
+        aleatoric = 10.0**exponent * torch.rand(depth.shape, generator=generator, dtype=dtype)
+        out = ufm(depth, pose, intrinsics, aleatoric)
+        mixture = ufm.mixture
+        values = torch.linalg.eigvalsh(mixture.covariance.double()[mixture.valid])
+        assert len(values) > 0
+        assert bool((values > 0).all())
+        assert bool(out.variance[out.valid].isfinite().all())
+        assert bool(ufm.query(mixture.mean, frame="first").disagreement[mixture.valid].isfinite().all())

@@ -9,7 +9,10 @@ from torch import nn
 
 import scenes
 from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.models import Preprocess
+from ufmstar_torch.pipeline import NetworksInTurn, combine
 
 H, W = 30, 40
 CONFIG = UfMStarConfig(segment=SPGF)
@@ -117,6 +120,34 @@ def test_preprocess_carries_the_intrinsics():
     out = UncertainDepth(Scaled(1.0), CONFIG, preprocess=half)(image(0), POSES[0], K)
     assert out.depth.shape == (1, H // 2, W // 2)
     torch.testing.assert_close(out.intrinsics[0], resize_intrinsics(K, (H, W), (H // 2, W // 2)))
+
+
+class ByFocal(nn.Module):
+    """Depth = the image times fx [px] of the network's own input / 16."""
+
+    takes_intrinsics = True
+
+    def forward(self, image, K):
+        assert K.shape == (len(image), 3, 3)
+        assert K.dtype == image.dtype == torch.float32
+        return DepthPrediction(image[:, 0] * K[:, 0, 0, None, None] / 16)
+
+
+@pytest.mark.parametrize("mode", ["alternate", "full"])
+def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
+    """Half the size, half the focal length; a member that takes none is called as ever."""
+    half = Preprocess(size=(H // 2, W // 2))
+    x = torch.rand(2, 3, H, W, generator=torch.Generator().manual_seed(0))
+    model = UncertainDepth([ByFocal(), Scaled(1.0)], CONFIG, mode=mode, preprocess=half)
+    expected = half.apply_image(x)[:, 0] * K[0, 0].float() / 2 / 16
+    if mode == "full":
+        expected = (expected + half.apply_image(x)[:, 0]) / 2
+    torch.testing.assert_close(model(x, POSES[0], K).depth, expected)
+    source = NetworkSource(NetworksInTurn(ByFocal(), preprocess=half), torch.device("cpu"), {}, seeding=None)
+    picture = (x[0] * 255).byte()
+    frame = Frame(0, "0", picture.permute(1, 2, 0).numpy(), None, POSES[0].numpy(), K.numpy())
+    depth = torch.as_tensor(source.one(frame, 0).depth)
+    torch.testing.assert_close(depth.reshape(H // 2, W // 2), ByFocal()(*half(picture[None], K[None].float())).depth[0])
 
 
 def test_networks_stay_in_eval_mode():

@@ -100,7 +100,8 @@ def _where(used: Tensor, new: Tensor, old: Tensor) -> Tensor:
 def append(mixture: GaussianMixture, current: GaussianMixture, new: Tensor) -> tuple[GaussianMixture, Tensor]:
     """Add first observations to the mixture, M_i <- M_(i-1) with G_c: m = 0, count = 1.
 
-    Occupied slots are the first ones; the new components follow in increasing c.
+    Occupied slots are the first ones; the new components follow in increasing c. Their covariances must hold in the
+    mixture's dtype (``gaussian.storage_floor``).
 
     Args:
         new: [B, C] True where c is to be added.

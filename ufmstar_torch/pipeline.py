@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
@@ -66,7 +66,8 @@ class NetworksInTurn(nn.Module):
     whatever the caller's training flag is.
 
     Args:
-        networks: one network or a sequence of them. Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`.
+        networks: one network or a sequence of them. Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one
+            with an attribute ``takes_intrinsics = True`` is called with the intrinsics of that image as well.
         samples: passes of a single stochastic network that :meth:`every` combines; None: one pass of each network.
         preprocess: maps image and intrinsics to the networks' input; None passes both through.
 
@@ -104,20 +105,20 @@ class NetworksInTurn(nn.Module):
         """The networks' input [B, 3, h, w] and its intrinsics [B, 3, 3] [px]."""
         return (image, intrinsics) if self.preprocess is None else self.preprocess(image, intrinsics)
 
-    def member(self, x: Tensor, n: int) -> DepthPrediction:
-        """One inference of member ``n``, or sample ``n`` of a single network, on the prepared input.
+    def member(self, x: Tensor, intrinsics: Tensor, n: int) -> DepthPrediction:
+        """One inference of member ``n``, or sample ``n`` of a single network, on what :meth:`prepare` returned.
 
         Raises:
             TypeError: the network returns something else than a :class:`DepthPrediction`.
         """
-        prediction = self.networks[n % len(self.networks)](x)
+        prediction = infer(self.networks[n % len(self.networks)], x, intrinsics)
         if not isinstance(prediction, DepthPrediction):
             raise TypeError(f"network {n} must return a DepthPrediction, got {type(prediction).__name__}")
         return prediction
 
-    def every(self, x: Tensor) -> DepthPrediction:
-        """All members, or samples, on the prepared input, combined (:func:`combine`)."""
-        return combine([self.member(x, n) for n in range(self.passes)])
+    def every(self, x: Tensor, intrinsics: Tensor) -> DepthPrediction:
+        """All members, or samples, on what :meth:`prepare` returned, combined (:func:`combine`)."""
+        return combine([self.member(x, intrinsics, n) for n in range(self.passes)])
 
     def train(self, mode: bool = True) -> Self:
         """The networks stay in eval mode: a prediction must not depend on the caller's training flag."""
@@ -131,7 +132,8 @@ class UncertainDepth(NetworksInTurn):
 
     Args:
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
-            separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`.
+            separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one with an
+            attribute ``takes_intrinsics = True`` is called as ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
         config: of UfM*.
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
@@ -208,7 +210,7 @@ class UncertainDepth(NetworksInTurn):
         member = None if self.mode == "full" else self.turn(self._next)
         with torch.no_grad():
             x, K = self.prepare(image, intrinsics.expand(image.shape[0], 3, 3))
-            prediction = self.every(x) if member is None else self.member(x, member)
+            prediction = self.every(x, K) if member is None else self.member(x, K, member)
         if anchors is not None and self.preprocess is not None:
             anchors = anchors.moved(intrinsics, K)
         a, e = prediction.aleatoric_variance, prediction.epistemic_variance

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.hook import EVIDENCE_SUMS
+from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
 
@@ -72,6 +73,49 @@ class UfMStarState:
     def mixture(self) -> GaussianMixture:
         """M_i, [B, K]."""
         return GaussianMixture(self.mean, self.covariance, self.weight, self.disagreement, self.count, self.features)
+
+    def require(self, config: UfMStarConfig) -> None:
+        """Check tensors that come from elsewhere, a checkpoint say, before they become a state.
+
+        Raises:
+            ValueError: shapes that do not fit each other or the config; values that are not finite or out of their
+                range; covariances that are not positive definite; more slots than ``config.max_components``.
+        """
+        if self.weight.dim() != 2:
+            raise ValueError(f"weight must be [B, K], got {tuple(self.weight.shape)}")
+        b, k = self.weight.shape
+        rows = self.evidence.shape[1] if self.evidence.dim() == 3 and self.evidence.shape[1] in (0, k) else k
+        image = tuple(self.smoothed.shape[1:]) if self.smoothed.dim() == 3 else ("H", "W")
+        shapes = {
+            "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k),
+            "features": (b, k, config.features), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
+            "skipped": (b,), "smoothed": (b, *image), "evidence": (b, rows, EVIDENCE_SUMS),
+            "overall_evidence": (b, EVIDENCE_SUMS),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            if (given := tuple(getattr(self, name).shape)) != shape:
+                raise ValueError(f"{name} must have shape {shape} beside weight {(b, k)}, got {given}")
+        if config.max_components is not None and k > max(config.max_components, 1):
+            raise ValueError(f"{k} slots exceed max_components = {config.max_components}")
+        if self.weight.device.type == "meta":
+            return
+        for name, value in self.tensors().items():
+            if not bool((value.isfinite() | value.isnan() if name == "smoothed" else value.isfinite()).all()):
+                raise ValueError(f"{name} holds NaN or infinity")
+        for name in ("weight", "disagreement", "count", "frames", "skipped", "smoothed"):
+            if bool((getattr(self, name) < 0).any()):
+                raise ValueError(f"{name} holds negative values")
+        occupied = self.weight > 0
+        if bool((occupied[:, 1:] & ~occupied[:, :-1]).any()):
+            raise ValueError("weight has an empty slot before an occupied one")
+        covariance = self.covariance[occupied].double()
+        # A rotation leaves the rounding of one entry and its mirror image apart.
+        lopsided = (covariance - covariance.mT).abs() > 1e-4 * covariance.abs().amax((-2, -1), keepdim=True)
+        if bool(lopsided.any()) or bool(torch.linalg.cholesky_ex(covariance).info.any()):
+            raise ValueError("covariance holds matrices that are not symmetric and positive definite")
+        R = self.T_world_first[:, :3, :3]
+        if b and float(rotation_deviation(R).max()) > 1e-6:
+            raise ValueError("T_world_first holds matrices that are not rigid")
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, without copying."""

@@ -77,19 +77,77 @@ class StatefulModule(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
-        saved = json.loads(bytes(state.tolist()).decode())
+        saved = _config_of(state)
         ours = self.config.to_dict()
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
             warnings.warn(f"the loaded state was made with another config: {', '.join(changed)} differ", stacklevel=2)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """Take the shapes of a saved state before its values are copied."""
-        for name in self.STATE:
-            saved, own = state_dict.get(prefix + name), getattr(self, name)
-            if isinstance(saved, Tensor) and saved.shape != own.shape:
-                setattr(self, name, torch.empty(saved.shape, dtype=own.dtype, device=own.device))
-        super()._load_from_state_dict(state_dict, prefix, *args)
+    def _require_state(self, state: Mapping[str, Tensor]) -> None:
+        """Check a state that is about to be loaded, in the buffers' dtypes; a class states its own rules.
+
+        Raises:
+            ValueError: tensors that do not fit together, or values that no run can produce.
+        """
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, metadata: Any, strict: bool,
+        missing: list[str], unexpected: list[str], errors: list[str],
+    ) -> None:  # fmt: skip
+        """Check the whole of a saved state, then take its shapes and copy its values: all of it or nothing."""
+        expected = [prefix + name for name in (*self.STATE, "_extra_state")]
+        absent = [key for key in expected if key not in state_dict]
+        foreign = [key for key in state_dict if key.startswith(prefix) and key not in expected]
+        if strict and (absent or foreign):
+            missing.extend(absent)
+            unexpected.extend(foreign)
+            return
+        try:
+            saved = {
+                n: _fitting(n, state_dict[prefix + n], getattr(self, n)) for n in self.STATE if prefix + n in state_dict
+            }
+            if prefix + "_extra_state" in state_dict:
+                _config_of(state_dict[prefix + "_extra_state"])
+            self._require_state({name: getattr(self, name) for name in self.STATE} | saved)
+        except ValueError as error:
+            errors.append(f"{type(self).__name__} keeps its state: {error}")
+            return
+        for name, value in saved.items():
+            if value.shape != (own := getattr(self, name)).shape:
+                setattr(self, name, torch.empty(value.shape, dtype=own.dtype, device=own.device))
+        super()._load_from_state_dict(state_dict, prefix, metadata, strict, missing, unexpected, errors)
+
+
+def _fitting(name: str, saved: object, own: Tensor) -> Tensor:
+    """A saved tensor in the dtype of its buffer.
+
+    Raises:
+        ValueError: it is no tensor, or of another kind of dtype.
+    """
+    kind = type(saved).__name__ if not isinstance(saved, Tensor) else str(saved.dtype)
+    fits = isinstance(saved, Tensor) and (
+        saved.is_floating_point() if own.is_floating_point() else saved.dtype == own.dtype
+    )
+    if not isinstance(saved, Tensor) or not fits:
+        raise ValueError(f"{name} must be a tensor that fits {own.dtype}, got {kind}")
+    return saved.detach().to(own.dtype)
+
+
+def _config_of(state: object) -> dict[str, Any]:
+    """The config in a saved ``_extra_state``.
+
+    Raises:
+        ValueError: it is no tensor of bytes that hold a JSON object.
+    """
+    if not isinstance(state, Tensor) or state.dtype != torch.uint8 or state.dim() != 1:
+        raise ValueError("_extra_state must be a tensor of bytes [n], the config as JSON")
+    try:
+        config = json.loads(bytes(state.tolist()).decode())
+    except ValueError as error:
+        raise ValueError(f"_extra_state is not the config as JSON: {error}") from error
+    if not isinstance(config, dict):
+        raise ValueError(f"_extra_state must hold a JSON object, got {type(config).__name__}")
+    return config
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[object]:

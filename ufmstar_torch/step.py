@@ -24,7 +24,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.disagree import with_overlap_disagreement
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.gaussian import pixel_footprint
+from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import FrameStatistics, StepOutput
 from ufmstar_torch.regress import Regression, moving_average
@@ -207,7 +207,7 @@ def step(
     fine = frame.fault == 0
     first = torch.where((fine & ~state.started)[:, None, None], frame.T_world_cam, state.T_world_first)
 
-    current_cam, labels = _segment(frame, config, kernels)
+    current_cam, labels = _segment(frame, config, kernels, state.covariance.dtype)
     stage("segment")
 
     mixture = state.mixture
@@ -275,11 +275,15 @@ def _unobserved(name: str) -> None:
     """Without an observer nothing happens between stages."""
 
 
-def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels) -> tuple[GaussianMixture, Tensor]:
+def _segment(
+    frame: FrameInput, config: UfMStarConfig, kernels: Kernels, stored: torch.dtype
+) -> tuple[GaussianMixture, Tensor]:
     """Step 2: C_i in the camera frame, float64, and its labels.
 
     SPGF's raw moments have no floor, and an exactly flat surface is singular. Eigenvalues are lifted to
-    the variance across one pixel at that depth, (z/f)^2/12: the depth map resolves nothing finer.
+    the variance across one pixel at that depth, (z/f)^2/12: the depth map resolves nothing finer. A covariance that is
+    far longer than thick (``config.aleatoric_in_moments`` with a large A) would lose its least eigenvalue in the dtype
+    ``stored`` of the mixture; it is lifted to what that dtype holds, as the fusion does.
     """
     mixture, labels = kernels.spgf(SegmentInput.of_frame(frame, config))
     mixture = mixture.to(torch.float64)
@@ -287,6 +291,7 @@ def _segment(frame: FrameInput, config: UfMStarConfig, kernels: Kernels) -> tupl
     # Nearer than the near plane nothing is ever matched; the footprint there keeps the floor above zero.
     z = mixture.mean[..., 2].clamp_min(config.near_plane)
     floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
+    floor = torch.maximum(floor, storage_floor(mixture.covariance, stored))
     return mixture.replace(covariance=kernels.floor_covariance(mixture.covariance, floor)), labels
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -231,6 +231,9 @@ class UfMStar(StatefulModule):
         else:
             new = old.restarted(self._chosen(streams, b))
         self._store(new.tensors() | ({"overall_evidence": old.overall_evidence} if keep_evidence else {}))
+
+    def _require_state(self, state: Mapping[str, Tensor]) -> None:
+        UfMStarState(**state).require(self.config)
 
     def _anchors(self, anchors: Anchors | None, frame: FrameInput) -> AnchorInput | None:
         """Checked, with what the network itself claims where they lie.

@@ -172,7 +172,7 @@ def measure_step(built: UfMStar, frames: Sequence[PosedDepth], points: int, *, w
         found = {name: watch.time(name, calls[name], frame, anchors) for name in order}
         used.append(int(found["anchored"].statistics.anchors_used))
     watch.drop(warm_up)
-    extra = _state_bytes(anchored) - _state_bytes(plain)
+    extra = anchored.evidence.nbytes + anchored.overall_evidence.nbytes
     return {
         "size": frames[0].depth.shape[-1],
         "anchors": points,
@@ -262,7 +262,3 @@ def _counts(values: Sequence[int]) -> dict[str, float]:
         "min": float(min(values)),
         "max": float(max(values)),
     }
-
-
-def _state_bytes(ufm: UfMStar) -> int:
-    return sum(buffer.nbytes for buffer in ufm.buffers())

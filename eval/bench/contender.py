@@ -17,7 +17,7 @@ from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import DepthOnlyNetwork, UncertaintyNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.pipeline import combine
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 
 class Inseparable(Exception):
@@ -65,17 +65,17 @@ class Contender:
         """Whether there is a multi-inference form: several members, or samples."""
         return self.passes > 1
 
-    def once(self, x: Tensor, turn: int) -> DepthPrediction:
-        """One inference with its uncertainty, by the member whose turn it is."""
-        return self._run(self.members[turn % len(self.members)], x)
+    def once(self, x: Tensor, turn: int, intrinsics: Tensor | None = None) -> DepthPrediction:
+        """One inference with its uncertainty, by the member whose turn it is, on an input with its intrinsics."""
+        return self._run(self.members[turn % len(self.members)], x, intrinsics)
 
-    def every(self, x: Tensor) -> DepthPrediction:
+    def every(self, x: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """All members, or samples, on the image, one after the other, combined."""
-        return combine([self.once(x, n) for n in range(self.passes)])
+        return combine([self.once(x, n, intrinsics) for n in range(self.passes)])
 
-    def alone(self, x: Tensor) -> DepthPrediction:
+    def alone(self, x: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth without uncertainty."""
-        return self._run(self.depth, x)
+        return self._run(self.depth, x, intrinsics)
 
     def memory(self) -> NetworkMemory | None:
         """Of depth alone and of the rest, or None where the tensors are not torch's (ONNX Runtime holds them)."""
@@ -84,9 +84,10 @@ class Contender:
         members = [self.depth] if self.base == "depth_only" else self.members
         return NetworkMemory.of(members, self.depth)
 
-    def _run(self, network: DepthNetwork, x: Tensor) -> DepthPrediction:
+    def _run(self, network: DepthNetwork, x: Tensor, intrinsics: Tensor | None) -> DepthPrediction:
         with torch.inference_mode():
-            return network(x)
+            prediction: DepthPrediction = infer(network, x, intrinsics)
+        return prediction
 
 
 def contenders(networks: Mapping[str, DepthSource]) -> dict[str, Contender]:

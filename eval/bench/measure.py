@@ -20,7 +20,7 @@ from ufmstar_torch.eval.bench.contender import Contender
 from ufmstar_torch.eval.bench.lines import NETWORK, network_line, row_line
 from ufmstar_torch.eval.bench.multiview import Multiview, synchronize
 from ufmstar_torch.eval.bench.power import CPU, GPU, PowerMeter
-from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, Race, inference_of, parts_of, run_race
+from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, Prepared, Race, inference_of, parts_of, run_race
 from ufmstar_torch.eval.bench.windows import Work, repeated, run_windows
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
@@ -176,7 +176,7 @@ def _work(
     for base, prepared in race.prepared.items():
         one = networks[base]
         for part in parts_of(base, rows):
-            calls = [partial(_infer, one, part, p.x, n) for n, p in enumerate(prepared)]
+            calls = [partial(_infer, one, part, p, n) for n, p in enumerate(prepared)]
             work[base, part] = (_unit(device), repeated(calls, partial(synchronize, device)))
     for row in rows:
         if row.method.fusion != ALONE:
@@ -187,13 +187,13 @@ def _work(
     return work
 
 
-def _infer(network: Contender, part: str, x: torch.Tensor, turn: int) -> None:
+def _infer(network: Contender, part: str, given: Prepared, turn: int) -> None:
     if part == DEPTH:
-        network.alone(x)
+        network.alone(given.x, given.intrinsics)
     elif part == EVERY:
-        network.every(x)
+        network.every(given.x, given.intrinsics)
     else:
-        network.once(x, turn)
+        network.once(given.x, turn, given.intrinsics)
 
 
 def _advance(row: Multiview, number: int, given: Any) -> None:

@@ -143,12 +143,12 @@ def _run_networks(
     race.prepared.setdefault(base, []).append(prepared)
     calls: dict[str, Any] = {
         DEPTH: contender.alone,
-        ONCE: lambda x: contender.once(x, number),
+        ONCE: lambda x, K: contender.once(x, number, K),
         EVERY: contender.every,
     }
     for part in _turned(parts, number):
         synchronize(device)
-        result = race.watch.time(f"{base}/{part}", waited(calls[part], device), prepared.x)
+        result = race.watch.time(f"{base}/{part}", waited(calls[part], device), prepared.x, prepared.intrinsics)
         if part != DEPTH:
             inputs = Inputs(result, prepared.T_world_cam, prepared.intrinsics)
             race.inputs.setdefault((base, part), []).append(inputs)

@@ -15,8 +15,16 @@ with M as it is now at the pixel. So nothing is counted twice: A, E and the anch
 after. (M before, anchor by anchor, would leave nothing where M has not been measured yet: a surface seen once has M = 0
 because nothing was compared, and so has a point that no component explains.)
 
-Sums of (1, r, e) live beside the mixture, one row a component, and one for the stream as a whole. A component takes an
-anchor by its share in explaining the predicted point, w_k = pi_k N_k / (sum pi N + pi_0). Old evidence fades by a
+One anchor must not outweigh all others. Its r is bounded, since its neighbours must support it; its e is not: where the
+network claims a variance of c = (s^2 + A + E)/d^2 far beyond what it errs by, e is -c. An anchor's weight is therefore
+
+    w = min(1, l/c)^2,      l = min(4, n - 1) max(.02^2, mean of r^2 at the frame's n - 1 other anchors),
+
+so that w c is at most l, and 0 in the limit; l = 1 where n = 1. The weight follows the claim and not the anchor's own
+r: with a network that is calibrated, w e is 0 on average as e is.
+
+Sums of w (1, r, e) live beside the mixture, one row a component, and one for the stream as a whole. A component takes
+an anchor by its share in explaining the predicted point, w_k = pi_k N_k / (sum pi N + pi_0). Old evidence fades by a
 factor with every frame that brings new; without new evidence what was learnt stays. Means shrink: the stream's towards
 0, sum/(n + kappa), so that a single anchor does not decide for all; a component's towards the stream's,
 (sum_k + kappa mean)/(n_k + kappa). Where no component explains a point, the stream's mean is the answer: what the
@@ -47,13 +55,16 @@ _TIE = 1e-6
 # "Similar" is within 2.5 sigma of what neighbours differ by; sigma is from the lower quartile of all such differences,
 # .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
 _SIMILAR_SIGMAS, _LOWER_QUARTILE = 2.5, 0.4506
+# Claims of more than so many times the mean square error of the frame's other anchors count less; an anchor with less
+# than _COUNTS of its weight is not reported as used.
+_CLAIM, _COUNTS = 4.0, 0.5
 # Least sigma of log g/d: tracked landmarks are right to some 2 %, whatever variance they state.
 _LEAST_SIGMA = 0.02
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Fading sums over anchors of (1, r, e).
+    """Fading sums over anchors of w (1, r, e).
 
     Attributes:
         component: [B, K, 3], row k of the mixture's slot k.
@@ -120,20 +131,31 @@ def observe(
         memory: in (0, 1], by which the old evidence of a stream is multiplied when there is new.
 
     Returns:
-        The evidence, and [B, N] which anchors were used.
+        The evidence, and [B, N] which anchors were used: supported by their neighbours, with half their weight or more.
     """
-    used = inliers(anchors)
-    d2 = anchors.predicted.square()
+    supported = inliers(anchors)
     r = anchors.depth / anchors.predicted - 1
-    e = r.square() - (anchors.variance + anchors.own_variance) / d2
-    rows = torch.stack([torch.ones_like(r), r, e], dim=-1)
-    rows = torch.where(used[..., None], rows, torch.zeros_like(rows))
+    claim = (anchors.variance + anchors.own_variance) / anchors.predicted.square()
+    w = _weight(r.square(), claim, supported)
+    rows = torch.stack([w, w * r, w * (r.square() - claim)], dim=-1)
+    rows = torch.where(supported[..., None], rows, torch.zeros_like(rows))
+    used = supported & (w >= _COUNTS)
     dtype = evidence.overall.dtype
     fresh = used.any(1, keepdim=True).double()
     fade = memory * fresh + (1 - fresh)
     component = fade[..., None] * evidence.component.double() + distribute(rows)
     overall = fade * evidence.overall.double() + total(rows, 1)
     return Evidence(component.to(dtype), overall.to(dtype)), used
+
+
+def _weight(r2: Tensor, claim: Tensor, supported: Tensor) -> Tensor:
+    """[B, N] w in [0, 1] from each anchor's r^2, the variance c that is claimed there, and which anchors count."""
+    r2 = torch.where(supported, r2, torch.zeros_like(r2))
+    others = (supported.sum(1, keepdim=True) - 1).clamp_min(0)
+    mean = (total(r2, 1)[:, None] - r2) / others.clamp_min(1)
+    limit = others.clamp_max(_CLAIM) * mean.clamp_min(_LEAST_SIGMA**2)
+    limit = torch.where(others > 0, limit, torch.ones_like(limit))
+    return (limit / claim.clamp_min(torch.finfo(claim.dtype).tiny)).clamp_max(1).square()
 
 
 def means(evidence: Evidence, shrinkage: float) -> tuple[Tensor, Tensor]:
