@@ -115,8 +115,8 @@ def test_culling_keeps_its_bound(monkeypatch, epsilon, weight):
     share = shares(m, points, config)
     unexplained = (share.amax(-1) <= 1e-3 * (1 - share.sum(-1))).view(depth.shape)
     assert error[unexplained].max() <= 1e-3 * epsilon * greatest
-    if epsilon == 0.5:
-        assert error.max() > 1e-13, "or nothing was left out, and the test tests nothing"
+    if epsilon == 0.5 and weight == 1e3:
+        assert error.max() > 1e-9, "or nothing was left out, and the test tests nothing"
 
 
 @pytest.mark.parametrize("size", [(40, 56), (33, 41), (7, 3)])
