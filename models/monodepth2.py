@@ -142,24 +142,34 @@ class MonodepthResNet(Backbone):
         assert self.head.bias is not None
         nn.init.constant_(self.head.bias, math.log(math.expm1(INITIAL_DEPTH)))
 
+    @property
+    def pyramid_channels(self) -> tuple[int, ...]:
+        """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
+        return tuple(level.after.out_channels for level in self.levels)
+
     def features(self, image: Tensor) -> Tensor:
-        """The decoder's output, from which the head reads depth.
+        """The decoder's output [B, decoder[0], H, W], from which the head reads depth; as :meth:`pyramid`."""
+        return self.pyramid(image)[0]
+
+    def pyramid(self, image: Tensor) -> list[Tensor]:
+        """The outputs of the decoder's levels, full resolution first.
 
         Args:
             image: [B, 3, H, W] normalised as ``preprocess`` does; H and W multiples of 32, at least 64.
 
         Returns:
-            [B, decoder[0], H, W].
+            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
 
         Raises:
             ValueError: the image has another shape or type.
         """
         require_image(image, MULTIPLE, SMALLEST)
         skips = self.encoder(image)
-        x = skips.pop()
+        x, maps = skips.pop(), []
         for level in reversed(self.levels):
             x = level(x, skips.pop() if skips else None)
-        return x
+            maps.append(x)
+        return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
         """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, hence positive."""
