@@ -84,7 +84,8 @@ class UpConvolution(nn.Module):
         super().__init__()
         self.before = _convolution(inputs, outputs)
         self.after = _convolution(outputs + skip, outputs)
-        self.between, self.dropout = DecoderDropout(between), DecoderDropout(dropout)
+        self.between = DecoderDropout(between) if between else nn.Identity()
+        self.dropout = DecoderDropout(dropout)
 
     def forward(self, x: Tensor, skip: Tensor | None) -> Tensor:
         x = F.interpolate(self.between(F.elu(self.before(x))), scale_factor=2.0, mode="nearest")
@@ -129,7 +130,7 @@ class MonodepthResNet(Backbone):
             raise ValueError(f"size must be multiples of {MULTIPLE} px, at least {SMALLEST}, got {size}")
         self.layers, self.strides = layers, strides
         self.preprocess = Preprocess.nyu(size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
-        self.feature_channels = decoder[0]
+        self.feature_channels, self._widths = decoder[0], tuple(decoder)
         self.encoder = ResNetEncoder(layers, strides)
         skips = (0, *self.encoder.channels[:-1])  # of levels 0 to 4
         inputs = (*decoder[1:], self.encoder.channels[-1])
@@ -145,7 +146,7 @@ class MonodepthResNet(Backbone):
     @property
     def pyramid_channels(self) -> tuple[int, ...]:
         """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
-        return tuple(level.after.out_channels for level in self.levels)
+        return self._widths
 
     def features(self, image: Tensor) -> Tensor:
         """The decoder's output [B, decoder[0], H, W], from which the head reads depth; as :meth:`pyramid`."""
