@@ -300,11 +300,12 @@ class Oracle:
             M = M + (1 - self.share) * (self.unmeasured_relative * depth) ** 2
         if self.unmeasured == "nan":
             M = np.where(self.share < 0.5, np.nan, M)
+        here = ~np.isnan(M)
         if self.smoothed is not None:
             both = (1 - self.alpha) * self.smoothed + self.alpha * M
             M = np.where(np.isnan(M), self.smoothed, np.where(np.isnan(self.smoothed), M, both))
         self.smoothed = M
-        M = np.where(valid, M, np.nan)
+        M = np.where(here, M, np.nan)
         V = M + (0 if aleatoric is None else aleatoric) + (0 if epistemic is None else epistemic)
         return V, M
 
