@@ -17,7 +17,8 @@ from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import OutputSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
 
 # Files of a torch.export archive: those of a word or a number, and tensors as raw bytes.
 _TEXTS = ("archive_format", "archive_version", "byteorder", "version", "serialization_id")
@@ -28,22 +29,34 @@ Spec = ProgramSpec | Mapping[str, Any] | str | Path
 class WrappedNetwork(DepthNetwork):
     """A network whose outputs are declared by an :class:`OutputSpec`; made by :func:`wrap_network`."""
 
-    def __init__(self, network: Callable[..., Any], outputs: OutputSpec, preprocess: Preprocess) -> None:
+    def __init__(
+        self, network: Callable[..., Any], outputs: OutputSpec, preprocess: Preprocess, takes_intrinsics: bool = False
+    ) -> None:
         super().__init__()
         self.network = network
         self.outputs = outputs
         self.preprocess = preprocess
+        self._passes_intrinsics = takes_intrinsics or declares_intrinsics(network)
 
-    def forward(self, image: Tensor) -> DepthPrediction:
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether the network does, or the unit of its depth depends on the focal length."""
+        return self.outputs.focal is not None or self._passes_intrinsics
+
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
 
+        Args:
+            image: see above.
+            intrinsics: [B, 3, 3] of ``image`` [px], for a network that takes them.
+
         Raises:
-            ValueError: the network's output is not what was declared.
+            ValueError: the network's output is not what was declared, or the intrinsics are missing.
         """
-        result = self.network(image)
+        result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
         if isinstance(result, DepthPrediction):
             return result
-        return self.outputs.prediction(_named(result), (image.shape[-2], image.shape[-1]))
+        return self.outputs.prediction(_named(result), (image.shape[-2], image.shape[-1]), intrinsics)
 
 
 def wrap_network(
@@ -57,6 +70,8 @@ def wrap_network(
     epistemic: str | int | None = None,
     epistemic_kind: str = "variance",
     resize: bool = False,
+    focal: float | None = None,
+    takes_intrinsics: bool = False,
     preprocess: Preprocess | None = None,
 ) -> WrappedNetwork:
     """A network of one's own for UfM*.
@@ -67,7 +82,9 @@ def wrap_network(
         output: which of several outputs is depth: a name, or a position in a tuple.
         scale: [m] length of one unit of depth.
         inverse: declares inverse or relative depth, which is refused.
-        aleatoric, aleatoric_kind, epistemic, epistemic_kind, resize: as in :class:`OutputSpec`.
+        aleatoric, aleatoric_kind, epistemic, epistemic_kind, resize, focal: as in :class:`OutputSpec`.
+        takes_intrinsics: whether it is called as ``network(x, K)``, K [B, 3, 3] [px] of ``x``; an attribute
+            ``takes_intrinsics = True`` of ``network`` does the same.
         preprocess: what its input needs; None: images in [0, 1] at their own size.
 
     Raises:
@@ -85,8 +102,9 @@ def wrap_network(
         epistemic=epistemic,
         epistemic_kind=epistemic_kind,
         resize=resize,
+        focal=focal,
     )
-    return WrappedNetwork(network, spec, preprocess or Preprocess())
+    return WrappedNetwork(network, spec, preprocess or Preprocess(), takes_intrinsics)
 
 
 def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
@@ -106,7 +124,7 @@ def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwo
         module = torch.jit.load(_existing(path), map_location="cpu")
     except RuntimeError as error:
         raise ValueError(f"{path} is not a readable TorchScript file: {error}") from error
-    return WrappedNetwork(module.eval(), declared.outputs, declared.preprocess or Preprocess())
+    return _wrapped(module.eval(), declared)
 
 
 def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
@@ -119,7 +137,11 @@ def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
         program = torch.export.load(str(path))
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError, BadZipFile) as error:
         raise ValueError(f"{path} is not a readable torch.export file: {error}") from error
-    return WrappedNetwork(_Exported(program.module()), declared.outputs, declared.preprocess or Preprocess())
+    return _wrapped(_Exported(program.module()), declared)
+
+
+def _wrapped(program: nn.Module, spec: ProgramSpec) -> WrappedNetwork:
+    return WrappedNetwork(program, spec.outputs, spec.preprocess or Preprocess(), spec.takes_intrinsics)
 
 
 def _require_tensors(path: str) -> None:
@@ -156,8 +178,8 @@ class _Exported(nn.Module):
         self.program = program
         self.training = False
 
-    def forward(self, image: Tensor) -> Any:
-        return self.program(image)
+    def forward(self, *inputs: Tensor) -> Any:
+        return self.program(*inputs)
 
     def train(self, mode: bool = True) -> _Exported:
         return self

@@ -13,7 +13,7 @@ from ufmstar_torch.models.distribution import DepthDistribution, split_batch
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer, takes_intrinsics
 
 SAMPLES = 10  # passes of the paper's multi-inference baseline
 
@@ -121,12 +121,18 @@ class MonteCarloDropout(DepthNetwork):
             raise TypeError(f"{type(self.network).__name__} is no UncertaintyNetwork; put a head on it for training")
         return self.network.distribution(image)
 
-    def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W]; with one sample only what the
-        network itself predicts, otherwise E = the variance between the passes (+ their own mean E)."""
-        if self.samples == 1:
-            return self.network(image)
-        if not self.batched:
-            return combine([self.network(image) for _ in range(self.samples)])
-        together = self.network(image.repeat(self.samples, 1, 1, 1))
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether the network does."""
+        return takes_intrinsics(self.network)
+
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
+        """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; with
+        one sample only what the network itself predicts, otherwise E = the variance between the passes (+ their own
+        mean E)."""
+        if self.samples == 1 or not self.batched:
+            passes = [infer(self.network, image, intrinsics) for _ in range(self.samples)]
+            return passes[0] if self.samples == 1 else combine(passes)
+        repeated = None if intrinsics is None else intrinsics.repeat(self.samples, 1, 1)
+        together = infer(self.network, image.repeat(self.samples, 1, 1, 1), repeated)
         return combine(split_batch(together, self.samples))

@@ -15,7 +15,7 @@ from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.pipeline import combine
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer, takes_intrinsics
 
 
 class Ensemble(DepthNetwork):
@@ -39,10 +39,15 @@ class Ensemble(DepthNetwork):
         self.members = nn.ModuleList(members)
         self.preprocess = wanted[0]
 
-    def forward(self, image: Tensor) -> DepthPrediction:
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether a member does."""
+        return any(takes_intrinsics(member) for member in self.members)
+
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Mean depth [B, H, W] [m], mean A, and the variance between the members (+ mean E) as E [m^2] of
-        ``image`` [B, 3, H, W]; one inference after the other."""
-        return combine([member(image) for member in self.members])
+        ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; one inference after the other."""
+        return combine([infer(member, image, intrinsics) for member in self.members])
 
 
 class LazyMember(DepthNetwork):
@@ -107,20 +112,26 @@ class LazyMember(DepthNetwork):
             )
         return network.train(self.training)
 
-    def forward(self, image: Tensor) -> DepthPrediction:
-        """What the network returns.
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether the network does, which is loaded for it."""
+        return takes_intrinsics(self.network())
+
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
+        """What the network returns; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them.
 
         Raises:
             CheckpointError: it cannot be loaded.
         """
         network, device = self.network(), self._where.device
         if not self.offload or device.type == "cpu":
-            return network(image)
+            prediction: DepthPrediction = infer(network, image, intrinsics)
+            return prediction
         tensors = {**dict(network.named_parameters()), **dict(network.named_buffers())}
         # Copies for this call: nothing has to be copied back, and none is left behind by an error.
         copies = {name: tensor.to(device, non_blocking=True) for name, tensor in tensors.items()}
         with self._calling:  # the call puts them into the network while it lasts
-            return functional_call(network, copies, (image,))
+            return functional_call(network, copies, (image, intrinsics) if takes_intrinsics(network) else (image,))
 
     def train(self, mode: bool = True) -> LazyMember:
         """Also for a network that is loaded later."""

@@ -77,16 +77,17 @@ class ResNetEncoder(nn.Module):
 
 
 class UpConvolution(nn.Module):
-    """One level of the decoder: convolve, double, concatenate with the skip, convolve."""
+    """One level of the decoder: convolve (and drop with probability ``between``), double, concatenate with the skip,
+    convolve, drop with probability ``dropout``."""
 
-    def __init__(self, inputs: int, skip: int, outputs: int, dropout: float) -> None:
+    def __init__(self, inputs: int, skip: int, outputs: int, dropout: float, between: float) -> None:
         super().__init__()
         self.before = _convolution(inputs, outputs)
         self.after = _convolution(outputs + skip, outputs)
-        self.dropout = DecoderDropout(dropout)
+        self.between, self.dropout = DecoderDropout(between), DecoderDropout(dropout)
 
     def forward(self, x: Tensor, skip: Tensor | None) -> Tensor:
-        x = F.interpolate(F.elu(self.before(x)), scale_factor=2.0, mode="nearest")
+        x = F.interpolate(self.between(F.elu(self.before(x))), scale_factor=2.0, mode="nearest")
         x = x if skip is None else torch.cat([x, skip], 1)
         return self.dropout(F.elu(self.after(x)))
 
@@ -102,6 +103,7 @@ class MonodepthResNet(Backbone):
         layers: of the encoder, 18, 34 or 50.
         strides: of the encoder, "v1.5" or "v1": see :class:`ResNetEncoder`.
         dropout: probability of decoder dropout, after each of the five levels.
+        dropout_both: dropout after both convolutions of a level instead of the second only.
         decoder: channels of the five levels, full resolution first.
         size: (height, width) [px], multiples of 32 and at least 64, that ``preprocess`` makes.
 
@@ -116,6 +118,7 @@ class MonodepthResNet(Backbone):
         *,
         strides: str = "v1.5",
         dropout: float = 0.0,
+        dropout_both: bool = False,
         decoder: tuple[int, ...] = DECODER_WIDTHS,
         size: tuple[int, int] = (224, 224),
     ) -> None:
@@ -132,7 +135,8 @@ class MonodepthResNet(Backbone):
         inputs = (*decoder[1:], self.encoder.channels[-1])
         # levels[i] makes features at 1/2^i of the resolution; level 4 runs first.
         self.levels = nn.ModuleList(
-            UpConvolution(inputs[i], skips[i], decoder[i], dropout=dropout) for i in range(LEVELS)
+            UpConvolution(inputs[i], skips[i], decoder[i], dropout, dropout if dropout_both else 0.0)
+            for i in range(LEVELS)
         )
         self.head = _convolution(decoder[0], 1)
         assert self.head.bias is not None

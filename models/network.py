@@ -19,9 +19,15 @@ class DepthNetwork(nn.Module, ABC):
 
     preprocess: Preprocess
 
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether it is called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
+        return False
+
     @abstractmethod
     def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it."""
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; a second argument, the image's
+        intrinsics [B, 3, 3] [px], of a network that takes them (``infer`` passes what a network takes)."""
 
 
 class Backbone(DepthNetwork):

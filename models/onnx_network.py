@@ -22,7 +22,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
 if TYPE_CHECKING:
-    from onnxruntime import InferenceSession
+    from onnxruntime import InferenceSession, NodeArg
 
 _NUMPY_TYPES = {
     "tensor(float)": np.float32,
@@ -30,6 +30,7 @@ _NUMPY_TYPES = {
     "tensor(double)": np.float64,
     "tensor(uint8)": np.uint8,
 }
+_FLOATS = [name for name, kind in _NUMPY_TYPES.items() if kind is not np.uint8]
 _ERRORS_ONLY = 3  # ONNX Runtime's severity; below it, it reports every unused weight of a file
 
 
@@ -41,7 +42,8 @@ class OnnxSpec(ProgramSpec):
         outputs: as in :class:`ProgramSpec`; outputs are named.
         preprocess: what the input needs; None: the image in [0, 1], stretched to the graph's size if that
             is fixed. A fixed size of the graph is taken over where ``preprocess.size`` is None.
-        input: name of the image input; None where the graph has only one.
+        input: name of the image input; None where the graph has only one. A second input, with ``takes_intrinsics``,
+            is that of the intrinsics [B, 3, 3] [px].
         layout: "NCHW" or "NHWC", of the input.
         channels: "rgb" or "bgr"; ``preprocess``'s mean and std are R, G, B in either case.
 
@@ -95,8 +97,8 @@ class OnnxNetwork(DepthNetwork):
         name = self.spec.input
         if name is None and len(inputs) == 1:
             name = next(iter(inputs))
-        if name not in inputs or len(inputs) != 1:
-            raise ValueError(f"{self.path}: input {name!r} must be the graph's only input; it has {list(inputs)}")
+        self.K_input = self._intrinsics_input(name, inputs)
+        assert name is not None  # one of the inputs
         self.input = name
         self.input_type = inputs[name].type
         if self.input_type not in _NUMPY_TYPES:
@@ -117,6 +119,34 @@ class OnnxNetwork(DepthNetwork):
             raise ValueError(f"{self.path}: the graph's outputs are {outputs}; {fault}")
         self.fetched = outputs if self.spec.outputs.depth is None else declared
 
+    def _intrinsics_input(self, name: str | None, inputs: Mapping[str, NodeArg]) -> tuple[str, Any] | None:
+        """Name and NumPy type of the graph's second input, the intrinsics [B, 3, 3]; None: it has only the image."""
+        rest = [i for other, i in inputs.items() if other != name]
+        if name in inputs and not rest and not self.spec.takes_intrinsics:
+            return None
+        if not self.spec.takes_intrinsics:
+            raise ValueError(
+                f"{self.path}: input {name!r} must be the graph's only input; it has {list(inputs)} "
+                "(a second one for the intrinsics needs takes_intrinsics)"
+            )
+        if name not in inputs or len(rest) != 1:
+            raise ValueError(
+                f"{self.path}: takes_intrinsics needs two inputs, the image (the spec's input names it, got {name!r}) "
+                f"and the intrinsics; the graph has {list(inputs)}"
+            )
+        shape = [d if isinstance(d, int) and d > 0 else None for d in rest[0].shape]
+        if len(shape) != 3 or {*shape[1:]} - {3, None} or rest[0].type not in _FLOATS:
+            raise ValueError(
+                f"{self.path}: input {rest[0].name!r} must be floating-point intrinsics [B, 3, 3], got {rest[0].type} "
+                f"{rest[0].shape}"
+            )
+        return rest[0].name, _NUMPY_TYPES[rest[0].type]
+
+    @property
+    def takes_intrinsics(self) -> bool:
+        """Whether the graph does, or the unit of its depth depends on the focal length."""
+        return self.K_input is not None or self.spec.outputs.focal is not None
+
     def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:
         height, width = self.size
         if height is None or width is None:
@@ -128,26 +158,34 @@ class OnnxNetwork(DepthNetwork):
             )
         return replace(preprocess, size=(height, width))
 
-    def forward(self, image: Tensor) -> DepthPrediction:
+    def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] on the image's device.
 
         Args:
             image: [B, 3, H, W] RGB as ``preprocess`` returns it.
+            intrinsics: [B, 3, 3] of ``image`` [px], for a graph that takes them.
 
         Raises:
-            ValueError: the image does not fit the graph's input, or an output is not as declared.
+            ValueError: the image does not fit the graph's input, the intrinsics are missing, or an output is not as
+                declared.
         """
         self._check(image)
+        if self.takes_intrinsics and intrinsics is None:
+            raise ValueError(f"{self.path} takes intrinsics: call network(x, K), K [B, 3, 3] of its input x")
         array = image.detach().cpu()
         if self.spec.channels == "bgr":
             array = array.flip(1)
         if self.spec.layout == "NHWC":
             array = array.permute(0, 2, 3, 1)
-        runs = [self._run(np.ascontiguousarray(part.numpy())) for part in array.split(self.batch or max(len(array), 1))]
+        size = self.batch or max(len(array), 1)
+        cameras = [None] * -(-len(array) // size)
+        if self.K_input is not None and intrinsics is not None:
+            cameras = intrinsics.detach().cpu().expand(len(array), 3, 3).split(size)
+        runs = [self._run(part.contiguous(), K) for part, K in zip(array.split(size), cameras, strict=True)]
         outputs: dict[str | int, Tensor] = {
             name: torch.cat([run[i] for run in runs]).to(image.device) for i, name in enumerate(self.fetched)
         }
-        prediction = self.spec.outputs.prediction(outputs, (image.shape[-2], image.shape[-1]))
+        prediction = self.spec.outputs.prediction(outputs, (image.shape[-2], image.shape[-1]), intrinsics)
         if len(prediction.depth) != len(image):
             raise ValueError(
                 f"{self.path}: the depth output holds {len(prediction.depth)} maps for {len(image)} images"
@@ -165,11 +203,14 @@ class OnnxNetwork(DepthNetwork):
                 f"number of images, got {len(image)}"
             )
 
-    def _run(self, array: np.ndarray[Any, Any]) -> list[Tensor]:
-        dtype = _NUMPY_TYPES[self.input_type]
+    def _run(self, image: Tensor, K: Tensor | None) -> list[Tensor]:
+        dtype, array = _NUMPY_TYPES[self.input_type], image.numpy()
         if dtype is np.uint8:
             array = array.round().clip(0, 255)
-        results = self.session.run(self.fetched, {self.input: array.astype(dtype, copy=False)})
+        feeds = {self.input: array.astype(dtype, copy=False)}
+        if self.K_input is not None and K is not None:
+            feeds[self.K_input[0]] = K.numpy().astype(self.K_input[1])
+        results = self.session.run(self.fetched, feeds)
         return [torch.from_numpy(np.asarray(value)).to(torch.float32) for value in results]
 
     def __getstate__(self) -> dict[str, Any]:

@@ -34,6 +34,9 @@ class OutputSpec(Checked):
         depth: name of the depth output (or its position, for a network that returns a tuple); None where the
             network has only one output.
         scale: [m] length of one unit of the depth output, .001 for millimetres.
+        focal: [px] focal length for which the depth output holds; None where it holds for every camera. Depth and the
+            spreads in its units are then multiplied by f / ``focal``, with f = (fx + fy) / 2 of the network's input
+            (300 for Depth Anything 3's metric networks, 1000 for Metric3D), which needs the intrinsics.
         aleatoric, epistemic: names of the outputs with the learned data and model variance, if any.
         aleatoric_kind, epistemic_kind: "variance", "std", "log_variance" or "log_std" (natural logarithms), in the
             units of the depth output; or "relative_std", a standard deviation per depth (to first order that of the
@@ -53,6 +56,7 @@ class OutputSpec(Checked):
     epistemic: str | int | None = None
     epistemic_kind: str = choice(*SPREADS)
     resize: bool = False
+    focal: float | None = number(None, "f", "px", 0.0, open_low=True, open_high=True)
 
     def __post_init__(self) -> None:
         if self.kind in NOT_METRIC:
@@ -71,35 +75,56 @@ class OutputSpec(Checked):
         """The outputs that are declared by name."""
         return [name for name in (self.depth, self.aleatoric, self.epistemic) if name is not None]
 
-    def prediction(self, outputs: Mapping[str | int, Tensor], size: tuple[int, int]) -> DepthPrediction:
+    def prediction(
+        self, outputs: Mapping[str | int, Tensor], size: tuple[int, int], intrinsics: Tensor | None = None
+    ) -> DepthPrediction:
         """The declared outputs in metres.
 
         Args:
             outputs: raw outputs by name, each [B, 1, H, W], [B, H, W, 1] or [B, H, W].
             size: (H, W) [px] of the network's input, whose intrinsics the prediction has to share.
+            intrinsics: [B, 3, 3] of that input [px], for ``focal``.
 
         Raises:
-            ValueError: a declared output is missing or has another shape.
+            ValueError: a declared output is missing or has another shape, or ``focal`` lacks the intrinsics.
         """
         if self.depth is None and len(outputs) != 1:
             raise ValueError(f"the network returns {list(outputs)}; declare which one is depth")
         depth_name = next(iter(outputs)) if self.depth is None else self.depth
-        depth = self._map(outputs, depth_name, size) * self.scale
-        aleatoric = self._variance(outputs, self.aleatoric, self.aleatoric_kind, depth)
-        epistemic = self._variance(outputs, self.epistemic, self.epistemic_kind, depth)
+        depth = self._map(outputs, depth_name, size)
+        unit = self._unit(intrinsics, depth)
+        depth = depth * unit
+        aleatoric = self._variance(outputs, self.aleatoric, self.aleatoric_kind, depth, unit)
+        epistemic = self._variance(outputs, self.epistemic, self.epistemic_kind, depth, unit)
         return DepthPrediction(depth, aleatoric, epistemic)
 
+    def _unit(self, intrinsics: Tensor | None, depth: Tensor) -> float | Tensor:
+        """[m] length of one unit of the depth output: a number, or [B, 1, 1] where the camera decides."""
+        if self.focal is None:
+            return self.scale
+        if intrinsics is None:
+            raise ValueError(
+                f"OutputSpec.focal={self.focal:g} needs the intrinsics of the network's input: call network(x, K)"
+            )
+        K = intrinsics.to(depth.device, torch.promote_types(depth.dtype, torch.float32))
+        return self.scale / self.focal * (K[..., 0, 0, None, None] + K[..., 1, 1, None, None]) / 2
+
     def _variance(
-        self, outputs: Mapping[str | int, Tensor], name: str | int | None, kind: str, depth: Tensor
+        self,
+        outputs: Mapping[str | int, Tensor],
+        name: str | int | None,
+        kind: str,
+        depth: Tensor,
+        unit: float | Tensor,
     ) -> Tensor | None:
-        """[B, H, W] [m^2], or None where the network has none; ``depth`` [B, H, W] [m]."""
+        """[B, H, W] [m^2], or None where the network has none; ``depth`` [B, H, W] [m], ``unit`` as :meth:`_unit`."""
         if name is None:
             return None
         spread = self._map(outputs, name, (depth.shape[-2], depth.shape[-1]))
         if kind == "relative_std":
             return (spread * depth).square()
         spread = spread.exp() if kind.startswith("log_") else spread
-        return (spread.square() if kind.endswith("std") else spread) * self.scale**2
+        return (spread.square() if kind.endswith("std") else spread) * unit**2
 
     def _map(self, outputs: Mapping[str | int, Tensor], name: str | int, size: tuple[int, int]) -> Tensor:
         """[B, H, W] of one output, in its own units."""
@@ -142,6 +167,7 @@ class ProgramSpec(Checked):
     Attributes:
         outputs: which output is depth, in which unit; and the variances, if any.
         preprocess: what the input needs; None: the image in [0, 1] at its own size.
+        takes_intrinsics: whether the program has a second input for the intrinsics [B, 3, 3] [px] of the first.
 
     Raises:
         ValueError: a field is out of range.
@@ -149,6 +175,7 @@ class ProgramSpec(Checked):
 
     outputs: OutputSpec
     preprocess: Preprocess | None = None
+    takes_intrinsics: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,14 @@ from torch import Tensor, nn
 
 import ufmstar_torch.models
 from ufmstar_torch.models import (
+    AlignedNetwork,
+    Alignment,
+    DecoderDropout,
+    DepthNetwork,
+    Ensemble,
     FastDepth,
+    LazyMember,
+    MonteCarloDropout,
     OutputSpec,
     Preprocess,
     load_network,
@@ -30,7 +38,7 @@ from ufmstar_torch.models import (
 from ufmstar_torch.models.any_network import load_exported, load_torchscript
 from ufmstar_torch.models.load import network_names
 from ufmstar_torch.models.outputs import ProgramSpec
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 METRIC = ProgramSpec(OutputSpec("metric"))
 
@@ -98,6 +106,67 @@ def test_units_and_variances(image: Tensor) -> None:
     torch.testing.assert_close(got.epistemic_variance, image[:, 0].exp() * 1e-6)
 
 
+def cameras(*focals: tuple[float, float]) -> Tensor:
+    """[B, 3, 3] float64, as sequences have them."""
+    return torch.tensor([[[fx, 0, 4], [0, fy, 3], [0, 0, 1]] for fx, fy in focals], dtype=torch.float64)
+
+
+def test_depth_for_a_canonical_focal_length(image: Tensor) -> None:
+    """Depth and spreads in its units scale by f / 300, camera by camera; a relative spread does not scale again."""
+    raw = {"d": image.sum(1), "s": image[:, 0], "r": image[:, 1]}
+    kinds = {"aleatoric": "s", "aleatoric_kind": "std", "epistemic": "r", "epistemic_kind": "relative_std"}
+    network = wrap_network(lambda x: raw, "d", scale=2.0, focal=300.0, **kinds)
+    assert network.takes_intrinsics
+    got = network(image, cameras((150, 150), (500, 700)))
+    unit = 2 * torch.tensor([0.5, 2.0])[:, None, None]
+    torch.testing.assert_close(got.depth, raw["d"] * unit)
+    torch.testing.assert_close(got.aleatoric_variance, (raw["s"] * unit) ** 2)
+    torch.testing.assert_close(got.epistemic_variance, (raw["r"] * raw["d"] * unit) ** 2)
+    with pytest.raises(ValueError, match=r"focal=300 needs the intrinsics .* network\(x, K\)"):
+        network(image)
+    with pytest.raises(ValueError, match=r"OutputSpec.focal must lie in \(0.0, inf\)"):
+        OutputSpec("metric", focal=0.0)
+
+
+class Metric(nn.Module):
+    """Depth = the first channel times fx / 1000."""
+
+    takes_intrinsics = True
+
+    def forward(self, x: Tensor, K: Tensor) -> Tensor:
+        return x[:, 0] * K[:, 0, 0, None, None] / 1000
+
+
+@pytest.mark.parametrize("around", ["wrapped", "declared", "ensemble", "lazy", "samples", "batched", "aligned"])
+def test_the_intrinsics_pass_through_every_wrapper(image: Tensor, around: str) -> None:
+    """Whatever contains a network that takes intrinsics takes them as well and passes them on, in single precision."""
+    inner: DepthNetwork = wrap_network(Metric())
+    networks: dict[str, Callable[[], DepthNetwork]] = {
+        "wrapped": lambda: inner,
+        "declared": lambda: wrap_network(lambda x, K: Metric()(x, K), takes_intrinsics=True),
+        "ensemble": lambda: Ensemble([inner, wrap_network(lambda x: x[:, 0])]),
+        "lazy": lambda: LazyMember(lambda: inner, inner.preprocess),
+        "samples": lambda: MonteCarloDropout(wrap_network(Sampling()), 2),
+        "batched": lambda: MonteCarloDropout(wrap_network(Sampling()), 2, batched=True),
+        "aligned": lambda: AlignedNetwork(Metric(), Alignment("affine", 1.0, 0.0)),
+    }
+    network, factor = networks[around](), torch.tensor([0.5, 2.0])[:, None, None]
+    assert network.takes_intrinsics
+    depth = infer(network, image, cameras((500, 500), (2000, 2000))).depth
+    expected = image[:, 0] * ((1 + factor) / 2 if around == "ensemble" else factor)
+    torch.testing.assert_close(depth, expected)
+    with pytest.raises(ValueError, match=r"network\(x, K\)"):
+        network(image)
+
+
+class Sampling(Metric):
+    """With a dropout that a ``MonteCarloDropout`` can switch on, and that changes nothing here."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.dropout = DecoderDropout(0.5)
+
+
 def test_a_wrapped_module_stays_a_module(image: Tensor) -> None:
     """Parameters, gradients, modes and state_dict pass through the wrapper."""
     network = wrap_network(Sum(), preprocess=Preprocess(size=(6, 8)))
@@ -145,6 +214,10 @@ def test_torchscript(tmp_path: Path, image: Tensor) -> None:
     torch.testing.assert_close(load_torchscript(tmp_path / "n.ts", METRIC)(image).depth, expected)
     network = load_network("torchscript", tmp_path / "n.ts", spec={"outputs": {"kind": "metric", "scale": 2}})
     torch.testing.assert_close(network(image).depth, 2 * expected)
+    K = cameras((500, 500), (2000, 2000)).float()
+    torch.jit.save(torch.jit.trace(Metric(), (image, K)), str(tmp_path / "k.ts"))
+    network = load_network("torchscript", tmp_path / "k.ts", spec={**METRIC.to_dict(), "takes_intrinsics": True})
+    torch.testing.assert_close(network(image, K).depth, Metric()(image, K))
     (tmp_path / "broken.ts").write_bytes((tmp_path / "n.ts").read_bytes()[:200])
     with pytest.raises(ValueError, match=r"broken.ts is not a readable TorchScript file"):
         load_torchscript(tmp_path / "broken.ts", METRIC)
@@ -248,7 +321,9 @@ def test_refusals_by_name(tmp_path: Path) -> None:
     for name in ("onnx", "torchscript", "exported"):
         with pytest.raises(ValueError, match="needs a spec"):
             load_network(name, "n")
-    with pytest.raises(ValueError, match=r"ProgramSpec has no \['kind'\]; it has \['outputs', 'preprocess'\]"):
+    with pytest.raises(
+        ValueError, match=r"ProgramSpec has no \['kind'\]; it has \['outputs', 'preprocess', 'takes_intrinsics'\]"
+    ):
         load_network("exported", "n", spec={"kind": "metric"})
     assert {"exported", "fastdepth", "monodepth2", "onnx", "torchscript"} <= set(network_names())
 

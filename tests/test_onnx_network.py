@@ -18,7 +18,7 @@ from shared_data import require_shared
 from torch import Tensor
 
 from ufmstar_torch.models.fastdepth import FastDepth
-from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
+from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, load_onnx
 from ufmstar_torch.models.outputs import OutputSpec
 from ufmstar_torch.models.preprocess import Preprocess
 
@@ -63,6 +63,61 @@ def write(
         outputs.append((spread, None))
     shape = shape or (["n", "h", "w", 3] if nhwc else ["n", 3, "h", "w"])
     return save(path, nodes, weights, [("image", shape)], outputs, types=[kind])
+
+
+def write_with_camera(path: Path, shape: list[int | str], camera: list[int | str], names: tuple[str, str]) -> Path:
+    """depth = the first channel times fx, of an image in single and intrinsics in double precision."""
+    fx = numpy_helper.from_array(np.array([[1, 0, 0]], np.float64), "fx")
+    ones = numpy_helper.from_array(np.array([[1], [0], [0]], np.float64), "ones")
+    shape_of = numpy_helper.from_array(np.array([-1, 1, 1, 1], np.int64), "shape")
+    red = numpy_helper.from_array(np.array([[[[1]], [[0]], [[0]]]], np.float32), "red")
+    nodes = [
+        helper.make_node("MatMul", ["fx", names[1]], ["row"]),
+        helper.make_node("MatMul", ["row", "ones"], ["f"]),
+        helper.make_node("Cast", ["f"], ["single"], to=TensorProto.FLOAT),
+        helper.make_node("Reshape", ["single", "shape"], ["focal"]),
+        helper.make_node("Conv", [names[0], "red"], ["channel"]),
+        helper.make_node("Mul", ["channel", "focal"], ["depth"]),
+    ]
+    inputs = [(names[0], shape), (names[1], camera)]
+    types = [TensorProto.FLOAT, TensorProto.DOUBLE]
+    return save(path, nodes, [fx, ones, shape_of, red], inputs, [("depth", None)], types=types)
+
+
+@pytest.mark.parametrize("batch", ["n", 1])
+def test_a_second_input_for_the_intrinsics(tmp_path: Path, image: Tensor, batch: int | str) -> None:
+    """Image by image its own camera, also where the graph takes one at a time; copies too."""
+    path = write_with_camera(tmp_path / "n.onnx", [batch, 3, "h", "w"], [batch, 3, 3], ("image", "K"))
+    spec = {"outputs": {"kind": "metric", "focal": 300.0}, "takes_intrinsics": True, "input": "image"}
+    K = torch.diag_embed(torch.tensor([[300.0, 300, 1], [600, 600, 1], [200, 100, 1]], dtype=torch.float64))
+    network = load_onnx(path, spec)
+    for twin in (network, copy.deepcopy(network)):
+        assert twin.takes_intrinsics
+        unit = torch.tensor([300.0, 1200, 100])[:, None, None]  # fx (fx + fy) / 2 / 300
+        torch.testing.assert_close(twin(image, K).depth, image[:, 0] * unit)
+    with pytest.raises(ValueError, match=r"n.onnx takes intrinsics: call network\(x, K\)"):
+        network(image)
+
+
+@pytest.mark.parametrize(
+    ("camera", "spec", "message"),
+    [
+        ([1, 3, 3], {"input": "image"}, "must be the graph's only input; .* needs takes_intrinsics"),
+        ([1, 3, 3], {"takes_intrinsics": True}, r"the spec's input names it, got None.*\['image', 'K'\]"),
+        (
+            [1, 1, 3, 3],
+            {"takes_intrinsics": True, "input": "image"},
+            r"'K' must be floating-point intrinsics \[B, 3, 3\]",
+        ),
+    ],
+)
+def test_refusals_of_a_second_input(tmp_path: Path, camera: list[int | str], spec: Any, message: str) -> None:
+    path = write_with_camera(tmp_path / "n.onnx", [1, 3, "h", "w"], camera, ("image", "K"))
+    with pytest.raises(ValueError, match=message):
+        load_onnx(path, {"outputs": {"kind": "metric"}, **spec})
+    alone = write(tmp_path / "alone.onnx")
+    with pytest.raises(ValueError, match="takes_intrinsics needs two inputs"):
+        load_onnx(alone, {"outputs": {"kind": "metric"}, "takes_intrinsics": True})
 
 
 @pytest.fixture

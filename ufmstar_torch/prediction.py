@@ -1,8 +1,10 @@
-"""What every depth network returns."""
+"""What every depth network returns, and how one is called."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,3 +46,29 @@ class DepthPrediction:
         if a is None or e is None:
             return e if a is None else a
         return a + e
+
+
+def takes_intrinsics(network: Callable[..., Any]) -> bool:
+    """Whether a network declares that it is called as ``network(x, K)``: an attribute ``takes_intrinsics = True``."""
+    return bool(getattr(network, "takes_intrinsics", False))
+
+
+def infer(network: Callable[..., Any], image: Tensor, intrinsics: Tensor | None, *, takes: bool | None = None) -> Any:
+    """One inference: ``network(image, K)`` of a network that takes intrinsics, ``network(image)`` of any other.
+
+    Args:
+        network: see :func:`takes_intrinsics`.
+        image: [B, 3, H, W] the network's input.
+        intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px], that is of the preprocessed image. The network gets them as
+            [B, 3, 3] on the image's device, in its type but at least in single precision.
+        takes: whether it takes intrinsics; None: as it declares.
+
+    Raises:
+        ValueError: the network takes intrinsics and there are none.
+    """
+    if not (takes_intrinsics(network) if takes is None else takes):
+        return network(image)
+    if intrinsics is None:
+        raise ValueError(f"{type(network).__name__} takes intrinsics: call network(x, K), K [B, 3, 3] of its input x")
+    dtype = torch.promote_types(image.dtype, torch.float32)
+    return network(image, intrinsics.to(image.device, dtype).expand(len(image), 3, 3))

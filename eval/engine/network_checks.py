@@ -10,7 +10,7 @@ from ufmstar_torch.eval.engine.networks import stochastic
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, BatchEnsembleMember
 from ufmstar_torch.models.dropout import DecoderDropout, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 _PROBE = (480, 640)  # (h, w) [px] of the grey image that the networks are tried on
 
@@ -77,8 +77,8 @@ def _tried(member: DepthNetwork, device: torch.device) -> DepthPrediction:
     height, width = _PROBE
     K = torch.tensor([[[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]]], dtype=torch.float64)
     with torch.no_grad():
-        x, _ = member.preprocess(torch.full((1, 3, height, width), 128, dtype=torch.uint8, device=device), K)
-        prediction: DepthPrediction = member.to(device).eval()(x)
+        x, K = member.preprocess(torch.full((1, 3, height, width), 128, dtype=torch.uint8, device=device), K)
+        prediction: DepthPrediction = infer(member.to(device).eval(), x, K)
     return prediction
 
 

@@ -88,7 +88,7 @@ class NetworkSource:
             if self._seeding == "sample":
                 self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
             with self._timer.stage("network"):
-                prediction = self._turns.member(x, n)
+                prediction = self._turns.member(x, K, n)
             return Prediction.of(prediction, K[0], self._timer.take()["network"])
 
     def _prepared(self, frame: Frame) -> tuple[Tensor, Tensor]:
