@@ -126,15 +126,26 @@ class ConvUnit(nn.Module):
 
 
 class SeparableUnit(nn.Module):
-    """A depthwise and a pointwise :class:`ConvUnit`."""
+    """A depthwise and a pointwise :class:`ConvUnit`, with dropout between them."""
 
-    def __init__(self, inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu6: bool, norm: bool) -> None:
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        kernel: int,
+        *,
+        stride: int = 1,
+        relu6: bool,
+        norm: bool,
+        dropout: float = 0.0,
+    ) -> None:
         super().__init__()
         self.depthwise = ConvUnit(inputs, inputs, kernel, stride=stride, groups=inputs, relu6=relu6, norm=norm)
+        self.dropout = DecoderDropout(dropout) if dropout else nn.Identity()
         self.pointwise = ConvUnit(inputs, outputs, 1, relu6=relu6, norm=norm)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.pointwise(self.depthwise(x))
+        return self.pointwise(self.dropout(self.depthwise(x)))
 
 
 class FastDepth(Backbone):
@@ -148,6 +159,7 @@ class FastDepth(Backbone):
         norm: batch norm after every convolution; False for weights that have it folded in, which can be
             trained on, but as plain convolutions with a bias.
         dropout: probability of decoder dropout, after the convolutions of every decoder layer.
+        dropout_both: dropout after both convolutions of a decoder layer instead of the second only.
         positive: what keeps depth positive, "relu" as published or "softplus". A ReLU can leave a pixel at 0
             without a gradient, so softplus suits a start from scratch; weights mean one or the other.
         size: (height, width) [px], multiples of 32, that ``preprocess`` makes.
@@ -162,6 +174,7 @@ class FastDepth(Backbone):
         *,
         norm: bool = True,
         dropout: float = 0.0,
+        dropout_both: bool = False,
         positive: str = "relu",
         size: tuple[int, int] = (224, 224),
     ) -> None:
@@ -172,7 +185,7 @@ class FastDepth(Backbone):
             raise ValueError(f"size must be multiples of {MULTIPLE} px, got {size}")
         self.widths = widths or FastDepthWidths.full()
         self.feature_channels = self.widths.decoder[-1]
-        self.dropout = dropout
+        self.dropout, self.dropout_both = dropout, dropout_both
         self.positive = positive
         self.size = size
         self.preprocess = Preprocess.nyu(size)
@@ -182,7 +195,8 @@ class FastDepth(Backbone):
         for inputs, outputs, stride in zip(e, e[1:], _STRIDES[1:], strict=False):
             self.encoder.append(SeparableUnit(inputs, outputs, 3, stride=stride, relu6=True, norm=norm))
         self.decoder = nn.ModuleList(
-            SeparableUnit(inputs, outputs, 5, relu6=False, norm=norm) for inputs, outputs in pairwise(d)
+            SeparableUnit(inputs, outputs, 5, relu6=False, norm=norm, dropout=dropout if dropout_both else 0.0)
+            for inputs, outputs in pairwise(d)
         )
         self.dropouts = nn.ModuleList(DecoderDropout(dropout) for _ in self.decoder)
         self.head = ConvUnit(d[-1], 1, 1, relu6=False, norm=norm)
@@ -190,20 +204,29 @@ class FastDepth(Backbone):
         self.head.activation = activation()
         nn.init.constant_(_bias(self.head), start)
 
+    @property
+    def pyramid_channels(self) -> tuple[int, ...]:
+        """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
+        return self.widths.decoder[::-1]
+
     def features(self, image: Tensor) -> Tensor:
-        """The decoder's output, from which the head reads depth.
+        """The decoder's output [B, widths.decoder[-1], H, W], from which the head reads depth; as :meth:`pyramid`."""
+        return self.pyramid(image)[0]
+
+    def pyramid(self, image: Tensor) -> list[Tensor]:
+        """The outputs of the decoder's layers, full resolution first.
 
         Args:
             image: [B, 3, H, W] RGB in [0, 1], H and W multiples of 32.
 
         Returns:
-            [B, widths.decoder[-1], H, W].
+            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
 
         Raises:
             ValueError: the image has another shape or type.
         """
         require_image(image, MULTIPLE)
-        x, skips = image, {}
+        x, skips, maps = image, {}, []
         for i, block in enumerate(self.encoder):
             x = block(x)
             if i in _SKIPS.values():
@@ -212,7 +235,8 @@ class FastDepth(Backbone):
             x = F.interpolate(dropout(block(x)), scale_factor=2.0, mode="nearest")
             if i in _SKIPS:
                 x = x + skips[_SKIPS[i]]
-        return x
+            maps.append(x)
+        return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
         """Depth [B, H, W] [m] from :meth:`features`, at least 0 (where a last ReLU cuts off, a pixel has none)."""
@@ -258,7 +282,14 @@ class FastDepth(Backbone):
     def folded(self) -> FastDepth:
         """A copy for inference with every batch norm folded into its convolution, in eval mode: the same
         function up to rounding in about three quarters of the time on a CPU."""
-        network = FastDepth(self.widths, norm=False, dropout=self.dropout, positive=self.positive, size=self.size)
+        network = FastDepth(
+            self.widths,
+            norm=False,
+            dropout=self.dropout,
+            dropout_both=self.dropout_both,
+            positive=self.positive,
+            size=self.size,
+        )
         network.preprocess = self.preprocess
         for (_, source), (_, target) in zip(self._units(), network._units(), strict=True):
             conv, norm = source.conv, source.norm

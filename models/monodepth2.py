@@ -77,16 +77,18 @@ class ResNetEncoder(nn.Module):
 
 
 class UpConvolution(nn.Module):
-    """One level of the decoder: convolve, double, concatenate with the skip, convolve."""
+    """One level of the decoder: convolve (and drop with probability ``between``), double, concatenate with the skip,
+    convolve, drop with probability ``dropout``."""
 
-    def __init__(self, inputs: int, skip: int, outputs: int, dropout: float) -> None:
+    def __init__(self, inputs: int, skip: int, outputs: int, dropout: float, between: float) -> None:
         super().__init__()
         self.before = _convolution(inputs, outputs)
         self.after = _convolution(outputs + skip, outputs)
+        self.between = DecoderDropout(between) if between else nn.Identity()
         self.dropout = DecoderDropout(dropout)
 
     def forward(self, x: Tensor, skip: Tensor | None) -> Tensor:
-        x = F.interpolate(F.elu(self.before(x)), scale_factor=2.0, mode="nearest")
+        x = F.interpolate(self.between(F.elu(self.before(x))), scale_factor=2.0, mode="nearest")
         x = x if skip is None else torch.cat([x, skip], 1)
         return self.dropout(F.elu(self.after(x)))
 
@@ -102,6 +104,7 @@ class MonodepthResNet(Backbone):
         layers: of the encoder, 18, 34 or 50.
         strides: of the encoder, "v1.5" or "v1": see :class:`ResNetEncoder`.
         dropout: probability of decoder dropout, after each of the five levels.
+        dropout_both: dropout after both convolutions of a level instead of the second only.
         decoder: channels of the five levels, full resolution first.
         size: (height, width) [px], multiples of 32 and at least 64, that ``preprocess`` makes.
 
@@ -116,6 +119,7 @@ class MonodepthResNet(Backbone):
         *,
         strides: str = "v1.5",
         dropout: float = 0.0,
+        dropout_both: bool = False,
         decoder: tuple[int, ...] = DECODER_WIDTHS,
         size: tuple[int, int] = (224, 224),
     ) -> None:
@@ -126,36 +130,47 @@ class MonodepthResNet(Backbone):
             raise ValueError(f"size must be multiples of {MULTIPLE} px, at least {SMALLEST}, got {size}")
         self.layers, self.strides = layers, strides
         self.preprocess = Preprocess.nyu(size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
-        self.feature_channels = decoder[0]
+        self.feature_channels, self._widths = decoder[0], tuple(decoder)
         self.encoder = ResNetEncoder(layers, strides)
         skips = (0, *self.encoder.channels[:-1])  # of levels 0 to 4
         inputs = (*decoder[1:], self.encoder.channels[-1])
         # levels[i] makes features at 1/2^i of the resolution; level 4 runs first.
         self.levels = nn.ModuleList(
-            UpConvolution(inputs[i], skips[i], decoder[i], dropout=dropout) for i in range(LEVELS)
+            UpConvolution(inputs[i], skips[i], decoder[i], dropout, dropout if dropout_both else 0.0)
+            for i in range(LEVELS)
         )
         self.head = _convolution(decoder[0], 1)
         assert self.head.bias is not None
         nn.init.constant_(self.head.bias, math.log(math.expm1(INITIAL_DEPTH)))
 
+    @property
+    def pyramid_channels(self) -> tuple[int, ...]:
+        """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
+        return self._widths
+
     def features(self, image: Tensor) -> Tensor:
-        """The decoder's output, from which the head reads depth.
+        """The decoder's output [B, decoder[0], H, W], from which the head reads depth; as :meth:`pyramid`."""
+        return self.pyramid(image)[0]
+
+    def pyramid(self, image: Tensor) -> list[Tensor]:
+        """The outputs of the decoder's levels, full resolution first.
 
         Args:
             image: [B, 3, H, W] normalised as ``preprocess`` does; H and W multiples of 32, at least 64.
 
         Returns:
-            [B, decoder[0], H, W].
+            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
 
         Raises:
             ValueError: the image has another shape or type.
         """
         require_image(image, MULTIPLE, SMALLEST)
         skips = self.encoder(image)
-        x = skips.pop()
+        x, maps = skips.pop(), []
         for level in reversed(self.levels):
             x = level(x, skips.pop() if skips else None)
-        return x
+            maps.append(x)
+        return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
         """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, hence positive."""

@@ -13,6 +13,7 @@ mean over a depth edge is a place where nothing is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -71,6 +72,11 @@ class Preprocess(Checked):
     cubic: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.resize_height, Sequence):
+            raise ValueError(
+                f"Preprocess.resize_height is one number, got {self.resize_height!r}; for an input of that height and "
+                f"width: Preprocess(size={self.resize_height!r})"
+            )
         super().__post_init__()
         for name in ("crop", "size"):
             value = getattr(self, name)

@@ -35,6 +35,8 @@ class NetworkSpec(Checked):
         layers: of monodepth2's ResNet.
         strides: of monodepth2's ResNet: "v1" (in a bottleneck's first convolution) or "v1.5" (in its second).
         dropout: [1] share of the decoder's features that are dropped in training (and where "mc_dropout" samples).
+        dropout_both: dropout after both convolutions of a decoder's level instead of the second only.
+        head_scales: of the head of a variance: 1, or 4 in training as in Poggi et al. (2020).
         members: of "batch_ensemble"; 1 for every other method.
         size: (height, width) [px] of the input, multiples of 32.
         preprocess: how a camera image comes to that size: "nyu" (the centre crop of NYU's validation)
@@ -52,6 +54,8 @@ class NetworkSpec(Checked):
     layers: int = choice(50, 34, 18)
     strides: str = choice("v1.5", "v1")
     dropout: float = number(0.0, "p", "1", 0.0, 1.0, open_high=True)
+    dropout_both: bool = False
+    head_scales: int = choice(1, 4)
     members: int = number(1, "N", "networks", 1)
     size: tuple[int, int] = (224, 224)
     preprocess: str = choice("nyu", "resize")
@@ -93,16 +97,18 @@ class NetworkSpec(Checked):
 def build_backbone(spec: NetworkSpec) -> Backbone:
     """The encoder and decoder of ``spec``, with random weights from torch's generator."""
     backbone: Backbone
+    dropout: dict[str, Any] = {"dropout": spec.dropout, "dropout_both": spec.dropout_both}
     if spec.architecture == "fastdepth":
         from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
 
         named = {"full": FastDepthWidths.full, "pruned": FastDepthWidths.pruned}
         widths = named[spec.widths]() if isinstance(spec.widths, str) else FastDepthWidths.scaled(spec.widths)
-        backbone = FastDepth(widths, norm=spec.norm, dropout=spec.dropout, positive=spec.positive, size=spec.size)
+        options: dict[str, Any] = {"norm": spec.norm, "positive": spec.positive}
+        backbone = FastDepth(widths, **dropout, **options, size=spec.size)
     else:
         from ufmstar_torch.models.monodepth2 import MonodepthResNet
 
-        backbone = MonodepthResNet(spec.layers, strides=spec.strides, dropout=spec.dropout, size=spec.size)
+        backbone = MonodepthResNet(spec.layers, strides=spec.strides, **dropout, size=spec.size)
     backbone.preprocess = spec.input()
     return backbone
 
@@ -120,7 +126,7 @@ def build_network(
         init, std: how the factors of a "batch_ensemble" begin; see ``convert``.
     """
     backbone = build_backbone(spec) if backbone is None else backbone
-    network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric")
+    network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric", spec.head_scales)
     several = spec.method == "batch_ensemble"
     return BatchEnsemble(network, spec.members, init=init, std=std) if several else network
 

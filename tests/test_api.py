@@ -43,7 +43,9 @@ def test_signatures():
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
     assert names(UncertainDepth.__init__) == ["networks", "config", "mode", "samples", "preprocess"]
-    assert names(UncertainDepth.forward) == ["image", "pose", "intrinsics", "valid", "anchors"]
+    images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
+    assert names(UncertainDepth.forward) == images
+    assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]
     assert names(spgf)[:3] == ["depth", "intrinsics", "config"]
     assert "before_pruning" in names(spgf)
 

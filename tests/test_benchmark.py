@@ -15,11 +15,11 @@ from layouts import write_tum
 
 from ufmstar_torch import UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.bench import benchmark
-from ufmstar_torch.eval.bench.benchmark_frames import PosedDepth, RecordedSequence, RenderedRoom
-from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
-from ufmstar_torch.eval.bench.benchmark_report import format_report
-from ufmstar_torch.eval.bench.benchmark_step import build_up, components_in_view, memory
-from ufmstar_torch.eval.bench.benchmark_timing import STAGES, StageClock, pinned_threads
+from ufmstar_torch.eval.bench.frames import PosedDepth, RecordedSequence, RenderedRoom
+from ufmstar_torch.eval.bench.memory import state_memory
+from ufmstar_torch.eval.bench.step import build_up, components_in_view, measure_long_run
+from ufmstar_torch.eval.bench.text import format_report
+from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
 from ufmstar_torch.eval.commands import bench_command
 from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
 from ufmstar_torch.eval.results.machine import available_cores, cpu_model, versions
@@ -81,26 +81,65 @@ def test_stopwatch_tells_waiting_from_computing():
     assert watch.spread("sleep")["count"] == 1
 
 
-def test_every_moment_belongs_to_the_stage_that_needs_it():
-    clock = StageClock()
-    began = time.perf_counter()
-    clock.start()
-    for name in STAGES:
-        pauses = {"segment": ("spgf", 0.02), "append": (None, 0.04), "regress": ("regress_image", 0.03)}
-        kernel, seconds = pauses.get(name, (None, 0))
-        with clock.kernel(kernel):
-            time.sleep(seconds)
-        clock.stage(name)
-    total = 1e3 * (time.perf_counter() - began)
-    summary = clock.summary()
-    medians = {name: summary["stages"][name]["median_ms"] for name in STAGES}
-    assert medians["segment"] >= 20
-    assert medians["append"] >= 40
-    assert medians["regress"] >= 30
-    assert min(medians.values()) >= 0
-    assert summary["kernels"]["spgf"]["median_ms"] >= 20
+class Clock:
+    """Replaces ``time.perf_counter`` and ``time.process_time``: only work moves it."""
+
+    def __init__(self, monkeypatch):
+        self.now = 0.0
+        monkeypatch.setattr(time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(time, "process_time", lambda: self.now)
+
+    def work(self, seconds, result=None):
+        self.now += seconds
+        return result
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    return Clock(monkeypatch)
+
+
+def test_calls_alternate_and_each_follows_a_network(clock):
+    log = []
+
+    def call(name, seconds):
+        return lambda frame: clock.work(seconds, log.append((name, frame)) or (name, frame))
+
+    timed = TimedCalls(before={"small": call("small", 0.5), "large": call("large", 2.0)})
+    calls = {"a": call("a", 1.0), "b": call("b", 3.0), "c": call("c", 5.0)}
+    for frame in timed.frames(range(3), warm_up=1):
+        assert timed.call(calls, frame) == {name: (name, frame) for name in calls}
+    networks, orders = ("small", "large", "small"), ("abc", "cba", "abc")
+    pairs = [(n, pair) for n, order in enumerate(orders) for pair in zip(networks, order, strict=True)]
+    assert log == [(name, n) for n, pair in pairs for name in pair]
+    milliseconds = {"small": 500.0, "large": 2000.0, "a": 1000.0, "b": 3000.0, "c": 5000.0}
+    assert timed.times.wall == {name: [ms, ms] for name, ms in milliseconds.items()}, "once a frame, less the warm-up"
+
+
+def test_every_moment_belongs_to_the_stage_that_needs_it(clock):
+    class Module:
+        observer = None
+
+        def __call__(self, seconds):
+            for number, name in enumerate(STAGES):
+                clock.work(seconds)
+                with self.observer.kernel({"segment": "spgf", "average": "smooth"}.get(name, "fuse")):
+                    clock.work(0.1 * number)
+                self.observer.stage(name)
+            clock.work(1000)  # the output's assembly
+            return seconds
+
+    staged = StagedStep(Module())
+    assert [staged(seconds) for seconds in (100, 1, 2, 3)] == [100, 1, 2, 3]
+    summary = staged.summary(warm_up=1)
+    medians = {name: times["median_ms"] for name, times in summary["stages"].items()}
+    assert medians == pytest.approx({name: 2000 + 100 * number for number, name in enumerate(STAGES)})
+    kernels = {name: times["median_ms"] for name, times in summary["kernels"].items()}
+    others = sum(100 * n for n, name in enumerate(STAGES) if name not in ("segment", "average"))
+    expected = {"spgf": 100, "floor_covariance": 0, "correspond": 0, "fuse": others, "regress_image": 0}
+    assert kernels == pytest.approx(expected)
     assert summary["stages_total"]["median_ms"] == pytest.approx(sum(medians.values()))
-    assert sum(medians.values()) == pytest.approx(total, abs=1)
+    assert summary["stages_total"]["count"] == 3
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -261,7 +300,7 @@ def test_memory_counts_components_slots_and_the_map():
     frame = next(iter(RenderedRoom().frames(64, 1)))
     used = int(ufm(frame.depth, frame.T_world_cam, frame.intrinsics).statistics.components)
     # mean 3, covariance 9, weight and disagreement 1 each in float32, and an int64 count
-    assert memory(ufm) == {
+    assert state_memory(ufm) == {
         "bytes_per_component": 64,
         "components": used,
         "in_use": 64 * used,

@@ -14,10 +14,10 @@ import torch
 from ufmstar_torch import UfMStarConfig, cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench import benchmark
-from ufmstar_torch.eval.bench.benchmark_anchors import PARTS, TrackedTour, measure_anchors, measure_tracker, one_thread
-from ufmstar_torch.eval.bench.benchmark_frames import RenderedRoom
-from ufmstar_torch.eval.bench.benchmark_report import format_report
-from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
+from ufmstar_torch.eval.bench.anchors import PARTS, TrackedTour, measure_anchors, measure_tracker
+from ufmstar_torch.eval.bench.frames import RenderedRoom
+from ufmstar_torch.eval.bench.text import format_report
+from ufmstar_torch.eval.bench.timing import pinned_threads
 from ufmstar_torch.eval.commands import bench_command
 
 TIMES = {f"{clock}{name}_ms" for clock in ("", "cpu_") for name in ("median", "p90", "mean", "min")}
@@ -49,7 +49,7 @@ def report(one_core):
     before, seen = threads(), rendered()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackedTour, "frames", lambda _, count: seen[:count])
-        patch.setattr("ufmstar_torch.eval.bench.benchmark_step.reference_networks", lambda size, fastdepth: ({}, {}))
+        patch.setattr("ufmstar_torch.eval.bench.step.reference_networks", lambda size, fastdepth: ({}, {}))
         found = benchmark.run_benchmark(options)
     assert threads() == before
     return found
@@ -99,7 +99,7 @@ def test_the_standard_scene_keeps_300_corners():
 def test_parts_are_parts_of_the_whole(monkeypatch):
     """With a clock that moves by one at every look, parts and the whole are numbers of looks."""
     ticks = iter(range(10**6))
-    monkeypatch.setattr("ufmstar_torch.eval.bench.benchmark_anchors.perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
     found = measure_tracker(rendered()[:14], 60)
     # Following, searching and triangulating take a tick each; the whole update, from its own first look at the clock to
     # its last, seven.
@@ -112,7 +112,7 @@ def test_opencv_gets_one_thread_and_its_own_back(fails):
     before = threads()
     cv2.setNumThreads(2)
     try:
-        with one_thread():
+        with pinned_threads(1, opencv=True):
             assert threads() == (1, 1, 1)
             if fails:
                 raise KeyError("anything")
@@ -143,7 +143,7 @@ def test_impossible_numbers(capsys):
         measure_anchors(
             RenderedRoom(), UfMStarConfig(), points=0, frames=1, history=1, in_view=1, step_size=48, tour=SMALL
         )
-    with pytest.raises(ValueError, match="the way has 400"):
+    with pytest.raises(ValueError, match="the path has 400"):
         SMALL.frames(401)
 
 

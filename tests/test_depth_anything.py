@@ -27,7 +27,6 @@ from ufmstar_torch.models import (
     from_hugging_face,
     load_network,
 )
-from ufmstar_torch.ufmstar import UfMStarConfig
 
 transformers = pytest.importorskip("transformers")
 
@@ -522,7 +521,7 @@ def test_a_directory_is_identified_by_its_visible_files(broken, metric):
     assert sha256(broken) == sha256(metric)
     (broken / "config.json").rename(broken / "config2.json")
     assert sha256(broken) != sha256(metric)
-    identity = network_source("depth_anything", [metric], UfMStarConfig()).identity
+    identity = network_source("depth_anything", [metric]).identity
     assert identity["weights"] == [{"name": "metric", "sha256": sha256(metric)}]
 
 

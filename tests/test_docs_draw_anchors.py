@@ -89,4 +89,4 @@ def test_the_command_draws_a_tour(script: Any, monkeypatch: pytest.MonkeyPatch, 
 
 def test_the_picture_is_there_and_small() -> None:
     assert 20_000 < (DOCS / "images" / "anchors.jpg").stat().st_size < 300_000
-    assert "images/anchors.jpg" in (DOCS / "anchors.md").read_text()
+    assert "images/anchors.jpg" in (DOCS / "results" / "anchors.md").read_text()

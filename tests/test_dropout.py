@@ -16,6 +16,7 @@ from ufmstar_torch import UfMStarConfig, UncertainDepth
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout, set_sampling
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import AleatoricNetwork, DepthOnlyNetwork, EvidentialNetwork
+from ufmstar_torch.models.monodepth2 import MonodepthResNet
 from ufmstar_torch.models.network import Backbone
 
 P = 0.2
@@ -250,3 +251,28 @@ def test_training_and_arguments() -> None:
     again = copy.deepcopy(MonteCarloDropout(network, generator=seeded(13)).eval())
     with torch.no_grad():
         assert again(image).depth.shape == (2, 64, 64)
+
+
+@pytest.mark.parametrize("kind", ["fastdepth", "monodepth2"])
+def test_dropout_after_both_convolutions_of_a_level(kind: str) -> None:
+    """Twice the layers, more variance between samples, the same weights, and the same depth without sampling."""
+
+    def built(both: bool) -> Backbone:
+        if kind == "fastdepth":
+            return FastDepth(small_network().widths, dropout=P, dropout_both=both, positive="softplus").eval()
+        return MonodepthResNet(18, dropout=P, dropout_both=both, decoder=(4, 4, 4, 4, 4), size=(64, 64)).eval()
+
+    torch.manual_seed(0)
+    once, both = built(False), built(True)
+    both.load_state_dict(once.state_dict(), strict=True)
+    x = torch.rand(1, 3, 64, 64, generator=seeded())
+    with torch.inference_mode():
+        assert torch.equal(once(x).depth, both(x).depth)
+        assert (set_sampling(once, True, seeded()), set_sampling(both, True, seeded())) == (5, 10)
+        assert not torch.equal(once(x).depth, both(x).depth)
+        first = [module for module in both.modules() if isinstance(module, DecoderDropout)]
+        seen: list[int] = []
+        for n, module in enumerate(first):
+            module.register_forward_hook(lambda *_, n=n: seen.append(n))
+        both(x)
+    assert sorted(seen) == list(range(10)), "each of them acts once per pass"

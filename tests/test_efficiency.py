@@ -12,11 +12,10 @@ from efficiency_cases import SIZE, network, room_sequence, rows_of
 from tiny_networks import Linear
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.bench.contender import Contender
+from ufmstar_torch.eval.bench.energy import CPU, GPU, NOT_MEASURABLE, PowerMeter, Rail, Source
 from ufmstar_torch.eval.bench.measure import Plan, measure
-from ufmstar_torch.eval.bench.multiview import state_bytes
-from ufmstar_torch.eval.bench.power import CPU, GPU, NOT_MEASURABLE, PowerMeter, Rail, Source
-from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, ONCE, PROCESSOR, run_race
+from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
+from ufmstar_torch.eval.bench.race import MULTIVIEW, PROCESSOR, run_race
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
@@ -37,7 +36,7 @@ def sequence():
 
 
 def four(base="ensemble"):
-    return Contender(base, [network(offset=0.2 + 0.1 * n) for n in range(4)], "Linear")
+    return TimedNetwork(base, [network(offset=0.2 + 0.1 * n) for n in range(4)], "Linear")
 
 
 RACE_ROWS = ("UfM-Ensemble", "UfM*-Ensemble", "UfM*-FullEnsemble", "UfM*-Aleatoric", "UfM-Aleatoric-100K")
@@ -45,7 +44,7 @@ RACE_ROWS = ("UfM-Ensemble", "UfM*-Ensemble", "UfM*-FullEnsemble", "UfM*-Aleator
 
 def race_of(names, sequence, **options):
     options = {"warm_up": 2, "device": torch.device("cpu"), "multiview_device": torch.device("cpu"), **options}
-    networks = {"ensemble": four(), "aleatoric": Contender("aleatoric", [network()], "Linear")}
+    networks = {"ensemble": four(), "aleatoric": TimedNetwork("aleatoric", [network()], "Linear")}
     return run_race(rows_of(*names), networks, list(sequence), **options)
 
 
@@ -57,10 +56,10 @@ def race(sequence):
 @pytest.mark.parametrize("name", RACE_ROWS)
 def test_no_row_has_the_state_of_another(race, sequence, name):
     alone = race_of([name], sequence)
-    mine, theirs = alone.multiview[name], race.multiview[name]
-    assert mine.bytes == theirs.bytes
+    mine, theirs = alone.steps[name], race.steps[name]
+    assert mine.kept == theirs.kept
     states = [one.module.state_dict() for one in (mine, theirs)]
-    assert mine.count[-1] > 0
+    assert mine.kept[-1]["count"] > 0
     for key, value in states[0].items():
         assert torch.equal(value, states[1][key]), key
 
@@ -73,17 +72,18 @@ def test_a_row_is_what_the_module_makes_of_the_networks_turns(race, sequence):
             x, K = members[0].preprocess(image, torch.from_numpy(frame.intrinsics)[None])
             p = members[n % 4](x)
             ufm(p.depth, torch.from_numpy(frame.T_world_cam)[None], K, p.aleatoric_variance)
-    assert torch.equal(race.multiview["UfM*-Ensemble"].module.mean, ufm.mean)
-    assert state_bytes(ufm)[0] == race.multiview["UfM*-Ensemble"].bytes[-1]
+    assert torch.equal(race.steps["UfM*-Ensemble"].module.mean, ufm.mean)
+    used = int(ufm.mixture.components) * ufm.mixture.bytes_per_component()
+    assert race.steps["UfM*-Ensemble"].kept[-1]["bytes"] == used
 
 
 def test_the_stages_are_those_of_the_same_step_and_add_up(race):
-    staged, whole = race.staged["UfM*-Ensemble"], race.multiview["UfM*-Ensemble"].module
+    staged, whole = race.staged["UfM*-Ensemble"], race.steps["UfM*-Ensemble"].module
     assert torch.equal(staged.module.mixture.mean, whole.mean)
-    stages = staged.clock.stages
+    stages = {name: times[race.warm_up :] for name, times in staged.stages.items()}
     assert {len(times) for times in stages.values()} == {6}
     sums = np.sum(list(stages.values()), axis=0)
-    assert staged.clock.summary()["stages_total"]["median_ms"] == pytest.approx(np.median(sums))
+    assert staged.summary(warm_up=race.warm_up)["stages_total"]["median_ms"] == pytest.approx(np.median(sums))
     assert all(min(times) >= 0 for times in stages.values())
     assert set(race.staged) == {"UfM*-Ensemble", "UfM*-FullEnsemble", "UfM*-Aleatoric"}
 
@@ -91,7 +91,7 @@ def test_the_stages_are_those_of_the_same_step_and_add_up(race):
 def test_warm_up_is_run_but_not_counted(race):
     for owner, part in (("ensemble", DEPTH), ("ensemble", ONCE), ("ensemble", EVERY), ("UfM-Ensemble", MULTIVIEW)):
         assert len(race.ms(owner, part)) == 6
-    assert len(race.multiview["UfM-Ensemble"].bytes) == 8
+    assert len(race.steps["UfM-Ensemble"].kept) == 8
     assert race.ms("aleatoric", EVERY) == []  # nobody asked for it
 
 
@@ -110,7 +110,7 @@ class Slow(Linear):
 def test_further_members_cost_what_they_take_and_parts_take_turns(sequence):
     LOG.clear()
     members = [network(offset=0.2 + n, backbone=Slow) for n in range(3)]
-    one = {"ensemble": Contender("ensemble", members, "Slow")}
+    one = {"ensemble": TimedNetwork("ensemble", members, "Slow")}
     rows, cpu = rows_of("Ensemble", "UfM-Ensemble"), torch.device("cpu")
     race = run_race(rows, one, list(sequence)[:4], warm_up=0, device=cpu, multiview_device=cpu)
     assert min(race.ms("ensemble", DEPTH)) >= 4
@@ -156,7 +156,7 @@ def counting_meter(idle_watts):
 
 def test_energy_is_that_of_the_inferences(sequence):
     members = [network(offset=0.2 + 0.1 * n, backbone=Counted) for n in range(4)]
-    networks = {"ensemble": Contender("ensemble", members, "Linear")}
+    networks = {"ensemble": TimedNetwork("ensemble", members, "Linear")}
     meter = counting_meter(3.0)
     told = measure(rows_of("Ensemble", "UfM*-Ensemble"), networks, sequence, plan=QUICK, meter=meter)
     assert told["power"]["idle_watts"] == {"cpu package 0": pytest.approx(3.0)}
@@ -188,7 +188,7 @@ def numbers_of_energy(value, inside=False):
 
 @pytest.fixture(scope="module")
 def unpowered(sequence):
-    networks = {"ensemble": four(), "aleatoric": Contender("aleatoric", [network()], "Linear")}
+    networks = {"ensemble": four(), "aleatoric": TimedNetwork("aleatoric", [network()], "Linear")}
     names = ("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "Aleatoric", "UfM*-Aleatoric")
     return measure(rows_of(*names), networks, sequence, plan=QUICK, meter=NO_SENSOR)
 
@@ -231,7 +231,7 @@ def test_a_row_tells_its_latency_and_memory(unpowered):
 
 
 def test_what_cannot_be_measured_is_left_out_and_named(sequence):
-    one = {"ensemble": Contender("ensemble", [network()], "Linear")}
+    one = {"ensemble": TimedNetwork("ensemble", [network()], "Linear")}
     rows = [*rows_of("Ensemble", "UfM*-Ensemble", "Evidential"), Row(Method.parse("UfM*-Ensemble"), Setting(skip=2))]
     told = measure(rows, one, sequence, plan=QUICK, meter=NO_SENSOR)
     assert [row["row"] for row in told["rows"]] == ["UfM*-Ensemble"]
@@ -248,7 +248,7 @@ def test_a_network_that_predicts_all_in_one_is_not_separable(sequence):
         return {"depth": 0.2 + 5 * x[:, 0], "variance": 0.01 + x[:, 1]}
 
     whole = wrap_network(both, "depth", aleatoric="variance", preprocess=Preprocess(size=SIZE))
-    networks = {base: Contender(base, [whole], "Mine") for base in ("aleatoric", "depth_only")}
+    networks = {base: TimedNetwork(base, [whole], "Mine") for base in ("aleatoric", "depth_only")}
     names = ("UfM*-Aleatoric", "DepthOnly", "UfM*-DepthOnly")
     told = measure(rows_of(*names), networks, sequence, plan=QUICK, meter=NO_SENSOR)
     aleatoric, alone, depth_only = told["rows"]

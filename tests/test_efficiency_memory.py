@@ -8,11 +8,11 @@ import pytest
 import torch
 from efficiency_cases import network
 
-from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.bench.contender import Contender, contenders, depth_alone
-from ufmstar_torch.eval.bench.memory import NetworkMemory, overhead_percent, tensor_bytes
-from ufmstar_torch.eval.bench.multiview import state_bytes
-from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
+from ufmstar_torch.eval.bench.memory import NetworkMemory, overhead_percent, weight_bytes
+from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, depth_alone, timed_networks
+from ufmstar_torch.eval.bench.race import MultiviewStep, NetworkInput
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.efficiency import megabytes
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
 from ufmstar_torch.models.dropout import MonteCarloDropout
@@ -20,20 +20,27 @@ from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import with_head
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.prediction import DepthPrediction
+
+
+def step_memory(name, size, K):
+    """What the table counts for the multiview step of a row after one frame."""
+    step = MultiviewStep(Row(Method.parse(name)), torch.device("cpu"))
+    depth, variance = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01)
+    given = NetworkInput(torch.zeros(1, 3, 1, 1), torch.eye(4, dtype=torch.float64)[None], torch.tensor([K]).double())
+    step(DepthPrediction(depth, aleatoric_variance=variance), given)
+    step.note()
+    return step.memory()
 
 
 def test_100k_points_of_ufm_are_4_megabytes_and_the_smoothing_map_a_fifth():
-    ufm, ufm_star = UfM(UfMConfig(max_points=100_000)), UfMStar()
-    pose, depth = torch.eye(4, dtype=torch.float64), torch.full((1, 320, 320), 2.0)
-    ufm(depth, pose, torch.tensor([[300.0, 0, 160], [0, 300, 160], [0, 0, 1]], dtype=torch.float64))
-    assert state_bytes(ufm) == (4_000_000, 100_000)
-    assert megabytes(state_bytes(ufm)[0]) == "4.0"
-    K = torch.tensor([[200.0, 0, 112], [0, 200, 112], [0, 0, 1]], dtype=torch.float64)
-    ufm_star(torch.full((1, 224, 224), 2.0), pose, K)
-    assert ufm_star.smoothed.nbytes == 224 * 224 * 4
-    assert f"{ufm_star.smoothed.nbytes / 1e6:.1f}" == "0.2"
-    held, components = state_bytes(ufm_star)
-    assert held == 64 * components > 0
+    ufm = step_memory("UfM-Ensemble-100K", (320, 320), [[300.0, 0, 160], [0, 300, 160], [0, 0, 1]])
+    assert (ufm["bytes_end"], ufm["count_end"], ufm["smoothing_bytes"]) == (4_000_000, 100_000, 0)
+    assert megabytes(ufm["bytes_end"]) == "4.0"
+    star = step_memory("UfM*-Ensemble", (224, 224), [[200.0, 0, 112], [0, 200, 112], [0, 0, 1]])
+    assert star["smoothing_bytes"] == 224 * 224 * 4
+    assert f"{star['smoothing_bytes'] / 1e6:.1f}" == "0.2"
+    assert star["bytes_end"] == 64 * star["count_end"] > 0
 
 
 @pytest.mark.parametrize(("u", "d"), [(-1, 2), (1, -2), (0, 0)])
@@ -46,7 +53,7 @@ def test_fastdepth_has_the_papers_weights():
     full = FastDepth()
     assert f"{sum(p.nbytes for p in full.parameters()) / 1e6:.1f}" == "15.8"
     # Beside its weights it holds the statistics of its batch norms.
-    assert tensor_bytes(full) == sum(p.nbytes for p in full.parameters()) + sum(b.nbytes for b in full.buffers())
+    assert weight_bytes(full) == sum(p.nbytes for p in full.parameters()) + sum(b.nbytes for b in full.buffers())
     assert f"{9 * 15.844:.1f}" == "142.6"
 
 
@@ -63,8 +70,8 @@ def test_resnet50_monodepth2_is_the_papers_but_for_the_classifier():
 
 def test_ten_members_are_90_percent():
     members = [network(offset=0.1 * n) for n in range(10)]
-    memory = Contender("ensemble", members, "Linear").memory()
-    head = tensor_bytes(members[0].head)
+    memory = TimedNetwork("ensemble", members, "Linear").memory()
+    head = weight_bytes(members[0].head)
     assert memory == NetworkMemory(8, 9 * 8 + 10 * head)  # the backbone has two weights
     equal = NetworkMemory.of([FastDepth(norm=False) for _ in range(3)], FastDepth(norm=False))
     assert overhead_percent(equal.uncertainty, equal.depth) == pytest.approx(200 / 3)
@@ -72,7 +79,7 @@ def test_ten_members_are_90_percent():
 
 def test_shared_tensors_count_once():
     one = network()
-    assert tensor_bytes([one, one, one.backbone]) == tensor_bytes(one)
+    assert weight_bytes(one, one, one.backbone) == weight_bytes(one)
     with pytest.raises(ValueError, match="less than"):
         NetworkMemory.of([one.head], one)
 
@@ -85,26 +92,26 @@ def fast_depth(method, dropout=0.0):
 
 def test_a_batch_ensemble_adds_its_factors_and_the_head():
     ensemble = BatchEnsemble(fast_depth("aleatoric"), 4).eval()
-    one = Contender("batch_ensemble", ensemble.all_members(), "FastDepth")
+    one = TimedNetwork("batch_ensemble", ensemble.all_members(), "FastDepth")
     factors = sum(factor.nbytes for factor in ensemble.factors())
     biases = sum(layer.bias.nbytes for layer in converted_layers(ensemble.network) if layer.bias is not None)
     plain = fast_depth("aleatoric")
     head = plain.head.weight.nbytes  # its bias is among the members' biases
     memory = one.memory()
-    assert memory.depth == tensor_bytes(plain.backbone)
+    assert memory.depth == weight_bytes(plain.backbone)
     assert memory.uncertainty == factors + biases + head
-    x = torch.rand(1, 3, 64, 64)
-    torch.testing.assert_close(one.alone(x).depth, one.once(x, 0).depth, rtol=1e-4, atol=1e-4)
+    x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
+    torch.testing.assert_close(one.predict(DEPTH, x, K).depth, one.predict(ONCE, x, K).depth, rtol=1e-4, atol=1e-4)
 
 
 def test_mc_dropout_adds_a_head_and_depth_alone_does_not_sample():
     sampling = MonteCarloDropout(fast_depth("aleatoric", dropout=0.2))
-    one = Contender("mc_dropout", [sampling], "FastDepth", samples=3)
-    x = torch.rand(1, 3, 64, 64)
-    assert one.memory().uncertainty == tensor_bytes(sampling.network.head)
-    assert torch.equal(one.alone(x).depth, one.alone(x).depth)
-    assert not torch.equal(one.once(x, 0).depth, one.once(x, 0).depth)
-    assert one.every(x).epistemic_variance.max() > 0
+    one = TimedNetwork("mc_dropout", [sampling], "FastDepth", samples=3)
+    x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
+    assert one.memory().uncertainty == weight_bytes(sampling.network.head)
+    assert torch.equal(one.predict(DEPTH, x, K).depth, one.predict(DEPTH, x, K).depth)
+    assert not torch.equal(one.predict(ONCE, x, K).depth, one.predict(ONCE, x, K).depth)
+    assert one.predict(EVERY, x, K).epistemic_variance.max() > 0
     assert one.passes == 3
 
 
@@ -117,31 +124,31 @@ def test_depth_alone_is_the_same_depth_from_a_copy():
     assert prediction.aleatoric_variance is None
     assert not {p.data_ptr() for p in alone.parameters()} & {p.data_ptr() for p in whole.parameters()}
     lazy = LazyMember(lambda: whole, whole.preprocess)
-    assert Contender("evidential", [lazy], "FastDepth").memory().uncertainty == tensor_bytes(whole.head)
+    assert TimedNetwork("evidential", [lazy], "FastDepth").memory().uncertainty == weight_bytes(whole.head)
 
 
 def test_a_depth_only_row_is_not_charged_for_a_head_that_it_ignores():
-    assert Contender("depth_only", [network()], "Linear").memory().uncertainty == 0
+    assert TimedNetwork("depth_only", [network()], "Linear").memory().uncertainty == 0
 
 
-def test_contenders_are_checked():
+def test_networks_are_checked():
     with pytest.raises(ValueError, match="base must be one of"):
-        Contender("median", [network()], "x")
+        TimedNetwork("median", [network()], "x")
     with pytest.raises(ValueError, match="at least one network"):
-        Contender("ensemble", [], "x")
+        TimedNetwork("ensemble", [], "x")
     with pytest.raises(ValueError, match="one by one"):
-        Contender("ensemble", [Ensemble([network(), network()])], "x")
+        TimedNetwork("ensemble", [Ensemble([network(), network()])], "x")
     other = network()
     other.preprocess = Preprocess(size=(8, 8))
     with pytest.raises(ValueError, match="same input"):
-        Contender("ensemble", [network(), other], "x")
+        TimedNetwork("ensemble", [network(), other], "x")
 
 
-def test_ground_truth_is_no_contender():
+def test_ground_truth_has_no_network_to_time():
     bases = {
         "depth_only": SimpleNamespace(networks=(), label="ground truth", passes=1),
         "aleatoric": SimpleNamespace(networks=(network(),), label="Linear", passes=1),
     }
-    found = contenders(bases)
-    assert list(found) == ["aleatoric"]
-    assert found["aleatoric"].label == "Linear"
+    networks = timed_networks(bases)
+    assert list(networks) == ["aleatoric"]
+    assert networks["aleatoric"].label == "Linear"

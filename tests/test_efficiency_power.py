@@ -12,8 +12,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ufmstar_torch.eval.bench import sensors
-from ufmstar_torch.eval.bench.power import CPU, DRAM, GPU, OTHER, PowerMeter, Rail, SensorError, Source, consumed
-from ufmstar_torch.eval.bench.windows import PartEnergy, repeated, run_windows
+from ufmstar_torch.eval.bench.energy import (
+    CPU,
+    DRAM,
+    GPU,
+    OTHER,
+    PartEnergy,
+    PowerMeter,
+    Rail,
+    SensorError,
+    Source,
+    consumed,
+    repeated,
+    run_windows,
+)
 
 zeus = pytest.importorskip("zeus", reason="needs the extra energy")
 
@@ -384,7 +396,7 @@ def test_a_jetsons_rails_serve_both_units(bare):
 @pytest.mark.slow
 def test_importing_reads_no_sensor():
     code = (
-        "import sys, threading, ufmstar_torch.eval.bench.power, ufmstar_torch.eval.bench.sensors;"
+        "import sys, threading, ufmstar_torch.eval.bench.energy, ufmstar_torch.eval.bench.sensors;"
         "print('zeus' in sys.modules, 'torch' in sys.modules, threading.active_count())"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)

@@ -7,8 +7,8 @@ import re
 
 import pytest
 
+from ufmstar_torch.eval.bench.energy import CPU, GPU, NOT_MEASURABLE
 from ufmstar_torch.eval.bench.memory import overhead_percent
-from ufmstar_torch.eval.bench.power import CPU, GPU, NOT_MEASURABLE
 from ufmstar_torch.eval.report.efficiency import efficiency_table, efficiency_tables, megabytes
 
 

@@ -150,6 +150,35 @@ def test_the_preprocessed_intrinsics_reach_the_networks_that_take_them(mode):
     torch.testing.assert_close(depth.reshape(H // 2, W // 2), ByFocal()(*half(picture[None], K[None].float())).depth[0])
 
 
+def test_the_aleatoric_variance_is_regressed_as_a_feature():
+    """A in H: as UfM* with that feature, and a constant A stays itself; others replace it; without A it is an error."""
+    config = CONFIG.replace(features=1)
+    model, ufm = UncertainDepth(Scaled(1.0, aleatoric=0.04), config), UfMStar(config)
+    for i in range(3):
+        a = torch.full((1, H, W), 0.04)
+        out, expected = model(image(i), POSES[i], K), ufm(image(i)[:, 0], POSES[i], K, a, features=a[:, None])
+        assert torch.equal(out.ufm.features, expected.features)
+    assert float(out.ufm.features[out.ufm.labels >= 0].median()) == pytest.approx(0.04, rel=0.02)
+    other = UncertainDepth(Scaled(1.0), config)(image(0), POSES[0], K, features=torch.full((1, 1, H, W), 7.0))
+    assert float(other.ufm.features[other.ufm.labels >= 0].median()) == pytest.approx(7, rel=0.02)
+    with pytest.raises(ValueError, match=r"features=1 regresses the aleatoric variance, but the network predicts none"):
+        UncertainDepth(Scaled(1.0), config)(image(0), POSES[0], K)
+
+
+def test_the_mean_uncertainty_of_images():
+    """As UfM*'s own, with the members in turn; a call that fails does not advance the turn."""
+    model, ufm = UncertainDepth([Scaled(1.0, 0.01), Scaled(1.2, 0.03)], CONFIG), UfMStar(CONFIG)
+    for i in range(4):
+        factor, a = ((1.0, 0.01), (1.2, 0.03))[i % 2]
+        with pytest.raises(ValueError, match="pixels or fraction"):
+            model.mean_uncertainty(image(i), POSES[i], K, pixels=5, fraction=0.5)
+        got = model.mean_uncertainty(image(i), POSES[i], K, pixels=200, seed=i)
+        want = ufm.mean_uncertainty(image(i)[:, 0] * factor, POSES[i], K, torch.full((1, H, W), a), pixels=200, seed=i)
+        assert torch.equal(got.mean, want.mean)
+        assert int(got.pixels) == 200
+    assert model(image(4), POSES[4], K).member == 0
+
+
 def test_networks_stay_in_eval_mode():
     model = UncertainDepth(nn.Sequential(Scaled(1.0)), CONFIG)
     model.train()
@@ -191,7 +220,6 @@ def test_inference_mode_leaves_loadable_buffers():
 def test_what_cannot_be_meant_is_refused():
     for arguments in (
         {"networks": []},
-        {"networks": [lambda x: x]},
         {"networks": Scaled(1.0), "mode": "all"},
         {"networks": Scaled(1.0), "mode": "full"},
         {"networks": Scaled(1.0), "samples": 10},
@@ -201,8 +229,15 @@ def test_what_cannot_be_meant_is_refused():
             UncertainDepth(**arguments)
     with pytest.raises(ValueError, match=r"image must be \[B, 3, H, W\]"):
         UncertainDepth(Scaled(1.0), CONFIG)(image(0)[0], POSES[0], K)
-    with pytest.raises(TypeError, match="DepthPrediction"):
+    with pytest.raises(TypeError, match=r"DepthPrediction, got Tensor: wrap it with .*wrap_network\(network\)"):
         UncertainDepth(nn.Identity(), CONFIG)(image(0), POSES[0], K)
+    for function in (image, [image]):
+        with pytest.raises(TypeError, match=r"got a function; wrap a function with .*wrap_network\(function\)"):
+            UncertainDepth(function, CONFIG)
+    with pytest.raises(TypeError, match=r"sequence of them, got a int$"):
+        UncertainDepth(3, CONFIG)
+    with pytest.raises(ValueError, match=r"resize_height is one number, .*Preprocess\(size=\(224, 224\)\)"):
+        Preprocess((224, 224))
 
 
 def test_prediction_checks_itself():

@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import torch
 
 import scenes
+from ufmstar_torch.camera import resize_intrinsics
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -19,15 +21,14 @@ def blocks(language: str) -> list[str]:
 
 def test_the_example_runs(tmp_path, monkeypatch, capsys):
     (code,) = blocks("python")
-    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+    assert len([line for line in code.splitlines() if line.strip()]) <= 15
     depths, poses, K = scenes.sequence(3, 48, 64, 0.05)
-    frames = [
-        (torch.tensor(d)[None].float(), torch.tensor(T), torch.tensor(K)) for d, T in zip(depths, poses, strict=True)
-    ]
+    pictures = [np.repeat(np.nan_to_num(d * 40).clip(0, 255).astype(np.uint8)[..., None], 3, 2) for d in depths]
     monkeypatch.chdir(tmp_path)
-    scope = {"frames": frames}
+    scope = {"video": list(zip(pictures, poses, [K] * 3, strict=True)), "my_network": lambda x: x[:, :1] * 255 / 40}
     exec(compile(code, "README.md", "exec"), scope)
-    assert scope["trust"].shape == (1, 48, 64)
+    assert scope["trust"].shape == (1, 224, 224)
+    torch.testing.assert_close(scope["out"].intrinsics[0], resize_intrinsics(torch.tensor(K), (48, 64), (224, 224)))
     assert len(capsys.readouterr().out.splitlines()) == 3
     assert (tmp_path / "state.pt").exists()
 

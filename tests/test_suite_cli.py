@@ -9,7 +9,7 @@ import pytest
 from suite_runs import TRUTH, Stub, write_rooms
 
 from ufmstar_torch import cli
-from ufmstar_torch.eval.bench import efficiency_step
+from ufmstar_torch.eval.bench import measure as measurement
 from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.methods.setting import Setting
@@ -219,8 +219,8 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
         measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames, how["plan"].threads))
         return {"rows": []}
 
-    monkeypatch.setattr(efficiency_step, "measure", measure)
-    monkeypatch.setattr(efficiency_step, "contenders", lambda networks: networks)
+    monkeypatch.setattr(measurement, "measure", measure)
+    monkeypatch.setattr(measurement, "timed_networks", lambda networks: networks)
     rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
     (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
     words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 from tiny_suite import row
 
-from ufmstar_torch.eval.bench.measure import _obstacle
+from ufmstar_torch.eval.bench.measure import measure
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.estimators import Estimate
@@ -165,7 +165,8 @@ def test_a_setting_of_drift(name):
     assert default_of(name) == 0
     assert setting.pose_noise != Setting(**{name: 0.1}).pose_noise
     assert Setting(seed=2, anchors="truth").pose_noise == ()
-    assert "no matter of efficiency" in _obstacle(row(NAME, **{name: 0.1}), {"depth_only": object()})
+    with pytest.raises(ValueError, match="no matter of efficiency"):
+        measure([row(NAME, **{name: 0.1})], {"depth_only": object()}, None)
 
 
 def test_words():

@@ -328,6 +328,37 @@ def test_the_factors_of_a_batch_ensemble_do_not_decay(frames, tmp_path):
     assert sum(len(group["params"]) for group in groups) == len(list(module.network.parameters()))
 
 
+def test_a_split_batch_trains_every_member_on_its_own_images(frames, tmp_path):
+    """One prediction per image, the cost of one network; too few images are refused."""
+    recipe = replace(with_network(RECIPE, method="batch_ensemble", members=2), split_batch=True, batch_size=4)
+    module = TrainingModule(build_network(recipe.network).eval(), recipe, 10)  # batch norm would mix the images
+    image = torch.rand(4, 3, *recipe.network.size, generator=torch.Generator().manual_seed(0))
+    distribution = module._distribution(image)
+    assert len(distribution.depth) == 4
+    for n, own in enumerate(distribution.depth.split(2)):
+        factor = module.network.factors()[0]
+        (gradient,) = torch.autograd.grad(own.sum(), factor, retain_graph=True)
+        assert [bool(row.any()) for row in gradient] == [n == 0, n == 1]
+    fit(tiny_job(frames, tmp_path / "out", replace(recipe, epochs=1, max_steps=1)))
+    with pytest.raises(ValueError, match=r"no more members than batch_size, got 2 and 1"):
+        replace(recipe, batch_size=1)
+    with pytest.raises(ValueError, match="split_batch needs a batch_ensemble"):
+        replace(RECIPE, split_batch=True)
+
+
+@pytest.mark.parametrize("network", [{"method": "evidential"}, {"method": "batch_ensemble", "members": 2}])
+def test_heads_at_four_scales_train_and_are_stored(frames, tmp_path, network):
+    """The loss of every scale counts; the stored network predicts with the finest."""
+    recipe = replace(with_network(RECIPE, **network, head_scales=4), epochs=1, max_steps=1)
+    module = TrainingModule(build_network(recipe.network), recipe, 10)
+    image = torch.rand(3, 3, *recipe.network.size, generator=torch.Generator().manual_seed(0))
+    assert len(module._distribution(image).depth) == 3 * 4 * recipe.network.members
+    assert module.network(image).depth.shape == (3, *recipe.network.size)
+    fit(tiny_job(frames, tmp_path / "out", recipe))
+    for trained in load_trained(tmp_path / "out" / "trained.safetensors"):
+        assert trained(image).depth.shape == (3, *recipe.network.size)
+
+
 @pytest.mark.parametrize("average", [0.0, 0.9])
 def test_a_loss_that_is_not_finite_names_its_samples_and_loses_nothing(frames, tmp_path, monkeypatch, average):
     """The second member diverges at its step 2, the first of the two is there nevertheless."""

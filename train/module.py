@@ -176,7 +176,10 @@ class TrainingModule(pl.LightningModule):
         self.losses = Sums(*checkpoint["ufmstar_sums"]["losses"])
 
     def _distribution(self, image: Tensor) -> DepthDistribution:
-        return self.network.distribution(image.contiguous(memory_format=torch.channels_last))
+        image = image.contiguous(memory_format=torch.channels_last)
+        if self.recipe.split_batch:
+            return self.network.distribution(image, repeat=False)
+        return self.network.distribution(image)
 
     def _over_processes(self, values: Tensor) -> tuple[Tensor, int]:
         """The sum over all processes, and their number."""

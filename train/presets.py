@@ -43,6 +43,8 @@ class Recipe(Checked):
         weight_decay: L2 penalty, which Adam adds to the gradient.
         clip: largest norm of the gradient, 0 = not clipped.
         average: decay per step of the running mean of the weights, which is the result then; 0 = no mean.
+        split_batch: whether every image of a batch trains one member of a BatchEnsemble, as in its paper: the cost of
+            one network. Otherwise it trains all of them, at N times the cost.
         half: whether the weights are stored in half precision at the end.
 
     Raises:
@@ -62,12 +64,18 @@ class Recipe(Checked):
     weight_decay: float = number(1e-4, "lambda", "1", 0, 10)
     clip: float = number(0.0, "|g|", "1", 0, 1e6)
     average: float = number(0.0, "d", "1", 0, 1, open_high=True)
+    split_batch: bool = False
     half: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.network.method == "batch_ensemble" and self.members > 1:
             raise ValueError("Recipe.members must be 1 for a batch_ensemble: its members are Recipe.network.members")
+        if self.split_batch and not 1 < self.network.members <= self.batch_size:
+            raise ValueError(
+                "Recipe.split_batch needs a batch_ensemble with no more members than batch_size, got "
+                f"{self.network.members} and {self.batch_size}"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain values for JSON."""
@@ -125,7 +133,11 @@ PRESETS: dict[str, Recipe] = {
 
 _SOURCES = """From the paper (Section V-A): method, members, size, epochs, decay, dropout, Adam's betas (.9, .999), and
 the ResNet50 encoder's start from ImageNet (--init imagenet). Ours, since the paper does not state them: batch,
-learning rate and its schedule. The preset demo is ours."""
+learning rate and its schedule; one head at full resolution (--network.head_scales 4:
+four, as Poggi et al.); dropout after the second convolution of a level
+(--network.dropout_both true: after both); every image trains all members of a BatchEnsemble (--split-batch true: one
+each, with --batch-size 10 or more). fastdepth ends in a ReLU as published; --network.positive softplus is ours and
+better from scratch. The preset demo is ours."""
 
 
 def preset(name: str) -> Recipe:

@@ -88,7 +88,7 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
     state, _ = read_safetensors(path, prefix=f"member.{member % info.networks}.")
     source = build_network(info.spec)
     fill(source, {k: v.float() if v.is_floating_point() else v for k, v in state.items()}, str(path))
-    shared = ("size", "preprocess", "dropout", "method", "members")
+    shared = ("size", "preprocess", "dropout", "dropout_both", "method", "members")
     own = replace(info.spec, **{name: getattr(spec, name) for name in shared})
     if own != spec:
         raise ValueError(f"init: {path} holds {info.spec}, which does not fit {spec}")

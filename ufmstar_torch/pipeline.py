@@ -6,15 +6,16 @@ stochastic network, or by a single one; or, for comparison, by all of them at on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.output import MeanUncertainty
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
@@ -72,6 +73,7 @@ class NetworksInTurn(nn.Module):
         preprocess: maps image and intrinsics to the networks' input; None passes both through.
 
     Raises:
+        TypeError: something that is no ``nn.Module``.
         ValueError: no network, or ``samples`` of several.
     """
 
@@ -83,9 +85,7 @@ class NetworksInTurn(nn.Module):
         preprocess: Preprocess | None = None,
     ) -> None:
         super().__init__()
-        members = [networks] if isinstance(networks, nn.Module) else list(networks)
-        if not members or not all(isinstance(m, nn.Module) for m in members):
-            raise ValueError("networks must be an nn.Module or a non-empty sequence of them")
+        members = _modules(networks)
         if samples is not None and (samples < 1 or len(members) > 1):
             raise ValueError(f"samples must be at least 1 and goes with one network, got {samples} of {len(members)}")
         self.networks = nn.ModuleList(members).eval()
@@ -113,7 +113,10 @@ class NetworksInTurn(nn.Module):
         """
         prediction = infer(self.networks[n % len(self.networks)], x, intrinsics)
         if not isinstance(prediction, DepthPrediction):
-            raise TypeError(f"network {n} must return a DepthPrediction, got {type(prediction).__name__}")
+            raise TypeError(
+                f"network {n} must return a DepthPrediction, got {type(prediction).__name__}: wrap it with "
+                "ufmstar_torch.models.wrap_network(network), which declares what its output means"
+            )
         return prediction
 
     def every(self, x: Tensor, intrinsics: Tensor) -> DepthPrediction:
@@ -134,7 +137,8 @@ class UncertainDepth(NetworksInTurn):
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
             separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one with an
             attribute ``takes_intrinsics = True`` is called as ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
-        config: of UfM*.
+        config: of UfM*. With ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
+            as the second entry of H (``ufm.features``), unless other features are given.
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
             (or ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean
@@ -147,6 +151,7 @@ class UncertainDepth(NetworksInTurn):
     to sample in eval mode, as decoder dropout at test time does.
 
     Raises:
+        TypeError: something that is no ``nn.Module``: a function needs ``ufmstar_torch.models.wrap_network``.
         ValueError: no network, an unknown mode, or ``samples`` that fit neither.
 
     Example::
@@ -170,7 +175,7 @@ class UncertainDepth(NetworksInTurn):
         samples: int | None = None,
         preprocess: Preprocess | None = None,
     ) -> None:
-        single = isinstance(networks, nn.Module) or len(networks) == 1
+        single = len(_modules(networks)) == 1
         if mode not in ("alternate", "full"):
             raise ValueError(f"mode must be 'alternate' or 'full', got {mode!r}")
         if samples is not None and (samples < 2 or not single or mode != "full"):
@@ -190,6 +195,7 @@ class UncertainDepth(NetworksInTurn):
         intrinsics: Tensor,
         valid: Tensor | None = None,
         *,
+        features: Tensor | None = None,
         anchors: Anchors | None = None,
     ) -> UncertainPrediction:
         """Predict depth and its variance for the next image of every stream.
@@ -199,12 +205,53 @@ class UncertainDepth(NetworksInTurn):
             pose: [B, 4, 4] or [4, 4] camera-to-world [m].
             intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
             valid: [B, h, w] bool at the depth map's size, True = use.
+            features: [B, F, h, w] likewise, F = ``config.features``; None with F = 1: the aleatoric variance [m^2].
             anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchored``; their pixels are
                 those of ``image`` and ``intrinsics``, whatever the preprocessing makes of them. None = none.
 
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; the alternation has not advanced then.
         """
+        prediction, K, member, optional = self._predicted(image, intrinsics, features, anchors)
+        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+        ufm = self.ufm(prediction.depth, pose, K, a, e, valid, **optional)
+        self._count(self._next + 1)
+        return UncertainPrediction(prediction, ufm, K, member)
+
+    def mean_uncertainty(
+        self,
+        image: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        valid: Tensor | None = None,
+        *,
+        features: Tensor | None = None,
+        anchors: Anchors | None = None,
+        pixels: int | None = None,
+        fraction: float | None = None,
+        seed: int = 0,
+        average: bool = False,
+    ) -> MeanUncertainty:
+        """Like :meth:`forward`, but an average variance per image, for active learning.
+
+        Args:
+            image, pose, intrinsics, valid, features, anchors: as in :meth:`forward`.
+            pixels, fraction, seed, average: as in :meth:`UfMStar.mean_uncertainty`.
+
+        Raises:
+            ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; the alternation has not advanced then.
+        """
+        prediction, K, _, optional = self._predicted(image, intrinsics, features, anchors)
+        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+        sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
+        mean = self.ufm.mean_uncertainty(prediction.depth, pose, K, a, e, valid, **optional, **sample)
+        self._count(self._next + 1)
+        return mean
+
+    def _predicted(
+        self, image: Tensor, intrinsics: Tensor, features: Tensor | None, anchors: Anchors | None
+    ) -> tuple[DepthPrediction, Tensor, int | None, dict[str, Any]]:
+        """The prediction for the next image, its intrinsics, the member, and UfM*'s features and anchors."""
         if image.dim() != 4 or image.shape[1] != 3:
             raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
         member = None if self.mode == "full" else self.turn(self._next)
@@ -213,10 +260,13 @@ class UncertainDepth(NetworksInTurn):
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
         if anchors is not None and self.preprocess is not None:
             anchors = anchors.moved(intrinsics, K)
-        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-        ufm = self.ufm(prediction.depth, pose, K, a, e, valid, anchors=anchors)
-        self._count(self._next + 1)
-        return UncertainPrediction(prediction, ufm, K, member)
+        if features is None and self.ufm.config.features == 1:
+            if prediction.aleatoric_variance is None:
+                raise ValueError(
+                    "config.features=1 regresses the aleatoric variance, but the network predicts none: give features"
+                )
+            features = prediction.aleatoric_variance[:, None]
+        return prediction, K, member, {"features": features, "anchors": anchors}
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
@@ -233,6 +283,24 @@ class UncertainDepth(NetworksInTurn):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._next = int(self.image_index)
+
+
+def _modules(networks: object) -> list[nn.Module]:
+    """One network or a sequence of them as a list.
+
+    Raises:
+        TypeError: something else.
+        ValueError: an empty sequence.
+    """
+    members = list(networks) if isinstance(networks, Iterable) and not isinstance(networks, nn.Module) else [networks]
+    if not members:
+        raise ValueError("networks must hold at least one network")
+    if wrong := [member for member in members if not isinstance(member, nn.Module)]:
+        raise TypeError(
+            f"networks must be an nn.Module or a sequence of them, got a {type(wrong[0]).__name__}"
+            + ("; wrap a function with ufmstar_torch.models.wrap_network(function)" if callable(wrong[0]) else "")
+        )
+    return [member for member in members if isinstance(member, nn.Module)]
 
 
 def combine(predictions: Sequence[DepthPrediction]) -> DepthPrediction:

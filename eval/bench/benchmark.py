@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
+from ufmstar_torch.eval.bench.timing import pinned_threads
 
 # Milliseconds and ratios at 224 x 224, bytes and ratios for one room; the tracker's mean processor time for 300 corners
 # at 640 x 480. For information.
@@ -81,7 +81,8 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
     """Measure what the options ask for.
 
     Args:
-        progress: is told what is measured next.
+        options: see :class:`BenchSettings`.
+        progress: is called with a description of what is measured next.
 
     Returns:
         The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run" and
@@ -92,8 +93,7 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
     """
     from ufmstar_torch import UfMStarConfig
-    from ufmstar_torch.eval.bench.benchmark_compile import measure_compilation
-    from ufmstar_torch.eval.bench.benchmark_long import measure_long_run
+    from ufmstar_torch.eval.bench.step import measure_compilation, measure_long_run
     from ufmstar_torch.eval.results import machine
 
     config = UfMStarConfig()
@@ -129,7 +129,7 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
 
 def _inputs(options: BenchSettings) -> tuple[Any, Any]:
     """FastDepth, with random weights of the pruned network's shape if none are given, and the frames' source."""
-    from ufmstar_torch.eval.bench.benchmark_frames import RecordedSequence, RenderedRoom
+    from ufmstar_torch.eval.bench.frames import RecordedSequence, RenderedRoom
     from ufmstar_torch.models import FastDepth, FastDepthWidths, load_network
 
     if options.weights is None:
@@ -148,27 +148,28 @@ def _inputs(options: BenchSettings) -> tuple[Any, Any]:
 def _results(
     options: BenchSettings, config: Any, fastdepth: Any, source: Any, progress: Callable[[str], object]
 ) -> list[dict[str, Any]]:
-    from ufmstar_torch.eval.bench.benchmark_step import Plan, build_up, measure_step, reference_networks
+    from ufmstar_torch.eval.bench.step import build_up, measure_step, reference_networks
 
     results = []
     for size in options.sizes:
         progress(f"{size} x {size}, building up the mixture")
         networks, about = reference_networks(size, fastdepth)
-        rounds = _WARM_UP + options.frames
         built, frames, history = build_up(
-            source, config, size=size, in_view=options.in_view, history=options.history, rounds=rounds
-        )
+            source, config, size=size, in_view=options.in_view, history=options.history,
+            rounds=_WARM_UP + options.frames,
+        )  # fmt: skip
         for backend in options.backends:
             progress(f"{size} x {size}, {backend}")
-            timed = options.frames if backend == "numba" else min(options.frames, _TORCH_ROUNDS)
-            plan = Plan(size, backend, _WARM_UP if backend == "numba" else 1, timed)
-            result = measure_step(plan, built, frames, networks)
+            warm_up, timed = _WARM_UP, options.frames
+            if backend == "torch":
+                warm_up, timed = 1, min(timed, _TORCH_ROUNDS)
+            result = measure_step(built, frames[: warm_up + timed], networks, backend=backend, warm_up=warm_up)
             results.append({**result, "history": history, "networks_about": about})
     return results
 
 
 def _anchors(options: BenchSettings, config: Any, source: Any, progress: Callable[[str], object]) -> dict[str, Any]:
-    from ufmstar_torch.eval.bench.benchmark_anchors import measure_anchors
+    from ufmstar_torch.eval.bench.anchors import measure_anchors
 
     assert options.anchors is not None
     progress(f"{options.anchors} corners and anchors")

@@ -2,32 +2,49 @@
 
 Per row: what the network spends on depth alone, what uncertainty adds to the network (a head, further members or
 samples), and the multiview step. Times come from a race over the frames of one sequence (``race``), energies from
-windows of the machine's own counters (``windows``), memory from the tensors that are kept (``memory``).
+windows of the machine's own counters (``energy``), memory from the tensors that are kept (``memory``).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
+from statistics import median
 from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.bench.benchmark_timing import pinned_threads
-from ufmstar_torch.eval.bench.contender import Contender
-from ufmstar_torch.eval.bench.lines import NETWORK, network_line, row_line
-from ufmstar_torch.eval.bench.multiview import Multiview, synchronize
-from ufmstar_torch.eval.bench.power import CPU, GPU, PowerMeter
-from ufmstar_torch.eval.bench.race import DEPTH, EVERY, MULTIVIEW, Prepared, Race, inference_of, parts_of, run_race
-from ufmstar_torch.eval.bench.windows import Work, repeated, run_windows
+from ufmstar_torch.eval.bench.energy import CPU, GPU, PartEnergy, PowerMeter, Work, repeated, run_windows
+from ufmstar_torch.eval.bench.memory import overhead_percent
+from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
+from ufmstar_torch.eval.bench.race import (
+    MULTIVIEW,
+    PROCESSOR,
+    WALL,
+    MultiviewStep,
+    Race,
+    inference_of,
+    parts_of,
+    run_race,
+)
+from ufmstar_torch.eval.bench.timing import pinned_threads
+from ufmstar_torch.eval.engine.clock import paired_ratio, spread, synchronize
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.machine import available_cores, hardware, load_average, versions
+from ufmstar_torch.eval.results.work import EvalJob
+from ufmstar_torch.eval.results.worker import device_of
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 
+EFFICIENCY = "efficiency.json"
 FORMAT = 1
+NETWORK = "network_uncertainty"
+NOT_NEEDED = "the method asks nothing of the network but depth"
+
+Energies = Mapping[tuple[str, str], PartEnergy]
 
 
 @dataclass(frozen=True)
@@ -66,7 +83,7 @@ class Plan:
 
 def measure(
     rows: Sequence[Row],
-    networks: Mapping[str, Contender],
+    networks: Mapping[str, TimedNetwork],
     sequence: FrameSequence,
     *,
     device: torch.device | str = "cpu",
@@ -109,26 +126,57 @@ def measure(
         units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
         work = _work(chosen, networks, race, device, multiview_device)
         energy = run_windows(meter, work, idle, seconds=plan.seconds, windows=plan.windows)
-    used = [base for base in networks if any(row.method.base == base for row in chosen)]
+    used = [base for base in networks if base in race.given]
+    gpu = None if on_gpu is None else torch.cuda.get_device_name(on_gpu)
     return {
         "format": FORMAT,
-        "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": _gpu(on_gpu)},
+        "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": gpu},
         "devices": {"networks": str(device), "multiview": str(multiview_device), "units": units},
         "plan": {**asdict(plan), "threads": plan.threads or available_cores()},
         "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": unreadable},
         "power": {"rails": [asdict(rail) for rail in meter.rails], "missing": meter.missing, "idle_watts": idle},
-        "networks": {base: network_line(networks[base], race, energy) for base in used},
-        "rows": [row_line(row, networks[row.method.base], race, energy) for row in chosen],
+        "networks": {base: _network_line(networks[base], race, energy) for base in used},
+        "rows": [_row_line(row, networks[row.method.base], race, energy) for row in chosen],
         "left_out": left_out,
     }
 
 
-def _obstacle(row: Row, networks: Mapping[str, Contender]) -> str | None:
+def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
+    """Measure the rows on the first sequence that can be opened, and write OUT/efficiency.json.
+
+    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device.
+
+    Args:
+        job: an evaluation whose sequences are done.
+        plan: how much is measured; None = the defaults, with fewer frames where the sequence has no more.
+
+    Raises:
+        ValueError: no sequence can be opened, it has no frames enough, or no row can be measured.
+        OSError: the file cannot be written.
+    """
+    plan = plan or Plan()
+    device = device_of(job.device, 0)
+    failed = []
+    for item in job.items:
+        try:
+            sequence = item.open()
+            break
+        except (OSError, ValueError) as error:
+            failed.append(f"{item.label}: {error}")
+    else:
+        raise ValueError(f"no sequence can be opened: {'; '.join(failed[:3])}")
+    frames = max(1, min(plan.frames, len(sequence) - plan.warm_up))
+    networks = timed_networks(job.load(torch.device(device)))
+    result = measure(job.suite.rows, networks, sequence, device=device, plan=replace(plan, frames=frames))
+    write_json_atomic(job.out / EFFICIENCY, result)
+
+
+def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:
     """Why a row cannot be measured."""
     base, setting = row.method.base, row.setting
     if base not in networks:
         return f"no network for {base}"
-    if row.method.every_member and not networks[base].several:
+    if row.method.every_member and networks[base].passes == 1:
         return f"it runs several members, {networks[base].label} has one"
     if setting.skip or setting.pose_noise:
         return "left out frames and noise on poses are no matter of efficiency"
@@ -157,47 +205,123 @@ def _unit(device: torch.device) -> str:
     return CPU if device.type == "cpu" else GPU
 
 
-def _gpu(device: torch.device | None) -> str | None:
-    return None if device is None else torch.cuda.get_device_name(device)
-
-
-# ---- energy ----
-
-
 def _work(
     rows: Sequence[Row],
-    networks: Mapping[str, Contender],
+    networks: Mapping[str, TimedNetwork],
     race: Race,
     device: torch.device,
     multiview_device: torch.device,
 ) -> dict[tuple[str, str], tuple[str, Work]]:
     """What a window repeats, by owner and part, on the very inputs of the race."""
     work: dict[tuple[str, str], tuple[str, Work]] = {}
-    for base, prepared in race.prepared.items():
-        one = networks[base]
+    for base, inputs in race.given.items():
         for part in parts_of(base, rows):
-            calls = [partial(_infer, one, part, p, n) for n, p in enumerate(prepared)]
+            one = partial(networks[base].predict, part)
+            calls = [partial(one, given.x, given.intrinsics, turn=turn) for turn, given in enumerate(inputs)]
             work[base, part] = (_unit(device), repeated(calls, partial(synchronize, device)))
     for row in rows:
         if row.method.fusion != ALONE:
-            inputs, judge = race.inputs[row.method.base, inference_of(row)], Multiview(row, multiview_device)
-            steps = [partial(_advance, judge, n, given) for n, given in enumerate(inputs)]
-            repeat = repeated(steps, partial(synchronize, multiview_device))
-            work[row.label, MULTIVIEW] = (_unit(multiview_device), repeat)
+            step = MultiviewStep(row, multiview_device)
+            steps = [partial(_advance, step, turn == 0, *given) for turn, given in enumerate(race.step_inputs(row))]
+            work[row.label, MULTIVIEW] = (
+                _unit(multiview_device),
+                repeated(steps, partial(synchronize, multiview_device)),
+            )
     return work
 
 
-def _infer(network: Contender, part: str, given: Prepared, turn: int) -> None:
-    if part == DEPTH:
-        network.alone(given.x, given.intrinsics)
-    elif part == EVERY:
-        network.every(given.x, given.intrinsics)
-    else:
-        network.once(given.x, turn, given.intrinsics)
+def _advance(step: MultiviewStep, first: bool, *given: Any) -> None:
+    """A step; the first frame of the sequence begins with an empty state, as in the race."""
+    if first:
+        step.module.reset()
+    step(*given)
 
 
-def _advance(row: Multiview, number: int, given: Any) -> None:
-    """A step; the first frame of the sequence begins with nothing, as it did in the race."""
-    if number == 0:
-        row.module.reset()
-    row(given)
+# ---- the lines of the result ----
+
+
+def _network_line(network: TimedNetwork, race: Race, energy: Energies) -> dict[str, Any]:
+    """A base's networks: what they are, and what depth alone and each form of inference take."""
+    memory = network.memory()
+    parts = [part for part in (DEPTH, ONCE, EVERY) if race.ms(network.base, part)]
+    return {
+        "label": network.label,
+        "members": len(network.members),
+        "passes": network.passes,
+        "whole": network.why_whole,
+        "memory": None if memory is None else asdict(memory),
+        "latency": {part: spread(race.ms(network.base, part)) for part in parts},
+        "energy": {part: energy[network.base, part].to_dict() for part in parts},
+    }
+
+
+def _row_line(row: Row, network: TimedNetwork, race: Race, energy: Energies) -> dict[str, Any]:
+    """One line of the table."""
+    base, part, name = row.method.base, inference_of(row), row.label
+    missing = _no_network_part(row, network)
+    clocks = (WALL, PROCESSOR)
+    depth = {clock: race.ms(base, DEPTH, clock) for clock in clocks}
+    times: dict[str, dict[str, list[float]]] = {}
+    energies: dict[str, PartEnergy] = {DEPTH: energy[base, DEPTH]}
+    if missing is None:
+        times[NETWORK] = {clock: race.added_ms(base, part, clock) for clock in clocks}
+        energies[NETWORK] = energy[base, part].minus(energy[base, DEPTH])
+    if row.method.fusion != ALONE:
+        times[MULTIVIEW] = {clock: race.ms(name, MULTIVIEW, clock) for clock in clocks}
+        energies[MULTIVIEW] = energy[name, MULTIVIEW]
+    unmeasured = {} if missing is None else {NETWORK: missing}
+    latency = {key: spread(ms[WALL]) for key, ms in ({DEPTH: depth} | times).items()}
+    ratios = {key: {clock: paired_ratio(ms[clock], depth[clock]) for clock in clocks} for key, ms in times.items()}
+    return {
+        "method": row.method.name,
+        "setting": row.setting.to_dict(),
+        "row": name,
+        "base": base,
+        "network": network.label,
+        "latency": latency | unmeasured,
+        "ratios_to_depth": ratios,
+        "stages": race.staged[name].summary(warm_up=race.warm_up) if name in race.staged else None,
+        "energy": {key: value.to_dict() for key, value in energies.items()} | unmeasured,
+        "energy_overhead_percent": _energy_overhead(energies, missing),
+        "memory": _memory(row, network, race),
+    }
+
+
+def _no_network_part(row: Row, network: TimedNetwork) -> dict[str, str] | None:
+    """None, or why the network's share for uncertainty is nothing or unknown."""
+    if row.method.base == "depth_only":
+        return {"none": NOT_NEEDED}
+    if network.why_whole is not None and not row.method.every_member:
+        return {"not_separable": network.why_whole}
+    return None
+
+
+def _energy_overhead(energies: Mapping[str, PartEnergy], missing: Mapping[str, str] | None) -> dict[str, float] | None:
+    """Share of uncertainty in all energy [%], gross and net; None unless all of it was measured.
+
+    A difference that the noise makes negative counts as nothing.
+    """
+    if any(part.reason is not None for part in energies.values()) or (missing is not None and "none" not in missing):
+        return None
+    overhead: dict[str, float] = {}
+    for kind, field in (("gross", "joules"), ("net", "net")):
+        middle = {key: median(getattr(part, field)) for key, part in energies.items()}
+        depth = middle.pop(DEPTH)
+        if depth > 0:
+            overhead[kind] = overhead_percent(sum(max(0.0, value) for value in middle.values()), depth)
+    return overhead or None
+
+
+def _memory(row: Row, network: TimedNetwork, race: Race) -> dict[str, Any]:
+    """Bytes of the network for depth, of what uncertainty adds to it, and of the multiview state; the share."""
+    memory = network.memory()
+    state = race.steps[row.label].memory() if row.method.fusion != ALONE else None
+    if memory is None:
+        return {"multiview": state, "not_measurable": "the weights are not torch's tensors"}
+    uncertainty = memory.uncertainty + (0 if state is None else state["bytes_end"])
+    return {
+        "depth_bytes": memory.depth,
+        "network_uncertainty_bytes": memory.uncertainty,
+        "multiview": state,
+        "overhead_percent": overhead_percent(uncertainty, memory.depth),
+    }

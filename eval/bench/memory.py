@@ -10,20 +10,30 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-MEGABYTE = 1e6
+from ufmstar_torch import UfMStar
 
 
-def tensor_bytes(modules: nn.Module | Iterable[nn.Module]) -> int:
+def tensor_bytes(tensors: Iterable[Tensor]) -> int:
+    """Bytes of tensors; what several of them share counts once."""
+    return sum({(t.data_ptr(), t.nbytes): t.nbytes for t in tensors if t.numel()}.values())
+
+
+def weight_bytes(*modules: nn.Module) -> int:
     """Bytes of the parameters and buffers of modules; what several of them share counts once."""
-    held: dict[tuple[int, int], int] = {}
-    for module in [modules] if isinstance(modules, nn.Module) else modules:
-        for tensor in _tensors(module):
-            held[tensor.data_ptr(), tensor.nbytes] = tensor.nbytes
-    return sum(held.values())
+    return tensor_bytes(t for module in modules for t in (*module.parameters(), *module.buffers()))
 
 
-def _tensors(module: nn.Module) -> list[Tensor]:
-    return [t for t in (*module.parameters(), *module.buffers()) if t.numel()]
+def state_memory(ufm: UfMStar) -> dict[str, int]:
+    """Bytes of the components in use, of the slots allocated, and of the moving average's map."""
+    mixture = ufm.mixture
+    each, components = mixture.bytes_per_component(), int(mixture.components.sum())
+    return {
+        "bytes_per_component": each,
+        "components": components,
+        "in_use": each * components,
+        "allocated": each * mixture.streams * mixture.capacity,
+        "moving_average": ufm.smoothed.nbytes,
+    }
 
 
 @dataclass(frozen=True)
@@ -45,7 +55,7 @@ class NetworkMemory:
         Raises:
             ValueError: the members hold less than the network for depth.
         """
-        alone, everything = tensor_bytes(depth), tensor_bytes(members)
+        alone, everything = weight_bytes(depth), weight_bytes(*members)
         if everything < alone:
             raise ValueError(f"members hold {everything} bytes, less than the {alone} of one network for depth")
         return cls(alone, everything - alone)

@@ -1,72 +1,141 @@
-"""The clocks: every part of every row on every frame, in turns, so that a busy machine slows all of them down.
+"""The clocks: every part of every row on every frame, in turn, so that a busy machine slows all of them down.
 
-A frame's networks run first, then what judges its views; odd frames in the reverse order, so that nothing always
-follows the same neighbour. What uncertainty adds to a network is the difference of two calls on one frame.
+A frame's networks run first, then the multiview steps on their predictions; odd frames in the reverse order
+(``TimedCalls``). What uncertainty adds to a network is the difference of two calls on one frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.bench.contender import Contender
-from ufmstar_torch.eval.bench.multiview import Inputs, Multiview, StagedUfMStar, synchronize, waited
+from ufmstar_torch import UfMStar
+from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
+from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls
 from ufmstar_torch.eval.engine.clock import CallTimes
+from ufmstar_torch.eval.engine.estimators import Gaussians, Pointwise, make_estimator
 from ufmstar_torch.eval.methods.method import ALONE, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
+from ufmstar_torch.prediction import DepthPrediction
 
-DEPTH, ONCE, EVERY, MULTIVIEW = "depth", "once", "every", "multiview"
+MULTIVIEW = "multiview"
 # Clocks: what passes, and what this process computes (over all its threads), which other work does not stretch.
 WALL, PROCESSOR = "wall", "processor"
 
 
 @dataclass(frozen=True)
-class Prepared:
+class NetworkInput:
     """A frame as a network takes it.
 
     Attributes:
         x: [1, 3, H, W] its input, on its device.
-        T_world_cam: [1, 4, 4] float64 [m]; ``intrinsics``: [1, 3, 3] float64 of the input [px].
-        intrinsics: see ``T_world_cam``.
+        T_world_cam: [1, 4, 4] float64 camera-to-world [m].
+        intrinsics: [1, 3, 3] float64 of the input [px].
     """
 
     x: Tensor
     T_world_cam: Tensor
     intrinsics: Tensor
 
+    @classmethod
+    def of(cls, frame: Frame, network: TimedNetwork, device: torch.device) -> NetworkInput:
+        """Raises FrameError where the frame has no image."""
+        K = torch.from_numpy(frame.intrinsics)[None].to(device)
+        x, K = network.preprocess(image_tensor(frame).to(device), K)
+        return cls(x, torch.from_numpy(frame.T_world_cam)[None], K)
+
+
+class MultiviewStep:
+    """UfM or UfM* of a row, as the evaluation builds it, with a state of its own.
+
+    Args:
+        row: behind UfM or UfM*.
+        device: where it runs.
+
+    Attributes:
+        kept: what the estimator holds after every noted frame (``Estimator.memory``).
+
+    Raises:
+        ValueError: a row without a multiview part.
+    """
+
+    def __init__(self, row: Row, device: torch.device) -> None:
+        estimator = make_estimator(row, device)
+        if not isinstance(estimator, Pointwise | Gaussians):
+            raise ValueError(f"{row.label} has no multiview part")
+        self.row, self.device, self.module = row, device, estimator.ufm
+        self.kept: list[dict[str, float]] = []
+        self._estimator = estimator
+
+    def __call__(self, prediction: DepthPrediction, given: NetworkInput) -> Any:
+        """The next frame: its maps to the device, and the step."""
+        return self.module(*self.arguments(prediction, given))
+
+    def arguments(self, prediction: DepthPrediction, given: NetworkInput) -> tuple[Tensor | None, ...]:
+        """Depth, pose, intrinsics, A and E as the row uses them, on its device."""
+        own = (prediction.aleatoric_variance, prediction.epistemic_variance)
+        maps = (prediction.depth, given.T_world_cam, given.intrinsics)
+        used = (*maps, *own) if self.row.method.uses_aleatoric else (*maps, None, None)
+        return tuple(None if value is None else value.to(self.device) for value in used)
+
+    def note(self) -> None:
+        """Record what is kept now."""
+        self.kept.append(self._estimator.memory())
+
+    def memory(self) -> dict[str, float]:
+        """Bytes and points or components after the noted frames: at the end, on average, at most; and of the
+        map that is kept for smoothing [bytes]."""
+        figures = {"smoothing_bytes": self.kept[-1]["smoothing_bytes"]}
+        for name in ("bytes", "count"):
+            values = [kept[name] for kept in self.kept]
+            figures |= {
+                f"{name}_end": values[-1],
+                f"{name}_mean": sum(values) / len(values),
+                f"{name}_max": max(values),
+            }
+        return figures
+
 
 @dataclass
 class Race:
-    """What was run and how long it took.
+    """What was run and its times.
 
     Attributes:
-        watch: times by (base or row, part), of the frames after the warm-up.
-        prepared: by base, every frame.
-        inputs: by base and part ("once" or "every"), what the multiview methods were given.
-        multiview: by row's label, the state after the last frame.
+        warm_up: frames at the beginning that are not counted.
+        times: by "base/part" or "row/multiview", of the frames after the warm-up.
+        given: by base, the networks' input of every frame.
+        predictions: by base and part ("once" or "every"), the multiview steps' input of every frame.
+        steps: by row's label, the state after the last frame.
         staged: likewise, the stages of UfM*.
     """
 
-    watch: CallTimes = field(default_factory=CallTimes)
-    prepared: dict[str, list[Prepared]] = field(default_factory=dict)
-    inputs: dict[tuple[str, str], list[Inputs]] = field(default_factory=dict)
-    multiview: dict[str, Multiview] = field(default_factory=dict)
-    staged: dict[str, StagedUfMStar] = field(default_factory=dict)
+    warm_up: int
+    times: CallTimes = field(default_factory=CallTimes)
+    given: dict[str, list[NetworkInput]] = field(default_factory=dict)
+    predictions: dict[tuple[str, str], list[DepthPrediction]] = field(default_factory=dict)
+    steps: dict[str, MultiviewStep] = field(default_factory=dict)
+    staged: dict[str, StagedStep] = field(default_factory=dict)
 
     def ms(self, owner: str, part: str, clock: str = WALL) -> list[float]:
         """Times of a part by a clock [ms], one per frame; none if it was not run."""
-        times = self.watch.wall if clock == WALL else self.watch.cpu
+        times = self.times.wall if clock == WALL else self.times.cpu
         return times.get(f"{owner}/{part}", [])
 
     def added_ms(self, base: str, part: str, clock: str = WALL) -> list[float]:
         """What a network's inference takes beyond that of depth alone [ms], frame by frame."""
         return [a - b for a, b in zip(self.ms(base, part, clock), self.ms(base, DEPTH, clock), strict=True)]
+
+    def step_inputs(self, row: Row) -> list[tuple[DepthPrediction, NetworkInput]]:
+        """Of a row's multiview step, frame by frame."""
+        base = row.method.base
+        return list(zip(self.predictions[base, inference_of(row)], self.given[base], strict=True))
 
 
 def parts_of(base: str, rows: Iterable[Row]) -> tuple[str, ...]:
@@ -82,7 +151,7 @@ def inference_of(row: Row) -> str:
 
 def run_race(
     rows: Sequence[Row],
-    contenders: Mapping[str, Contender],
+    networks: Mapping[str, TimedNetwork],
     frames: Sequence[Frame],
     *,
     warm_up: int,
@@ -93,7 +162,7 @@ def run_race(
 
     Args:
         rows: different ones.
-        contenders: by base.
+        networks: by base.
         frames: with images; the first ``warm_up`` are run, but not counted.
         warm_up: see ``frames``.
         device: of the networks.
@@ -102,58 +171,30 @@ def run_race(
     Raises:
         FrameError: a frame has no image.
     """
-    race = Race()
-    bases = [base for base in contenders if any(row.method.base == base for row in rows)]
-    judged = [row for row in rows if row.method.fusion != ALONE]
-    gaussians = [row for row in judged if row.method.fusion == UFM_STAR]
-    race.multiview = {row.label: Multiview(row, multiview_device) for row in judged}
-    race.staged = {row.label: StagedUfMStar(row, multiview_device) for row in gaussians}
-    for number, frame in enumerate(frames):
-        for base in _turned(bases, number):
-            _run_networks(race, contenders[base], parts_of(base, rows), frame, number, device)
-        for row in _turned(judged, number):
-            given = race.inputs[row.method.base, inference_of(row)][-1]
-            one = race.multiview[row.label]
-            race.watch.time(f"{row.label}/{MULTIVIEW}", waited(one, multiview_device), given)
-            one.note()
-            if row.label in race.staged:
-                race.staged[row.label](given)
-    race.watch.drop(warm_up)
-    for staged in race.staged.values():
-        staged.clock.drop(warm_up)
+    timed, race = TimedCalls(), Race(warm_up)
+    race.times = timed.times
+    parts = {base: parts_of(base, rows) for base in networks if any(row.method.base == base for row in rows)}
+    race.steps = {row.label: MultiviewStep(row, multiview_device) for row in rows if row.method.fusion != ALONE}
+    staged = {row.label: MultiviewStep(row, multiview_device) for row in rows if row.method.fusion == UFM_STAR}
+    for label, step in staged.items():
+        assert isinstance(step.module, UfMStar)
+        race.staged[label] = StagedStep(step.module, multiview_device)
+    for turn, frame in enumerate(timed.frames(frames, warm_up=warm_up)):
+        calls: dict[str, Any] = {}
+        for base, needed in parts.items():
+            given = NetworkInput.of(frame, networks[base], device)
+            race.given.setdefault(base, []).append(given)
+            one = partial(networks[base].predict, x=given.x, intrinsics=given.intrinsics, turn=turn)
+            calls |= {f"{base}/{part}": partial(one, part) for part in needed}
+        predicted = timed.call(calls, device=device)
+        for base, needed in parts.items():
+            for part in needed[1:]:
+                race.predictions.setdefault((base, part), []).append(predicted[f"{base}/{part}"])
+        inputs = {label: race.step_inputs(step.row)[-1] for label, step in race.steps.items()}
+        steps = {f"{label}/{MULTIVIEW}": partial(step, *inputs[label]) for label, step in race.steps.items()}
+        timed.call(steps, device=multiview_device)
+        for step in race.steps.values():
+            step.note()
+        for label, step in staged.items():
+            race.staged[label](*step.arguments(*inputs[label]))
     return race
-
-
-def prepare(contender: Contender, frame: Frame, device: torch.device) -> Prepared:
-    """A frame's image as a network's input.
-
-    Raises:
-        FrameError: it has none.
-    """
-    image = image_tensor(frame).to(device)
-    x, K = contender.preprocess(image, torch.from_numpy(frame.intrinsics)[None].to(device))
-    return Prepared(x, torch.from_numpy(frame.T_world_cam)[None], K)
-
-
-def _run_networks(
-    race: Race, contender: Contender, parts: Sequence[str], frame: Frame, number: int, device: torch.device
-) -> None:
-    base = contender.base
-    prepared = prepare(contender, frame, device)
-    race.prepared.setdefault(base, []).append(prepared)
-    calls: dict[str, Any] = {
-        DEPTH: contender.alone,
-        ONCE: lambda x, K: contender.once(x, number, K),
-        EVERY: contender.every,
-    }
-    for part in _turned(parts, number):
-        synchronize(device)
-        result = race.watch.time(f"{base}/{part}", waited(calls[part], device), prepared.x, prepared.intrinsics)
-        if part != DEPTH:
-            inputs = Inputs(result, prepared.T_world_cam, prepared.intrinsics)
-            race.inputs.setdefault((base, part), []).append(inputs)
-
-
-def _turned(items: Sequence[Any], number: int) -> Sequence[Any]:
-    """In order for even numbers, in reverse for odd ones."""
-    return items if number % 2 == 0 else items[::-1]

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.bench.power import CPU, DRAM, GPU, OTHER, READING_ERRORS, Rail, SensorError, Source
+from ufmstar_torch.eval.bench.energy import CPU, DRAM, GPU, OTHER, READING_ERRORS, Rail, SensorError, Source
 
 # [s] Refresh of the counters: NVML's of a data-centre GPU and RAPL's of a package, both generously, and the interval
 # at which zeus asks a Jetson's power monitor.
@@ -35,18 +35,18 @@ def find_sources(gpu: int | None) -> tuple[list[Source], dict[str, str]]:
     chip, why_no_chip = _try(_chip)
     if chip is not None:
         sources.append(chip if gpu is not None else _without(chip, GPU))
-    there = {rail.part for source in sources for rail in source.rails}
-    if CPU not in there:
-        found, reason = _try(_packages)
-        if found is not None:
-            sources.append(found)
+    known = {rail.part for source in sources for rail in source.rails}
+    if CPU not in known:
+        source, reason = _try(_packages)
+        if source is not None:
+            sources.append(source)
         missing |= dict.fromkeys((CPU, DRAM), _both(reason, why_no_chip))
     if gpu is None:
         missing[GPU] = _UNUSED
-    elif GPU not in there:
-        found, reason = _try(lambda: _graphics(gpu))
-        if found is not None:
-            sources.append(found)
+    elif GPU not in known:
+        source, reason = _try(lambda: _graphics(gpu))
+        if source is not None:
+            sources.append(source)
         missing[GPU] = _both(reason, why_no_chip)
     if any(rail.part == CPU for source in sources for rail in source.rails):
         missing[DRAM] = "the processor has no counter for its memory"
@@ -54,9 +54,9 @@ def find_sources(gpu: int | None) -> tuple[list[Source], dict[str, str]]:
 
 
 def _both(reason: str | None, chip: str | None) -> str:
-    """What zeus says, as one reason."""
-    told = ", ".join(f'"{text}"' for text in (reason, chip) if text)
-    return f"there is no counter of it that zeus can read ({told})"
+    """The messages of zeus as one reason."""
+    messages = ", ".join(f'"{text}"' for text in (reason, chip) if text)
+    return f"there is no counter of it that zeus can read ({messages})"
 
 
 def _try(open_: Callable[[], Source]) -> tuple[Source | None, str | None]:
@@ -70,7 +70,7 @@ def _try(open_: Callable[[], Source]) -> tuple[Source | None, str | None]:
 
 
 def _guarded(call: Callable[[], Any]) -> Any:
-    """What a call into zeus returns.
+    """The result of a call into zeus.
 
     Raises:
         SensorError: the sensor is missing, may not be read, or does not answer.
@@ -80,8 +80,8 @@ def _guarded(call: Callable[[], Any]) -> Any:
     try:
         return call()
     except (ZeusBaseError, ImportError, *READING_ERRORS) as error:
-        told = " ".join(str(error).split()).rstrip(". ")
-        raise SensorError(told or type(error).__name__) from error
+        message = " ".join(str(error).split()).rstrip(". ")
+        raise SensorError(message or type(error).__name__) from error
 
 
 # ---- GPUs ----

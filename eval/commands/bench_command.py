@@ -17,7 +17,7 @@ def read(words: Sequence[str]) -> BenchSettings:
 def main(options: BenchSettings) -> int:
     """Run the benchmark, print its table and write its JSON; the exit code."""
     from ufmstar_torch.eval.bench.benchmark import run_benchmark
-    from ufmstar_torch.eval.bench.benchmark_report import format_report
+    from ufmstar_torch.eval.bench.text import format_report
     from ufmstar_torch.eval.results.files import write_json_atomic
 
     try:

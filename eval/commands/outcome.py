@@ -33,8 +33,7 @@ def measure(outcome: EvalOutcome, threads: int | None = None) -> str | None:
     Raises:
         OSError: the file cannot be written.
     """
-    from ufmstar_torch.eval.bench.efficiency_step import EFFICIENCY, measure_job
-    from ufmstar_torch.eval.bench.measure import Plan
+    from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
 
     if not outcome.job.suite.efficiency or (outcome.job.out / EFFICIENCY).exists():
         return None

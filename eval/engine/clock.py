@@ -22,6 +22,7 @@ class StageTimer:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._ms: dict[str, float] = {}
+        self._lap = time.perf_counter()
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -32,9 +33,16 @@ class StageTimer:
         synchronize(self._device)
         self._ms[name] = self._ms.get(name, 0.0) + 1000 * (time.perf_counter() - started)
 
+    def lap(self, name: str) -> None:
+        """Add the time since the previous lap, or since :meth:`take`, to a stage."""
+        synchronize(self._device)
+        previous, self._lap = self._lap, time.perf_counter()
+        self._ms[name] = self._ms.get(name, 0.0) + 1000 * (self._lap - previous)
+
     def take(self) -> dict[str, float]:
-        """The stages' times [ms]; all stages begin again at 0."""
+        """The stages' times [ms]; all stages begin again at 0, and the next lap begins."""
         taken, self._ms = self._ms, {}
+        self._lap = time.perf_counter()
         return taken
 
 

@@ -2,6 +2,9 @@
 
 A *rail* is one counter: a GPU, a processor package, its memory. It counts joules since some moment, so that a
 window's energy is the difference of two readings. Idle power is measured in the same way while nothing is done.
+
+Counters are refreshed tens of times a second at best, so that a single call cannot be measured. A window repeats one
+part until it is long enough; several windows per part, in alternating order, show how much they differ.
 """
 
 from __future__ import annotations
@@ -9,7 +12,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import cycle
 from queue import Empty
+from typing import Any
+
+import numpy as np
 
 GPU, CPU, DRAM, OTHER = "gpu", "cpu", "dram", "other"
 PARTS = (GPU, CPU, DRAM, OTHER)
@@ -19,6 +26,11 @@ _REFRESHES = 20
 # [W] More than a rail draws. A window that is longer than its counter takes to wrap at this power may have seen it
 # wrap more than once, which no difference of two readings can tell.
 _MOST_WATTS = 1000.0
+# What reading a sensor may end in, beside zeus's own errors: no file, no permission, a helper that does not answer.
+READING_ERRORS: tuple[type[Exception], ...] = (OSError, Empty)
+
+# Repeats a part for at least so many seconds and returns how many frames that were.
+Work = Callable[[float], int]
 
 
 class SensorError(Exception):
@@ -92,7 +104,7 @@ class PowerMeter:
     Args:
         sources: of the rails.
         missing: by part of the machine, why it has no rail.
-        clock: [s] that time windows are told by.
+        clock: [s] of the windows.
 
     Raises:
         ValueError: two rails of one name.
@@ -110,9 +122,9 @@ class PowerMeter:
         names = [rail.name for rail in self.rails]
         if len(set(names)) != len(names):
             raise ValueError(f"rails must have names of their own, got {names}")
-        there = {rail.part for rail in self.rails}
+        measured = {rail.part for rail in self.rails}
         given = dict(missing or {})
-        self.missing = {p: given.get(p, "no sensor") for p in (GPU, CPU, DRAM) if p not in there}
+        self.missing = {p: given.get(p, "no sensor") for p in (GPU, CPU, DRAM) if p not in measured}
 
     @classmethod
     def open(cls, gpu: int | None = None) -> PowerMeter:
@@ -196,5 +208,140 @@ def consumed(rail: Rail, start: float, end: float, seconds: float) -> float:
     return joules
 
 
-# What reading a sensor may end in, beside zeus's own errors: no file, no permission, a helper that does not answer.
-READING_ERRORS: tuple[type[Exception], ...] = (OSError, Empty)
+# ---- energy per frame ----
+
+
+@dataclass(frozen=True)
+class PartEnergy:
+    """Of one part, on the rails of the unit that it runs on; one number per window.
+
+    Attributes:
+        joules: per frame [J], all that the rails counted.
+        net: likewise, less what they count in the same time while the process is idle.
+        seconds: per frame [s].
+        reason: why nothing was measured; the lists are empty then.
+    """
+
+    joules: tuple[float, ...] = ()
+    net: tuple[float, ...] = ()
+    seconds: tuple[float, ...] = ()
+    reason: str | None = None
+
+    def minus(self, other: PartEnergy) -> PartEnergy:
+        """What this part takes beyond another one, window by window."""
+        if self.reason is not None or other.reason is not None:
+            return PartEnergy(reason=self.reason or other.reason)
+        pairs = [(self.joules, other.joules), (self.net, other.net), (self.seconds, other.seconds)]
+        joules, net, seconds = (tuple(a - b for a, b in zip(x, y, strict=True)) for x, y in pairs)
+        return PartEnergy(joules, net, seconds)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: medians and quartiles per frame [mJ], the time that goes with them [s], and power while the part
+        runs [W]; or the reason."""
+        if self.reason is not None:
+            return {"not_measurable": self.reason}
+        figures: dict[str, Any] = {}
+        for name, values in (("gross", self.joules), ("net", self.net)):
+            low, middle, high = (1e3 * float(v) for v in np.percentile(values, (25, 50, 75)))
+            figures[name] = {
+                "millijoules": middle, "q1": low, "q3": high,
+                "seconds": float(np.median(self.seconds)), "watts": _power(values, self.seconds),
+            }  # fmt: skip
+        return {**figures, "windows": len(self.joules)}
+
+
+def _power(joules: Sequence[float], seconds: Sequence[float]) -> float | None:
+    """[W] Energy over time; None where the time that a difference leaves is not positive."""
+    total = sum(seconds)
+    return sum(joules) / total if total > 0 else None
+
+
+def run_windows(
+    meter: PowerMeter,
+    work: Mapping[tuple[str, str], tuple[str, Work]],
+    idle: Mapping[str, float],
+    *,
+    seconds: float,
+    windows: int,
+) -> dict[tuple[str, str], PartEnergy]:
+    """Measure every part.
+
+    Args:
+        meter: the rails.
+        work: by owner and part: the part of the machine whose rails count ("gpu" or "cpu"), and what to repeat.
+        idle: power by rail [W].
+        seconds: that a window lasts, at least [s].
+        windows: per part.
+    """
+    results: dict[tuple[str, str], list[tuple[float, float, float]]] = {key: [] for key in work}
+    reasons = {key: reason for key, (unit, _) in work.items() if (reason := _without_rails(meter, unit)) is not None}
+    measured = [key for key in work if key not in reasons]
+    for turn in range(windows):
+        for key in measured if turn % 2 == 0 else measured[::-1]:
+            unit, repeat = work[key]
+            value = _one(meter, unit, repeat, idle, max(seconds, meter.shortest))
+            if isinstance(value, str):
+                reasons[key] = value
+            else:
+                results[key].append(value)
+    energies: dict[tuple[str, str], PartEnergy] = {}
+    for key, values in results.items():
+        if key in reasons:
+            energies[key] = PartEnergy(reason=reasons[key])
+        else:
+            joules, net, times = zip(*values, strict=True)
+            energies[key] = PartEnergy(joules, net, times)
+    return energies
+
+
+def _without_rails(meter: PowerMeter, unit: str) -> str | None:
+    if meter.names(unit):
+        return None
+    return meter.missing.get(unit, NOT_MEASURABLE)
+
+
+def _one(
+    meter: PowerMeter, unit: str, repeat: Work, idle: Mapping[str, float], seconds: float
+) -> tuple[float, float, float] | str:
+    """Joules, net joules and seconds per frame of one window, or why there are none."""
+    frames: list[int] = []
+    window = meter.measure(lambda: frames.append(repeat(seconds)))
+    for name in meter.names(unit):
+        if name in window.unusable:
+            return window.unusable[name]
+        if name not in idle:
+            return f"the idle power of {name} could not be measured"
+    gross = sum(window.joules[name] for name in meter.names(unit))
+    resting = sum(idle[name] for name in meter.names(unit)) * window.seconds
+    return gross / frames[0], (gross - resting) / frames[0], window.seconds / frames[0]
+
+
+def repeated(
+    calls: Sequence[Callable[[], object]],
+    wait: Callable[[], None],
+    clock: Callable[[], float] = time.perf_counter,
+) -> Work:
+    """Call after call, each waited for as in a robot's loop, over and over until the time is up.
+
+    Args:
+        calls: one per frame.
+        wait: until the device has finished.
+        clock: [s].
+
+    Raises:
+        ValueError: no call.
+    """
+    if not calls:
+        raise ValueError("calls must hold at least one")
+
+    def work(seconds: float) -> int:
+        start, count = clock(), 0
+        for call in cycle(calls):
+            call()
+            wait()
+            count += 1
+            if clock() - start >= seconds:
+                break
+        return count
+
+    return work

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -17,9 +17,8 @@ from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, Preprocess
 
 
-@dataclass(frozen=True)
-class PosedDepth:
-    """One frame of one stream.
+class PosedDepth(NamedTuple):
+    """One frame of one stream: the arguments of a step.
 
     Attributes:
         depth: [1, H, W] float32 [m], 0 where there is none.

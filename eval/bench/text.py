@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ufmstar_torch.eval.bench.benchmark_timing import STAGES
+from ufmstar_torch.eval.bench.timing import STAGES
 
 _COLUMNS = ("median_ms", "p90_ms", "mean_ms", "min_ms", "cpu_median_ms", "cpu_p90_ms", "cpu_mean_ms", "cpu_min_ms")
 
@@ -32,8 +32,8 @@ def format_report(report: Mapping[str, Any]) -> str:
         lines += ["", *_anchors(report["anchors"])]
     lines += ["", f"{'target (for information)':26}{'value':>12}{'target':>12}"]
     for row in report["targets"]:
-        told = {None: "not measured", True: "met", False: "missed"}[row["met"]]
-        lines.append(f"{row['name']:26}{_number(row['value']):>12}{_number(row['target']):>12}  {told}")
+        verdict = {None: "not measured", True: "met", False: "missed"}[row["met"]]
+        lines.append(f"{row['name']:26}{_number(row['value']):>12}{_number(row['target']):>12}  {verdict}")
     return "\n".join(lines)
 
 
@@ -80,8 +80,8 @@ def _long_run(run: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _anchors(found: Mapping[str, Any]) -> list[str]:
-    tracker, step, (height, width) = found["tracker"], found["step"], found["tour"]["size"]
+def _anchors(measured: Mapping[str, Any]) -> list[str]:
+    tracker, step, (height, width) = measured["tracker"], measured["step"], measured["tour"]["size"]
     followed, ratio, extra = tracker["followed"], step["ratio"], step["extra_bytes"]
     rows = {
         "tracker, a frame": tracker["update"],
@@ -92,7 +92,7 @@ def _anchors(found: Mapping[str, Any]) -> list[str]:
     return [
         f"anchors, one thread: {followed['mean']:.0f} corners followed at {width} x {height} ({followed['min']:.0f} to "
         f"{followed['max']:.0f}), {tracker['landmarks']['mean']:.0f} of them triangulated, new ones found in "
-        f"{tracker['refills']:.0%} of {found['frames']} frames",
+        f"{tracker['refills']:.0%} of {measured['frames']} frames",
         f"  {'[ms]':24}{'median':>9}{'90 %':>9}{'mean':>9}{'minimum':>9}{'CPU:':>6}{'median':>9}{'90 %':>9}{'mean':>9}"
         f"{'minimum':>9}",
         *(_anchor_row(name, times) for name, times in rows.items()),

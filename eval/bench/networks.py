@@ -1,4 +1,4 @@
-"""The networks of a base, taken apart: depth alone, one inference with its uncertainty, and all of them."""
+"""The networks of a base in parts: depth alone, one inference with its uncertainty, and all of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.bench.memory import NetworkMemory, tensor_bytes
+from ufmstar_torch.eval.bench.memory import NetworkMemory, weight_bytes
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
@@ -16,15 +16,17 @@ from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDrop
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import DepthOnlyNetwork, UncertaintyNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
-from ufmstar_torch.pipeline import combine
+from ufmstar_torch.pipeline import NetworksInTurn
 from ufmstar_torch.prediction import DepthPrediction, infer
+
+DEPTH, ONCE, EVERY = "depth", "once", "every"
 
 
 class Inseparable(Exception):
-    """What a network spends on depth alone cannot be told from the rest; the message says why."""
+    """A network's share for depth alone cannot be separated from the rest; the message says why."""
 
 
-class Contender:
+class TimedNetwork:
     """The loaded network(s) of a base, on one device and in eval mode.
 
     Args:
@@ -34,6 +36,9 @@ class Contender:
         samples: of "mc_dropout", passes per image of the multi-inference baseline.
 
     Attributes:
+        members: opened.
+        passes: inferences that all members, or all samples, take.
+        preprocess: of the members.
         depth: the network without anything that uncertainty adds: of the first member, a copy.
         why_whole: None, or why ``depth`` is the whole network instead.
 
@@ -49,59 +54,51 @@ class Contender:
             raise ValueError(f"{base}: members must hold at least one network")
         if any(member.preprocess != opened[0].preprocess for member in opened):
             raise ValueError(f"{base}: members must want the same input")
-        self.base, self.label = base, label
-        self.members = tuple(member.eval() for member in opened)
-        self.passes = samples if base == "mc_dropout" else len(self.members)
-        self.preprocess = self.members[0].preprocess
+        self.base, self.label, self.members = base, label, tuple(opened)
+        self._turns = NetworksInTurn(opened, samples=samples if base == "mc_dropout" else None)
+        self.passes, self.preprocess = self._turns.passes, opened[0].preprocess
         self.why_whole: str | None = None
-        self.depth: DepthNetwork = self.members[0]
+        self.depth: DepthNetwork = opened[0]
         try:
-            self.depth = depth_alone(self.members[0])
+            self.depth = depth_alone(opened[0])
         except Inseparable as error:
             self.why_whole = str(error)
 
-    @property
-    def several(self) -> bool:
-        """Whether there is a multi-inference form: several members, or samples."""
-        return self.passes > 1
+    def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
+        """One of the three forms of inference.
 
-    def once(self, x: Tensor, turn: int, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """One inference with its uncertainty, by the member whose turn it is, on an input with its intrinsics."""
-        return self._run(self.members[turn % len(self.members)], x, intrinsics)
-
-    def every(self, x: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """All members, or samples, on the image, one after the other, combined."""
-        return combine([self.once(x, n, intrinsics) for n in range(self.passes)])
-
-    def alone(self, x: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth without uncertainty."""
-        return self._run(self.depth, x, intrinsics)
+        Args:
+            part: "depth" without uncertainty; "once" with it, by the member whose turn it is; "every" member (or
+                sample) one after the other, combined.
+            x: [1, 3, H, W] the networks' input.
+            intrinsics: [1, 3, 3] of the input [px], for networks that take them.
+            turn: number of the image, for "once".
+        """
+        with torch.inference_mode():
+            if part == DEPTH:
+                prediction: DepthPrediction = infer(self.depth, x, intrinsics)
+                return prediction
+            if part == EVERY:
+                return self._turns.every(x, intrinsics)
+            return self._turns.member(x, intrinsics, turn)
 
     def memory(self) -> NetworkMemory | None:
-        """Of depth alone and of the rest, or None where the tensors are not torch's (ONNX Runtime holds them)."""
-        if not tensor_bytes(self.members):
+        """Of depth alone and of the rest, or None where the weights are not torch's tensors (ONNX Runtime's)."""
+        if not weight_bytes(*self.members):
             return None
-        members = [self.depth] if self.base == "depth_only" else self.members
-        return NetworkMemory.of(members, self.depth)
-
-    def _run(self, network: DepthNetwork, x: Tensor, intrinsics: Tensor | None) -> DepthPrediction:
-        with torch.inference_mode():
-            prediction: DepthPrediction = infer(network, x, intrinsics)
-        return prediction
+        return NetworkMemory.of([self.depth] if self.base == "depth_only" else self.members, self.depth)
 
 
-def contenders(networks: Mapping[str, DepthSource]) -> dict[str, Contender]:
-    """The networks of an evaluation by base; ground truth is none, since nothing runs."""
-    return {
-        base: Contender(base, one.networks, one.label, one.passes) for base, one in networks.items() if one.networks
-    }
+def timed_networks(sources: Mapping[str, DepthSource]) -> dict[str, TimedNetwork]:
+    """The networks of an evaluation by base, without ground truth, for which no network runs."""
+    return {b: TimedNetwork(b, one.networks, one.label, one.passes) for b, one in sources.items() if one.networks}
 
 
 def depth_alone(network: DepthNetwork) -> DepthNetwork:
     """A copy of a network without what uncertainty adds: heads, sampling, factors of a BatchEnsemble.
 
     Raises:
-        Inseparable: it is of a kind whose inside is not known here.
+        Inseparable: its kind has no known division.
     """
     if isinstance(network, MonteCarloDropout):
         return depth_alone(network.network)

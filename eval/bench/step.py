@@ -1,0 +1,254 @@
+"""Times of a UfM* step: beside the networks that it accompanies, after a long time in one room, and when compiling."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.util import find_spec
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import torch
+
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.camera import focal_and_centre, relative_pose
+from ufmstar_torch.eval.bench.frames import FrameSource, PosedDepth, RenderedRoom
+from ufmstar_torch.eval.bench.memory import state_memory
+from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls, spread_of_counts
+from ufmstar_torch.models import FastDepth
+from ufmstar_torch.models.fastdepth import MULTIPLE
+
+_RECENT = 20  # frames over which the components in view are averaged
+_PIXELS = 1000  # of the image average
+_COMPILED_STEPS = 3  # the kernels of the fusion meet a mixture from the second on
+_FIRST_STEPS = "import json; from ufmstar_torch.eval.bench.step import first_steps; print(json.dumps(first_steps({})))"
+
+
+def build_up(
+    source: FrameSource, config: UfMStarConfig, *, size: int, in_view: int, history: int, rounds: int
+) -> tuple[UfMStar, list[PosedDepth], int]:
+    """Run until ``in_view`` components are in view (mean of the last 20 frames), at most ``history`` frames.
+
+    Compiled kernels run where they are available, also for a state on which the torch reference is then timed: the two
+    agree to rounding.
+
+    Returns:
+        The module, the ``rounds`` frames that follow, and the number of frames before them.
+
+    Raises:
+        ValueError: the source has not more than ``rounds`` frames.
+    """
+    if source.available is not None and source.available <= rounds:
+        raise ValueError(f"{rounds} frames are timed and some must come before them, there are {source.available}")
+    history = history if source.available is None else min(history, source.available - rounds)
+    ufm = UfMStar(config.replace(backend="auto"))
+    frames = source.frames(size, history + rounds)
+    recent: deque[int] = deque(maxlen=_RECENT)
+    seen = 0
+    for frame in islice(frames, history):
+        ufm(*frame)
+        recent.append(components_in_view(ufm, frame))
+        seen += 1
+        if len(recent) == _RECENT and sum(recent) >= in_view * _RECENT:
+            break
+    return ufm, list(islice(frames, rounds)), seen
+
+
+def measure_step(
+    built: UfMStar,
+    frames: Sequence[PosedDepth],
+    networks: dict[str, Callable[..., Any]],
+    *,
+    backend: str,
+    warm_up: int,
+) -> dict[str, Any]:
+    """Time the whole step, its stages, the image average and the networks, one after the other per frame.
+
+    The whole step, the stages and the average run on copies of one state, so that timing the stages cannot slow the
+    whole. All of them get the same frames, and each follows a network as in use (caches and threads are as the network
+    left them).
+
+    Args:
+        built: the state to start from; not modified.
+        frames: of which the first ``warm_up`` are not counted.
+        networks: forward passes by name, on the arguments of a step; may be empty.
+        backend: "numba" or "torch".
+        warm_up: see ``frames``.
+    """
+    start = copy.deepcopy(built)
+    start.config = built.config.replace(backend=backend)
+    whole, staged, average = copy.deepcopy(start), StagedStep(copy.deepcopy(start)), copy.deepcopy(start)
+    size = frames[0].depth.shape[-1]
+    pixels = min(_PIXELS, size**2)
+    calls: dict[str, Callable[..., Any]] = {
+        "step": whole,
+        "staged": staged,
+        "mean_uncertainty": partial(average.mean_uncertainty, pixels=pixels),
+    }
+    timed = TimedCalls(before=networks)
+    counts = _Counts("components", "segments", "new")
+    for frame in timed.frames(frames, warm_up=warm_up):
+        counts.add(timed.call(calls, *frame)["step"].statistics, whole, frame)
+    times = timed.times
+    pairs = [("step", name) for name in networks] + [("mean_uncertainty", "step")]
+    return {
+        "size": size,
+        "backend": backend,
+        "frames": {"warm_up": warm_up, "timed": len(frames) - warm_up},
+        "counts": {name: spread_of_counts(values[warm_up:]) for name, values in counts.items()},
+        "step": times.spread("step"),
+        "staged_step": times.spread("staged"),
+        **staged.summary(warm_up=warm_up),
+        "mean_uncertainty": {"pixels": pixels, **times.spread("mean_uncertainty")},
+        "networks": {name: times.spread(name) for name in networks},
+        "memory": state_memory(whole),
+        "ratios": {f"{a}/{b}": times.ratio(a, b) for a, b in pairs},
+    }
+
+
+def measure_long_run(
+    source: FrameSource, config: UfMStarConfig, *, size: int, frames: int, early: int = 100, window: int = 100
+) -> dict[str, Any]:
+    """Run ``frames`` steps; compare those around frame ``early`` with the last ones.
+
+    Args:
+        source: of the frames, in one room.
+        config: of UfM*.
+        size: of the depth maps [px].
+        frames: in all.
+        early: the centre of the early window, counted from 1.
+        window: frames per window; a whole turn of the camera, so that both contain all of the room.
+
+    Returns:
+        "ratio" and "cpu_ratio": median time of the last ``window`` steps over the median of the early ones;
+        and a row per ``window`` frames with times and numbers of components.
+
+    Raises:
+        ValueError: the early and the last window would overlap, or the source has fewer frames.
+    """
+    start = max(0, early - window // 2)
+    if frames < start + 2 * window:
+        raise ValueError(f"a long run needs at least {start + 2 * window} frames for two windows, got {frames}")
+    if source.available is not None and source.available < frames:
+        raise ValueError(f"a long run of {frames} frames was asked for, there are {source.available}")
+    ufm, timed, counts = UfMStar(config), TimedCalls(), _Counts("components", "segments", "matched", "new")
+    for frame in timed.frames(source.frames(size, frames)):
+        counts.add(timed.call({"step": ufm}, *frame)["step"].statistics, ufm, frame)
+    wall, cpu = timed.times.wall["step"], timed.times.cpu["step"]
+
+    def at(low: int) -> dict[str, Any]:
+        part = slice(low, low + window)
+        names = ("in_view", "segments", "matched", "new")
+        return {
+            "frames": [low + 1, low + window],
+            "step_median_ms": float(np.median(wall[part])),
+            "step_cpu_median_ms": float(np.median(cpu[part])),
+            "components": counts["components"][part][-1],
+            **{f"{name}_mean": float(np.mean(counts[name][part])) for name in names},
+        }
+
+    first, last = at(start), at(frames - window)
+    return {
+        "size": size,
+        "backend": config.backend,
+        "frames": frames,
+        "early": first,
+        "late": last,
+        "ratio": last["step_median_ms"] / first["step_median_ms"],
+        "cpu_ratio": last["step_cpu_median_ms"] / first["step_cpu_median_ms"],
+        "memory": state_memory(ufm),
+        "rows": [at(low) for low in range(0, frames - window + 1, window)],
+    }
+
+
+def measure_compilation(size: int = 64) -> dict[str, float]:
+    """Seconds of the first steps in a new process: "cold_s" compiles, "warm_s" loads the compiled code from disk.
+
+    "cold_s" and "warm_s" include the first use of torch, which "steady_s", the last step, does not.
+
+    Raises:
+        subprocess.CalledProcessError: the process failed; its messages are on standard error.
+    """
+
+    def fresh_process(cache: str) -> list[float]:
+        command = [sys.executable, "-c", _FIRST_STEPS.format(size)]
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+        return json.loads(done.stdout)
+
+    with tempfile.TemporaryDirectory() as folder:
+        cold, warm = fresh_process(folder), fresh_process(folder)
+    return {"cold_s": sum(cold[:-1]), "warm_s": sum(warm[:-1]), "steady_s": warm[-1]}
+
+
+def first_steps(size: int) -> list[float]:
+    """Times of the first steps of this process [s]."""
+    ufm, timed = UfMStar(), TimedCalls()
+    for frame in timed.frames(RenderedRoom().frames(size, _COMPILED_STEPS)):
+        timed.call({"step": ufm}, *frame)
+    return [1e-3 * ms for ms in timed.times.wall["step"]]
+
+
+class _Counts(dict[str, list[int]]):
+    """Statistics of the steps by name, and "in_view"."""
+
+    def __init__(self, *names: str) -> None:
+        super().__init__({name: [] for name in (*names, "in_view")})
+
+    def add(self, statistics: Any, ufm: UfMStar, frame: PosedDepth) -> None:
+        """Those of one frame, and the components in view after it."""
+        for name, values in self.items():
+            values.append(components_in_view(ufm, frame) if name == "in_view" else int(getattr(statistics, name)))
+
+
+def components_in_view(ufm: UfMStar, frame: PosedDepth) -> int:
+    """Components beyond the near plane whose mean projects inside the frame: the candidates for a match."""
+    mixture = ufm.mixture
+    R, t = relative_pose(ufm.T_world_first, frame.T_world_cam[None])
+    mean = mixture.mean.double() @ R.mT + t[:, None]
+    fx, fy, cx, cy = focal_and_centre(frame.intrinsics)
+    x, y, z = mean.unbind(-1)
+    seen = mixture.valid & (z > ufm.config.near_plane)
+    u, v = fx * x / z + cx, fy * y / z + cy
+    height, width = frame.depth.shape[-2:]
+    return int((seen & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)).sum())
+
+
+def reference_networks(size: int, fastdepth: FastDepth) -> tuple[dict[str, Callable[..., Any]], dict[str, Any]]:
+    """Forward passes to compare with, on a fixed random image, and what they are.
+
+    FastDepth with its batch norms folded, at the nearest size it takes (multiples of 32); torchvision's
+    ResNet50 up to and including layer4, with random weights, where torchvision is installed.
+    """
+    side = max(MULTIPLE, MULTIPLE * round(size / MULTIPLE))
+    calls = {"fastdepth": _forward(fastdepth.folded(), side)}
+    about: dict[str, Any] = {"fastdepth": {"size": side, "parameters": _parameters(fastdepth)}, "resnet50": None}
+    if find_spec("torchvision") is not None:
+        from torchvision.models import resnet50
+
+        encoder = torch.nn.Sequential(*list(resnet50(weights=None).children())[:-2]).eval()
+        calls["resnet50"] = _forward(encoder, size)
+        about["resnet50"] = {"size": size, "parameters": _parameters(encoder)}
+    return calls, about
+
+
+def _forward(network: torch.nn.Module, size: int) -> Callable[..., Any]:
+    image = torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(0))
+
+    def call(*_: object) -> Any:
+        with torch.inference_mode():
+            return network(image)
+
+    return call
+
+
+def _parameters(network: torch.nn.Module) -> int:
+    return sum(p.nelement() for p in network.parameters())

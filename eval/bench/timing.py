@@ -1,0 +1,174 @@
+"""Timed calls in alternating order, the stages of a step, and a fixed number of threads.
+
+Wall-clock times on a machine with other load have a long upper tail: the median and the quartiles, which the tail
+hardly moves, and the minimum are reported. The processor time is what the process itself computed, over all its
+threads (threads that wait by spinning included), without what other processes took.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import cycle
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+
+from ufmstar_torch import UfMStar
+from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synchronize
+
+F = TypeVar("F")
+
+# Every moment of a step belongs to one of these; see ``ufmstar_torch.step.StepObserver``.
+STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
+_KERNELS = ("spgf", "floor_covariance", "correspond", "fuse", "regress_image")
+_CPU = torch.device("cpu")
+
+
+@contextmanager
+def pinned_threads(count: int, *, opencv: bool = False) -> Iterator[None]:
+    """Set the number of threads of torch and numba (where it is installed); restore the previous numbers afterwards.
+
+    Args:
+        count: threads of each.
+        opencv: set OpenCV's number too.
+
+    Raises:
+        ValueError: ``count`` is not positive or more than numba has started.
+        ModuleNotFoundError: ``opencv`` without OpenCV.
+    """
+    if count < 1:
+        raise ValueError(f"threads must be at least 1, got {count}")
+    # torch last: where numba's loops run on OpenMP, setting its number sets torch's as well.
+    libraries: list[tuple[Callable[[], int], Callable[[int], Any]]] = [(torch.get_num_threads, torch.set_num_threads)]
+    if find_spec("numba") is not None:
+        numba: Any = import_module("numba")
+        if count > numba.config.NUMBA_NUM_THREADS:
+            raise ValueError(f"threads must be at most numba's {numba.config.NUMBA_NUM_THREADS}, got {count}")
+        libraries.insert(0, (numba.get_num_threads, numba.set_num_threads))
+    if opencv:
+        cv2: Any = import_module("cv2")
+        libraries.insert(0, (cv2.getNumThreads, cv2.setNumThreads))
+    before = [read() for read, _ in reversed(libraries)][::-1]
+    with ExitStack() as restored:
+        for (_, write), number in reversed(list(zip(libraries, before, strict=True))):
+            restored.callback(write, number)
+        for _, write in libraries:
+            write(count)
+        yield
+
+
+class TimedCalls:
+    """Calls on the same frames, one after the other, each timed.
+
+    On odd frames the order is reversed: no call always follows the same neighbour, and a busy machine slows all calls
+    of a frame alike.
+
+    Args:
+        before: predecessors by name: one of them in turn runs before every call, as a network runs before a
+            step in use, on the same arguments. Each is timed the first time that it runs on a frame.
+
+    Attributes:
+        times: by the names of the calls and of ``before``.
+    """
+
+    def __init__(self, before: Mapping[str, Callable[..., Any]] | None = None) -> None:
+        self.times = CallTimes()
+        self._before = dict(before or {})
+        self._number = 0
+
+    def frames(self, frames: Iterable[F], *, warm_up: int = 0) -> Iterator[F]:
+        """The frames; after the last one, the times of the first ``warm_up`` are dropped."""
+        for number, frame in enumerate(frames):
+            self._number = number
+            yield frame
+        self.times.drop(warm_up)
+
+    def call(self, calls: Mapping[str, Callable[..., Any]], *args: Any, device: torch.device = _CPU) -> dict[str, Any]:
+        """Make every call on the current frame; the results by name.
+
+        Args:
+            calls: by name.
+            args: of every call.
+            device: where the calls compute; it is waited for before and within the timed span.
+        """
+
+        def finished(call: Callable[..., Any]) -> Any:
+            result = call(*args)
+            synchronize(device)
+            return result
+
+        names = list(calls) if self._number % 2 == 0 else list(calls)[::-1]
+        untimed = set(self._before)
+        results = {}
+        for name, previous in zip(names, cycle(self._before or [None]), strict=False):
+            if previous is not None:
+                self._run(previous, previous in untimed, finished, self._before[previous])
+                untimed.discard(previous)
+            synchronize(device)
+            results[name] = self.times.time(name, finished, calls[name])
+        return results
+
+    def _run(self, name: str, timed: bool, finished: Callable[..., Any], call: Callable[..., Any]) -> None:
+        if timed:
+            self.times.time(name, finished, call)
+        else:
+            finished(call)
+
+
+class StagedStep:
+    """UfM* with the times of its steps' stages: the module's observer (``ufmstar_torch.step.StepObserver``).
+
+    The stages are those that the step names; what follows the last one, the output's assembly, belongs to none.
+
+    Args:
+        module: whose ``observer`` it becomes.
+        device: where the module computes; it is waited for at both ends of every stage.
+    """
+
+    def __init__(self, module: UfMStar, device: torch.device = _CPU) -> None:
+        self.module, self._device = module, device
+        self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
+        self.kernels: dict[str, list[float]] = {name: [] for name in _KERNELS}
+        self._stages, self._kernels = StageTimer(device), StageTimer(device)
+        module.observer = self
+
+    def __call__(self, *args: Any) -> Any:
+        """One step of the module."""
+        synchronize(self._device)
+        self._kernels.take()
+        self._stages.take()
+        return self.module(*args)
+
+    def stage(self, name: str) -> None:
+        """A stage has ended; the last one ends the step."""
+        self._stages.lap(name)
+        if name == STAGES[-1]:
+            for kept, ms in ((self.stages, self._stages.take()), (self.kernels, self._kernels.take())):
+                for part, times in kept.items():
+                    times.append(ms.get(part, 0.0))
+
+    def kernel(self, name: str) -> AbstractContextManager[object]:
+        """Around one call of a kernel."""
+        return self._kernels.stage(name)
+
+    def summary(self, *, warm_up: int) -> dict[str, Any]:
+        """Spread of every stage, of every kernel (all its calls in a step), and of the steps' sums.
+
+        Args:
+            warm_up: steps at the beginning that do not count.
+        """
+        return {
+            "stages": {name: spread(times[warm_up:]) for name, times in self.stages.items()},
+            "kernels": {name: spread(times[warm_up:]) for name, times in self.kernels.items()},
+            "stages_total": spread(np.sum(list(self.stages.values()), axis=0)[warm_up:]),
+        }
+
+
+def spread_of_counts(values: Sequence[int]) -> dict[str, float]:
+    """Median, extremes and mean of at least one number."""
+    low, middle, high = (float(v) for v in np.percentile(np.asarray(values, np.float64), (0, 50, 100)))
+    return {"median": middle, "min": low, "max": high, "mean": float(np.mean(values))}
