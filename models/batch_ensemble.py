@@ -144,7 +144,10 @@ class BatchEnsemble(DepthNetwork):
     def forward(self, image: Tensor) -> DepthPrediction:
         """The members' mixture of ``image`` [B, 3, H, W]: mean depth [B, H, W] [m], mean A and the variance
         between the members as E [m^2], from one pass with a batch of N B."""
-        return combine(split_batch(self.distribution(image).prediction(), self.members))
+        prediction = self.distribution(image).prediction()
+        # In training mode a network with heads at several scales has as many blocks of members; the first predicts.
+        blocks = split_batch(prediction, max(self.members, len(prediction.depth) // max(len(image), 1)))
+        return combine(blocks[: self.members])
 
     def member(self, n: int) -> BatchEnsembleMember:
         """Member n as a network, with the weights of this one: nothing is copied.

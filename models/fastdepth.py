@@ -204,20 +204,29 @@ class FastDepth(Backbone):
         self.head.activation = activation()
         nn.init.constant_(_bias(self.head), start)
 
+    @property
+    def pyramid_channels(self) -> tuple[int, ...]:
+        """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
+        return self.widths.decoder[::-1]
+
     def features(self, image: Tensor) -> Tensor:
-        """The decoder's output, from which the head reads depth.
+        """The decoder's output [B, widths.decoder[-1], H, W], from which the head reads depth; as :meth:`pyramid`."""
+        return self.pyramid(image)[0]
+
+    def pyramid(self, image: Tensor) -> list[Tensor]:
+        """The outputs of the decoder's layers, full resolution first.
 
         Args:
             image: [B, 3, H, W] RGB in [0, 1], H and W multiples of 32.
 
         Returns:
-            [B, widths.decoder[-1], H, W].
+            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
 
         Raises:
             ValueError: the image has another shape or type.
         """
         require_image(image, MULTIPLE)
-        x, skips = image, {}
+        x, skips, maps = image, {}, []
         for i, block in enumerate(self.encoder):
             x = block(x)
             if i in _SKIPS.values():
@@ -226,7 +235,8 @@ class FastDepth(Backbone):
             x = F.interpolate(dropout(block(x)), scale_factor=2.0, mode="nearest")
             if i in _SKIPS:
                 x = x + skips[_SKIPS[i]]
-        return x
+            maps.append(x)
+        return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
         """Depth [B, H, W] [m] from :meth:`features`, at least 0 (where a last ReLU cuts off, a pixel has none)."""

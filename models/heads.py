@@ -14,7 +14,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth
+from ufmstar_torch.models.distribution import (
+    DepthDistribution,
+    EvidentialDepth,
+    GaussianDepth,
+    PointDepth,
+    split_batch,
+)
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -37,20 +43,50 @@ class UncertaintyNetwork(DepthNetwork):
 
     Args:
         backbone: whose features and depth are used; its ``preprocess`` is this network's.
+        scales: heads, at full resolution, 1/2, 1/4, ...: as many as 4 in Poggi et al. (2020). Only the first predicts;
+            the coarser ones are there in training mode, where they teach the decoder's inner layers.
+
+    Raises:
+        ValueError: more scales than the backbone has.
     """
 
-    def __init__(self, backbone: Backbone) -> None:
+    outputs = 0  # channels of a head
+
+    def __init__(self, backbone: Backbone, scales: int = 1) -> None:
         super().__init__()
+        channels = backbone.pyramid_channels
+        if not 1 <= scales <= len(channels):
+            raise ValueError(f"scales must be from 1 to {len(channels)} of this backbone, got {scales}")
         self.backbone = backbone
         self.preprocess = backbone.preprocess
+        if self.outputs:
+            self.head = _head(channels[0], self.outputs)
+            if scales > 1:
+                self.coarse = nn.ModuleList(_head(channels[s], self.outputs) for s in range(1, scales))
 
     @abstractmethod
     def distribution(self, image: Tensor) -> DepthDistribution:
-        """The parameters that the losses need, each [B, H, W], of ``image`` [B, 3, H, W]."""
+        """The parameters that the losses need, each [B, H, W], of ``image`` [B, 3, H, W]; in training mode with S
+        scales [S B, H, W], full resolution first, each with the same depth."""
 
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] and the head's variances [m^2] of ``image`` as ``preprocess`` returns it."""
-        return self.distribution(image).prediction()
+        prediction = self.distribution(image).prediction()
+        scales = len(prediction.depth) // max(len(image), 1)
+        return prediction if scales <= 1 else split_batch(prediction, scales)[0]
+
+    def _raw(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Depth [S B, H, W] [m] and the heads' outputs [S B, outputs, H, W], at least in single precision."""
+        coarse = self.coarse if self.training and hasattr(self, "coarse") else ()
+        if not coarse:
+            features = self.backbone.features(image)
+            raw = _single(self.head(features))
+            return _single(self.backbone.depth(features)), raw
+        maps = self.backbone.pyramid(image)
+        raws = [_single(head(x)) for head, x in zip((self.head, *coarse), maps, strict=False)]
+        size = raws[0].shape[-2:]
+        raws = [raws[0], *(F.interpolate(x, size, mode="bilinear", align_corners=False) for x in raws[1:])]
+        return _single(self.backbone.depth(maps[0])).repeat(len(raws), 1, 1), torch.cat(raws)
 
 
 class DepthOnlyNetwork(UncertaintyNetwork):
@@ -64,29 +100,23 @@ class DepthOnlyNetwork(UncertaintyNetwork):
 class AleatoricNetwork(UncertaintyNetwork):
     """Depth and a learned data variance ("Aleatoric")."""
 
-    def __init__(self, backbone: Backbone) -> None:
-        super().__init__(backbone)
-        self.head = _head(backbone, 1)
+    outputs = 1
 
     def distribution(self, image: Tensor) -> GaussianDepth:
         """Depth and log-variance within :data:`LOG_VARIANCE_RANGE`."""
-        features = self.backbone.features(image)
-        log_variance = soft_range(_single(self.head(features)[:, 0]), *LOG_VARIANCE_RANGE)
-        return GaussianDepth(_single(self.backbone.depth(features)), log_variance)
+        depth, raw = self._raw(image)
+        return GaussianDepth(depth, soft_range(raw[:, 0], *LOG_VARIANCE_RANGE))
 
 
 class EvidentialNetwork(UncertaintyNetwork):
     """Depth with learned data and model variance from one inference ("Evidential")."""
 
-    def __init__(self, backbone: Backbone) -> None:
-        super().__init__(backbone)
-        self.head = _head(backbone, 3)
+    outputs = 3
 
     def distribution(self, image: Tensor) -> EvidentialDepth:
         """gamma is the backbone's depth; nu, alpha - 1 and beta are softplus of the head's channels."""
-        features = self.backbone.features(image)
-        nu, alpha, beta = F.softplus(_single(self.head(features))).unbind(1)
-        depth = _single(self.backbone.depth(features))
+        depth, raw = self._raw(image)
+        nu, alpha, beta = F.softplus(raw).unbind(1)
         return EvidentialDepth(depth, nu + EVIDENCE_FLOOR, alpha + (1 + EVIDENCE_FLOOR), beta + BETA_FLOOR)
 
 
@@ -97,15 +127,16 @@ HEADS: dict[str, type[UncertaintyNetwork]] = {
 }
 
 
-def with_head(backbone: Backbone, method: str) -> UncertaintyNetwork:
-    """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential".
+def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
+    """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential"; ``scales`` as in
+    :class:`UncertaintyNetwork`.
 
     Raises:
-        ValueError: another method.
+        ValueError: another method, or more scales than the backbone has.
     """
     if method not in HEADS:
         raise ValueError(f"method must be one of {list(HEADS)}, got {method!r}")
-    return HEADS[method](backbone)
+    return HEADS[method](backbone, scales)
 
 
 def soft_range(x: Tensor, low: float, high: float) -> Tensor:
@@ -118,9 +149,9 @@ def soft_range(x: Tensor, low: float, high: float) -> Tensor:
     return high - F.softplus(high - x)
 
 
-def _head(backbone: Backbone, outputs: int) -> nn.Conv2d:
+def _head(inputs: int, outputs: int) -> nn.Conv2d:
     """A 3x3 convolution that starts near 0, whatever features a trained backbone has; members still differ."""
-    head = nn.Conv2d(backbone.feature_channels, outputs, 3, padding=1)
+    head = nn.Conv2d(inputs, outputs, 3, padding=1)
     assert head.bias is not None
     with torch.no_grad():
         head.weight.mul_(HEAD_SCALE)

@@ -84,7 +84,8 @@ class UpConvolution(nn.Module):
         super().__init__()
         self.before = _convolution(inputs, outputs)
         self.after = _convolution(outputs + skip, outputs)
-        self.between, self.dropout = DecoderDropout(between), DecoderDropout(dropout)
+        self.between = DecoderDropout(between) if between else nn.Identity()
+        self.dropout = DecoderDropout(dropout)
 
     def forward(self, x: Tensor, skip: Tensor | None) -> Tensor:
         x = F.interpolate(self.between(F.elu(self.before(x))), scale_factor=2.0, mode="nearest")
@@ -129,7 +130,7 @@ class MonodepthResNet(Backbone):
             raise ValueError(f"size must be multiples of {MULTIPLE} px, at least {SMALLEST}, got {size}")
         self.layers, self.strides = layers, strides
         self.preprocess = Preprocess.nyu(size, mean=IMAGENET_MEAN, std=IMAGENET_STD)
-        self.feature_channels = decoder[0]
+        self.feature_channels, self._widths = decoder[0], tuple(decoder)
         self.encoder = ResNetEncoder(layers, strides)
         skips = (0, *self.encoder.channels[:-1])  # of levels 0 to 4
         inputs = (*decoder[1:], self.encoder.channels[-1])
@@ -142,24 +143,34 @@ class MonodepthResNet(Backbone):
         assert self.head.bias is not None
         nn.init.constant_(self.head.bias, math.log(math.expm1(INITIAL_DEPTH)))
 
+    @property
+    def pyramid_channels(self) -> tuple[int, ...]:
+        """Of full resolution, 1/2, 1/4, 1/8 and 1/16."""
+        return self._widths
+
     def features(self, image: Tensor) -> Tensor:
-        """The decoder's output, from which the head reads depth.
+        """The decoder's output [B, decoder[0], H, W], from which the head reads depth; as :meth:`pyramid`."""
+        return self.pyramid(image)[0]
+
+    def pyramid(self, image: Tensor) -> list[Tensor]:
+        """The outputs of the decoder's levels, full resolution first.
 
         Args:
             image: [B, 3, H, W] normalised as ``preprocess`` does; H and W multiples of 32, at least 64.
 
         Returns:
-            [B, decoder[0], H, W].
+            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
 
         Raises:
             ValueError: the image has another shape or type.
         """
         require_image(image, MULTIPLE, SMALLEST)
         skips = self.encoder(image)
-        x = skips.pop()
+        x, maps = skips.pop(), []
         for level in reversed(self.levels):
             x = level(x, skips.pop() if skips else None)
-        return x
+            maps.append(x)
+        return maps[::-1]
 
     def depth(self, features: Tensor) -> Tensor:
         """Depth [B, H, W] [m] from :meth:`features`: a 3x3 convolution and softplus, hence positive."""

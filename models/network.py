@@ -39,6 +39,15 @@ class Backbone(DepthNetwork):
 
     feature_channels: int
 
+    @property
+    def pyramid_channels(self) -> tuple[int, ...]:
+        """Channels of the maps of :meth:`pyramid`."""
+        return (self.feature_channels,)
+
+    def pyramid(self, image: Tensor) -> list[Tensor]:
+        """The decoder's features by scale: [B, pyramid_channels[s], H / 2^s, W / 2^s], :meth:`features` first."""
+        return [self.features(image)]
+
     @abstractmethod
     def features(self, image: Tensor) -> Tensor:
         """The decoder's last features [B, feature_channels, H, W] at the resolution of ``image`` [B, 3, H, W]."""

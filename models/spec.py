@@ -36,6 +36,7 @@ class NetworkSpec(Checked):
         strides: of monodepth2's ResNet: "v1" (in a bottleneck's first convolution) or "v1.5" (in its second).
         dropout: [1] share of the decoder's features that are dropped in training (and where "mc_dropout" samples).
         dropout_both: dropout after both convolutions of a decoder's level instead of the second only.
+        head_scales: of the head of a variance: 1, or 4 in training as in Poggi et al. (2020).
         members: of "batch_ensemble"; 1 for every other method.
         size: (height, width) [px] of the input, multiples of 32.
         preprocess: how a camera image comes to that size: "nyu" (the centre crop of NYU's validation)
@@ -54,6 +55,7 @@ class NetworkSpec(Checked):
     strides: str = choice("v1.5", "v1")
     dropout: float = number(0.0, "p", "1", 0.0, 1.0, open_high=True)
     dropout_both: bool = False
+    head_scales: int = choice(1, 4)
     members: int = number(1, "N", "networks", 1)
     size: tuple[int, int] = (224, 224)
     preprocess: str = choice("nyu", "resize")
@@ -124,7 +126,7 @@ def build_network(
         init, std: how the factors of a "batch_ensemble" begin; see ``convert``.
     """
     backbone = build_backbone(spec) if backbone is None else backbone
-    network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric")
+    network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric", spec.head_scales)
     several = spec.method == "batch_ensemble"
     return BatchEnsemble(network, spec.members, init=init, std=std) if several else network
 

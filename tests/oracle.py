@@ -238,11 +238,25 @@ def dense(mixture_cam, depth, valid, K, **prior):
     return out
 
 
+def compared_share(mixture_cam, depth, valid, K, **prior):
+    """Share of every valid pixel's M from components seen at least twice, NaN elsewhere."""
+    out = np.full(depth.shape, np.nan)
+    mixture = prepared([{**g, "features": np.array([float(g["count"] > 1)])} for g in mixture_cam])
+    for v, u in np.argwhere(valid):
+        d = depth[v, u]
+        x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
+        out[v, u] = regress_point(x, mixture, **prior)[1][0] if mixture else 0.0
+    return out
+
+
 class Oracle:
     """The whole algorithm for one stream."""
 
     def __init__(self, spgf, *, eta=0.5, eta_occl=0.7, near=0.05, prior_weight=1.0, prior_mean=0.0,
-                 alpha=0.5, overlap_weighted=False, neighbourhood=None, disagreement="w2"):  # fmt: skip
+                 alpha=0.5, overlap_weighted=False, neighbourhood=None, disagreement="w2",
+                 unmeasured="paper", unmeasured_relative=0.1):  # fmt: skip
+        self.unmeasured, self.unmeasured_relative = unmeasured, unmeasured_relative
+        self.share = None
         self.disagreement = disagreement
         self.spgf, self.eta, self.eta_occl, self.near = spgf, eta, eta_occl, near
         self.prior = {"prior_weight": prior_weight, "prior_mean": prior_mean, "neighbourhood": neighbourhood}
@@ -251,7 +265,7 @@ class Oracle:
         self.matches = []
 
     def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None, features=None):
-        valid = np.isfinite(depth) & (depth > 0)
+        valid = np.isfinite(depth) & (depth > 0) & (depth <= self.spgf.settings.max_depth)
         if self.T_first is None:
             self.T_first = T_world_cam
         current = segment(np.where(valid, depth, 0.0), K, self.spgf, valid=valid, features=features)
@@ -278,12 +292,20 @@ class Oracle:
             distances=distances,
         )
         mixture_cam = [transform(g, *to_cam) for g in self.mixture]
+        self.share = compared_share(mixture_cam, depth, valid, K, **self.prior)
+        if self.unmeasured == "prior":
+            mixture_cam = [g if g["count"] > 1 else {**g, "m": self.prior["prior_mean"]} for g in mixture_cam]
         M = dense(mixture_cam, depth, valid, K, **self.prior)
+        if self.unmeasured == "relative":
+            M = M + (1 - self.share) * (self.unmeasured_relative * depth) ** 2
+        if self.unmeasured == "nan":
+            M = np.where(self.share < 0.5, np.nan, M)
+        here = ~np.isnan(M)
         if self.smoothed is not None:
             both = (1 - self.alpha) * self.smoothed + self.alpha * M
             M = np.where(np.isnan(M), self.smoothed, np.where(np.isnan(self.smoothed), M, both))
         self.smoothed = M
-        M = np.where(valid, M, np.nan)
+        M = np.where(here, M, np.nan)
         V = M + (0 if aleatoric is None else aleatoric) + (0 if epistemic is None else epistemic)
         return V, M
 

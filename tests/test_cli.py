@@ -19,6 +19,7 @@ from runs import Brightness, outputs, read_summary
 from shared_data import require_shared
 
 from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
+from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.engine import load as sources
 from ufmstar_torch.eval.results import writers
 from ufmstar_torch.models import Preprocess
@@ -264,6 +265,14 @@ def test_settings_from_file_and_words(ufmstar, path, tmp_path):
     assert settings["ufm"]["segment"] == expected
     lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
     assert [line["index"] for line in lines] == [1, 3]
+
+
+def test_the_papers_settings_by_name():
+    words = ["walk", "--depth", "self", "--out", "out", "--ufm-preset", "paper", "--ufm.eta", "0.4"]
+    assert read(words).config == UfMStarConfig.paper().replace(eta=0.4, on_bad_frame="skip")
+    assert read([*words, "--ufm.segment.min_rows", "8"]).config.segment.min_rows == 8
+    mixed = read([*words, "--preset", "tum"]).config
+    assert (mixed.segment, mixed.regression) == (SPGFConfig.preset("tum"), "neighbourhood")
 
 
 def test_the_settings_in_a_summary_are_a_configuration_file(ufmstar, path, tmp_path):

@@ -29,6 +29,7 @@ from ufmstar_torch.models.heads import (
     soft_range,
     with_head,
 )
+from ufmstar_torch.models.monodepth2 import MonodepthResNet
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 LOW, HIGH = LOG_VARIANCE_RANGE
@@ -232,3 +233,36 @@ def test_with_head() -> None:
         assert isinstance(network, UncertaintyNetwork)
     with pytest.raises(ValueError, match=r"method must be one of \['depth', 'aleatoric', 'evidential'\], got 'mc'"):
         with_head(backbone, "mc")
+
+
+@pytest.mark.parametrize(("method", "size"), [("aleatoric", 8_656), ("evidential", 25_968)])
+def test_heads_at_four_scales_as_the_paper_has_them(method: str, size: int) -> None:
+    """8.7 and 26 kB on ResNet50-Monodepth2's decoder (.01 and .03 MB in the paper), instead of .58 and 1.7 kB."""
+    backbone = MonodepthResNet(18)
+    for scales, expected in ((4, size), (1, {"aleatoric": 580, "evidential": 1_740}[method])):
+        parameters = with_head(backbone, method, scales).named_parameters()
+        assert sum(p.nbytes for name, p in parameters if not name.startswith("backbone")) == expected
+
+
+@pytest.mark.parametrize("method", ["aleatoric", "evidential"])
+def test_coarse_heads_learn_and_do_not_predict(method: str) -> None:
+    """In training four predictions per image with one depth; in eval mode the network with one head, to the bit."""
+    network = with_head(small_network(), method, 4)
+    single = with_head(network.backbone, method).eval()
+    single.head.load_state_dict(network.head.state_dict())
+    x = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    network.train()
+    network.backbone.eval()
+    told = network.distribution(x)
+    assert told.depth.shape == (8, 64, 64)
+    assert torch.equal(told.depth[:2], told.depth[6:])
+    told.prediction().variance.sum().backward()
+    heads = {name: p for name, p in network.named_parameters() if not name.startswith("backbone")}
+    assert len(heads) == 8
+    assert all(p.grad is not None and p.grad.any() for p in heads.values())
+    assert network(x).depth.shape == (2, 64, 64)
+    network.eval()
+    assert torch.equal(network(x).variance, single(x).variance)
+    assert torch.equal(network(x).depth, single(x).depth)
+    with pytest.raises(ValueError, match="scales must be from 1 to 5 of this backbone, got 6"):
+        with_head(small_network(), method, 6)

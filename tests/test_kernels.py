@@ -61,6 +61,10 @@ def test_floor_covariance():
     torch.testing.assert_close(
         fuse_cpu.floor_covariance(cov, floor), gaussian.floor_covariance(cov, floor), rtol=0, atol=1e-15
     )
+    least = torch.linalg.eigvalsh(cov)[..., 0]
+    for share in (0.5, 1 - 1e-6, 1 + 1e-6, 2.0):  # unchanged to the last bit below the least eigenvalue, and only there
+        lifted = fuse_cpu.floor_covariance(cov, share * least)
+        assert (lifted == cov).all(-1).all(-1).eq(share < 1).all()
     zero = torch.zeros(1, 3, 3, dtype=torch.float64)
     lifted = fuse_cpu.floor_covariance(zero, torch.tensor([1e-6], dtype=torch.float64))
     torch.testing.assert_close(lifted[0], 1e-6 * torch.eye(3, dtype=torch.float64), rtol=1e-12, atol=0)

@@ -89,19 +89,48 @@ def test_the_kernel_agrees_with_the_reference(config, dtype, tolerance):
     torch.testing.assert_close(fast.features.double(), reference.features, rtol=0, atol=tolerance, equal_nan=True)
 
 
-@pytest.mark.parametrize("epsilon", [0.5, 1e-2, 1e-6])
-def test_culling_keeps_its_bound(monkeypatch, epsilon):
-    m = mixture(1, 60, 5)
-    config = UfMStarConfig(prior_mean=0.7)
+def crowded(seed: int):
+    """300 Gaussians about the surface of ``rendered(2)`` and behind the camera, many of them thin, and its depth."""
     depth = rendered(2)
+    m = mixture(1, 300, seed, empty=3)
+    generator = torch.Generator().manual_seed(seed)
+    surface = unproject(depth.nan_to_num(1.0), K).flatten(1, 2)
+    near = surface[:, torch.randint(surface.shape[1], (300,), generator=generator)]
+    sign = 1 - 2 * (torch.arange(300) % 10 == 0).double()[:, None]
+    scale = 10 ** (-3 * torch.rand(300, generator=generator, dtype=torch.float64))
+    return m.replace(mean=near * sign, covariance=m.covariance * scale[:, None, None]), depth
+
+
+@pytest.mark.parametrize("weight", [1.0, 1e-3, 1e3])
+@pytest.mark.parametrize("epsilon", [0.5, 1e-2, 1e-6])
+def test_culling_keeps_its_bound(monkeypatch, epsilon, weight):
+    m, depth = crowded(5)
+    config = UfMStarConfig(prior_mean=0.7, prior_weight=weight)
     exact = regress_image(m, depth, K, depth > 0, config).disagreement
     monkeypatch.setitem(regress_cpu.EPSILON, torch.float64, epsilon)
-    error = (
-        (regress_cpu.regress_image(m, depth, K, depth > 0, config).disagreement - exact).abs().nan_to_num().max().item()
-    )
-    assert error <= 2 * epsilon * max(m.disagreement.max().item(), 0.7)
-    if epsilon == 0.5:
-        assert error > 1e-9  # something was left out, or the test tests nothing
+    error = (regress_cpu.regress_image(m, depth, K, depth > 0, config).disagreement - exact).abs().nan_to_num()
+    greatest = max(m.disagreement.max().item(), 0.7)
+    assert error.max() <= epsilon * greatest
+    points = unproject(depth, K).flatten(1, 2).nan_to_num(1.0)
+    share = shares(m, points, config)
+    unexplained = (share.amax(-1) <= 1e-3 * (1 - share.sum(-1))).view(depth.shape)
+    assert error[unexplained].max() <= 1e-3 * epsilon * greatest
+    if epsilon == 0.5 and weight == 1e3:
+        assert error.max() > 1e-9, "or nothing was left out, and the test tests nothing"
+
+
+@pytest.mark.parametrize("size", [(40, 56), (33, 41), (7, 3)])
+def test_the_kernel_agrees_on_images_of_any_size_and_with_holes(size):
+    m, depth = crowded(6)
+    depth = depth[:, : size[0], : size[1]].contiguous()
+    valid = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) > 0.4
+    valid[:, :9, 16:32] = False  # whole tiles
+    valid &= depth > 0
+    reference = regress_image(m, depth, K, valid, EXACT).disagreement
+    fast = regress_cpu.regress_image(m, depth, K, valid, EXACT).disagreement
+    torch.testing.assert_close(fast, reference, rtol=0, atol=1e-10, equal_nan=True)
+    single = regress_cpu.regress_image(m, depth.float(), K, valid, EXACT).disagreement
+    torch.testing.assert_close(single.double(), reference, rtol=0, atol=1e-4, equal_nan=True)
 
 
 @pytest.mark.parametrize("config", [EXACT, NEAR], ids=["exact", "neighbourhood"])

@@ -133,7 +133,8 @@ PRESETS: dict[str, Recipe] = {
 
 _SOURCES = """From the paper (Section V-A): method, members, size, epochs, decay, dropout, Adam's betas (.9, .999), and
 the ResNet50 encoder's start from ImageNet (--init imagenet). Ours, since the paper does not state them: batch,
-learning rate and its schedule; one head at full resolution; dropout after the second convolution of a level
+learning rate and its schedule; one head at full resolution (--network.head_scales 4:
+four, as Poggi et al.); dropout after the second convolution of a level
 (--network.dropout_both true: after both); every image trains all members of a BatchEnsemble (--split-batch true: one
 each, with --batch-size 10 or more). fastdepth ends in a ReLU as published; --network.positive softplus is ours and
 better from scratch. The preset demo is ours."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.arguments import require_float, require_mask
-from ufmstar_torch.camera import nearest_rotation, rotation_deviation
+from ufmstar_torch.camera import focal_and_centre, nearest_rotation, rotation_deviation
 
 # Index = code. Each text finishes the sentence "stream b: ...".
 FRAME_FAULTS = (
@@ -25,7 +25,16 @@ FRAME_FAULTS = (
     "pose has a reflection (negative determinant); expected a rotation",
     "intrinsics hold NaN or infinity; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
     "intrinsics are not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0",
+    "pose lies farther from the origin than 1e9 m",
+    "intrinsics have a focal length outside [0.01, 1e7] px",
+    "intrinsics have their principal point outside the depth map; expected the intrinsics of the depth map, not those "
+    "of an image of another size (ufmstar_torch.resize_intrinsics)",
 )
+# What is accepted. Within these ranges nothing that the algorithm squares or divides by leaves float32.
+DEPTH_RANGE = (1e-6, 1e6)  # [m]
+LARGEST = 1e12  # A and E [m^2], and entries of features
+FOCAL_RANGE = (1e-2, 1e7)  # [px]
+FARTHEST = 1e9  # [m] any coordinate of a camera
 
 
 @dataclass(frozen=True)
@@ -38,8 +47,10 @@ class FrameInput:
         intrinsics: [B, 3, 3] float64 [px]; a harmless camera if faulty.
         aleatoric, epistemic: [B, H, W] [m^2] in the depth's dtype, or None.
         features: [B, F, H, W] or None.
-        valid: [B, H, W] True where depth is finite and positive, A and E are finite and not negative,
-            features are finite, the caller's mask agrees and the stream has no fault.
+        valid: [B, H, W] True where depth lies in ``DEPTH_RANGE`` and not beyond the largest depth, A and E in
+            [0, ``LARGEST``], features in +-``LARGEST``, the caller's mask agrees and the stream has no fault.
+        beyond: [B] pixels of the mask with a finite depth beyond the largest one.
+        out_of_range: [B] further pixels of the mask with a finite positive depth that are not valid.
         fault: [B] int64 index into ``FRAME_FAULTS``, 0 = fine.
         rotation_deviation: [B] float64 max |R^T R - I| of the pose as given.
     """
@@ -53,6 +64,8 @@ class FrameInput:
     valid: Tensor
     fault: Tensor
     rotation_deviation: Tensor
+    beyond: Tensor
+    out_of_range: Tensor
 
     @property
     def size(self) -> tuple[int, int]:
@@ -71,8 +84,14 @@ def check_frame(
     *,
     feature_count: int,
     rotation_tolerance: float,
+    max_depth: float = DEPTH_RANGE[1],
 ) -> FrameInput:
     """Check and normalise one frame (shapes as in :meth:`ufmstar_torch.UfMStar.forward`).
+
+    Args:
+        feature_count: F.
+        rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix.
+        max_depth: farther pixels are not valid [m].
 
     Raises:
         TypeError: an argument is no tensor or has the wrong kind of dtype.
@@ -95,21 +114,27 @@ def check_frame(
     T = _matrix("pose", pose, 4, plain)
     K = _matrix("intrinsics", intrinsics, 3, plain)
     deviation = rotation_deviation(T[..., :3, :3])
-    fault = _first(_pose_fault(T, deviation, rotation_tolerance), _intrinsics_fault(K), plain.device)
+    fault = _first(_pose_fault(T, deviation, rotation_tolerance), _intrinsics_fault(K, shape[-2:]), plain.device)
     fine = fault == 0
 
-    use = (plain > 0) & (plain < torch.inf) & fine[:, None, None]  # NaN is neither
-    for variance in (a, e):
-        if variance is not None:
-            use = use & variance.detach().isfinite() & (variance.detach() >= 0)
-    if extra is not None:
-        use = use & extra.isfinite().all(1)
+    given = (plain > 0) & (plain < torch.inf) & fine[:, None, None]  # NaN is neither
     if valid is not None:
         either = [*shapes, (shape[0], 1, *shape[-2:])]
-        use = use & require_mask("valid", valid, either, depth).reshape(plain.shape)
+        given = given & require_mask("valid", valid, either, depth).reshape(plain.shape)
+    beyond = given & (plain > max_depth)
+    near = given & ~beyond
+    use = near & (plain >= DEPTH_RANGE[0]) & (plain <= DEPTH_RANGE[1])
+    for variance in (a, e):
+        if variance is not None:
+            use = use & (variance.detach() >= 0) & (variance.detach() <= LARGEST)
+    if extra is not None:
+        use = use & (extra.abs() <= LARGEST).all(1)
     T_safe, K_safe = _harmless(_moved(T, plain.device), _moved(K, plain.device), fine)
     safe_depth = torch.where(use, plain, torch.zeros_like(plain))
-    return FrameInput(safe_depth, T_safe, K_safe, a, e, extra, use, fault, _moved(deviation, plain.device))
+    return FrameInput(
+        safe_depth, T_safe, K_safe, a, e, extra, use, fault, _moved(deviation, plain.device),
+        beyond.sum((1, 2)), (near & ~use).sum((1, 2)),
+    )  # fmt: skip
 
 
 def raise_faults(faults: Sequence[int]) -> None:
@@ -151,7 +176,7 @@ def _moved(value: Tensor, device: torch.device) -> Tensor:
 
 
 def _pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
-    """[B] codes 1 to 4, on the pose's own device."""
+    """[B] codes 1 to 4 and 7, on the pose's own device."""
     zero = torch.zeros((), dtype=T.dtype, device=T.device)
     last = torch.stack([zero, zero, zero, zero + 1])
     checks = [
@@ -160,20 +185,26 @@ def _pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
         deviation > tolerance,
         (torch.linalg.cross(T[:, 0, :3], T[:, 1, :3]) * T[:, 2, :3]).sum(-1) < 0,  # the determinant
     ]
-    return _code(checks, start=1)
+    far = T[:, :3, 3].abs().amax(-1) > FARTHEST
+    return _code({**dict(enumerate(checks, start=1)), 7: far})
 
 
-def _intrinsics_fault(K: Tensor) -> Tensor:
-    """[B] codes 5 and 6, on the intrinsics' own device."""
+def _intrinsics_fault(K: Tensor, size: tuple[int, ...]) -> Tensor:
+    """[B] codes 5, 6, 8 and 9 for a depth map of ``size`` (H, W), on the intrinsics' own device."""
     off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
     shape = (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0)
-    return _code([~K.isfinite().all((-2, -1)), shape], start=5)
+    fx, fy, cx, cy = focal_and_centre(K)
+    low, high = FOCAL_RANGE
+    focal = (torch.minimum(fx, fy) < low) | (torch.maximum(fx, fy) > high)
+    outside = (torch.minimum(cx, cy) < -0.5) | (cx > size[1] - 0.5) | (cy > size[0] - 0.5)
+    return _code({5: ~K.isfinite().all((-2, -1)), 6: shape, 8: focal, 9: outside})
 
 
-def _code(checks: list[Tensor], start: int) -> Tensor:
+def _code(checks: dict[int, Tensor]) -> Tensor:
     """The number of the first check that is True, 0 for none."""
-    fault = torch.zeros(checks[0].shape, dtype=torch.int64, device=checks[0].device)
-    for code, bad in reversed(list(enumerate(checks, start=start))):
+    some = next(iter(checks.values()))
+    fault = torch.zeros(some.shape, dtype=torch.int64, device=some.device)
+    for code, bad in reversed(checks.items()):
         fault = torch.where(bad, torch.full_like(fault, code), fault)
     return fault
 

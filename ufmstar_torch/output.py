@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from torch import Tensor
 
 from ufmstar_torch.mixture import GaussianMixture
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrameStatistics:
     """What happened to one frame, per stream [B].
 
@@ -21,6 +21,11 @@ class FrameStatistics:
         new: segments appended to the mixture.
         dropped: segments not remembered: ``max_components`` was reached, or nearer than the near plane.
         valid_pixels: pixels used.
+        beyond: pixels not used because their depth is beyond ``config.segment.max_depth``.
+        out_of_range: further pixels with a finite positive depth that are not used: depth, A, E or features outside the
+            ranges that ``UfMStar.forward`` states.
+        unmeasured: of the pixels used (with a subset, of those regressed), where M rests by less than half on surfaces
+            seen from two views or more; what they get is ``config.unmeasured``.
         fault: index into ``ufmstar_torch.frame.FRAME_FAULTS``; not 0 = the frame was skipped.
         rotation_deviation: max |R^T R - I| of the pose, removed by projection onto SO(3).
         anchors: given and usable; 0 for a standing camera, say.
@@ -35,13 +40,22 @@ class FrameStatistics:
     new: Tensor
     dropped: Tensor
     valid_pixels: Tensor
+    beyond: Tensor
+    out_of_range: Tensor
+    unmeasured: Tensor
     fault: Tensor
     rotation_deviation: Tensor
     anchors: Tensor
     anchors_used: Tensor
 
+    def __repr__(self) -> str:
+        """The counts of every stream that are not 0, in a line."""
+        counts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rotation_deviation"}
+        shown = [f"{name}={_short(value)}" for name, value in counts.items() if _any(value)]
+        return f"FrameStatistics({', '.join(shown)})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class StepOutput:
     """The regressed disagreement and what led to it.
 
@@ -50,6 +64,7 @@ class StepOutput:
         features: regressed features [B, H, W, F] or [B, n, F].
         residual: [B, H, W, 2] or [B, n, 2] from anchors, the mean relative error r and mean square excess e expected at
             each pixel (``anchors.evidence``); None unless ``config.anchored``.
+        measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two views or more.
         labels: [B, H, W] int64 the segment of every pixel, -1 = none.
         current_cam: C_i in the camera frame.
         statistics: of this frame.
@@ -58,12 +73,17 @@ class StepOutput:
     disagreement: Tensor
     features: Tensor
     residual: Tensor | None
+    measured: Tensor
     labels: Tensor
     current_cam: GaussianMixture
     statistics: FrameStatistics
 
+    def __repr__(self) -> str:
+        """Shape and counts in a line."""
+        return f"StepOutput({_size(self.disagreement)}, {self.statistics!r})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class UfMStarOutput:
     """The prediction of one frame with its variance. Maps have the layout in which ``depth`` was given.
 
@@ -77,6 +97,8 @@ class UfMStarOutput:
             ``config.anchored``.
         bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchored``.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
+        measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
+            counts as not measured (``config.unmeasured``). NaN where not valid.
         valid: True where the pixel was used.
         labels: [B, H, W] the pixel's segment in ``current_cam``, -1 = none.
         current_cam: C_i, the segments of this frame in the camera frame, float64.
@@ -91,10 +113,16 @@ class UfMStarOutput:
     anchored: Tensor | None
     bias: Tensor | None
     features: Tensor
+    measured: Tensor
     valid: Tensor
     labels: Tensor
     current_cam: GaussianMixture
     statistics: FrameStatistics
+
+    def __repr__(self) -> str:
+        """Shape, median standard deviation and counts in a line."""
+        std = "" if self.variance.device.type == "meta" else f", median std {float(self.std.nanmedian()):.3g} m"
+        return f"UfMStarOutput({_size(self.variance)}{std}, {self.statistics!r})"
 
     @property
     def std(self) -> Tensor:
@@ -115,7 +143,7 @@ class UfMStarOutput:
         return self.depth * (1 + self.bias), self.variance - self.anchored + remaining
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class MeanUncertainty:
     """An image average of the total variance from a sample of pixels, per stream [B].
 
@@ -131,3 +159,23 @@ class MeanUncertainty:
     standard_error: Tensor
     pixels: Tensor
     statistics: FrameStatistics
+
+    def __repr__(self) -> str:
+        """Means, errors and counts in a line."""
+        return f"MeanUncertainty(mean={_short(self.mean)} m^2, pixels={_short(self.pixels)}, {self.statistics!r})"
+
+
+def _size(value: Tensor) -> str:
+    return " x ".join(map(str, value.shape))
+
+
+def _any(value: Tensor) -> bool:
+    return value.device.type == "meta" or bool(value.any())
+
+
+def _short(value: Tensor) -> str:
+    """The values of at most four streams."""
+    if value.device.type == "meta":
+        return "?"
+    texts = [f"{x:.4g}" if value.is_floating_point() else str(x) for x in value[:4].tolist()]
+    return texts[0] if len(value) == 1 else f"[{', '.join(texts)}{', ...' if len(value) > 4 else ''}]"

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from ufmstar_torch import correspond, fuse, gaussian, regress, segment
+from ufmstar_torch import correspond, fuse, gaussian, regress, segment, unmeasured
 from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
@@ -233,9 +233,12 @@ def step(
         Evidence(state.evidence, state.overall_evidence), mixture.to(torch.float64).rigid(R_cam, t_cam),
         frame, anchors, config, kernels.distribute,
     )  # fmt: skip
+    mixture_cam = unmeasured.before_regression(mixture_cam, config)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
+    chosen = frame.depth if pixels is None else torch.gather(frame.depth.flatten(1), 1, pixels)
+    result, measured = unmeasured.after_regression(result, chosen, config)
     result, residual = after_regression(result, stream)
     stage("regress")
 
@@ -252,6 +255,9 @@ def step(
         new=new.sum(1) - dropped,
         dropped=dropped + (current_cam.valid & ~far_enough).sum(1),
         valid_pixels=frame.valid.sum((1, 2)),
+        beyond=frame.beyond,
+        out_of_range=frame.out_of_range,
+        unmeasured=(measured < unmeasured.HALF).flatten(1).sum(1),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
         anchors=torch.zeros_like(used) if anchors is None else anchors.valid.sum(1),
@@ -268,7 +274,7 @@ def step(
         overall_evidence=evidence.overall,
     )
     stage("average")
-    return updated, StepOutput(disagreement, result.features, residual, labels, current_cam, statistics)
+    return updated, StepOutput(disagreement, result.features, residual, measured, labels, current_cam, statistics)
 
 
 def _unobserved(name: str) -> None:

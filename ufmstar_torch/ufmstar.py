@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from ufmstar_torch import unmeasured
 from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, check_anchors
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
@@ -51,6 +53,7 @@ class UfMStar(StatefulModule):
     STATE = UfMStarState.names()
     config: UfMStarConfig
     observer: StepObserver | None = None
+    _warned: bool = False
 
     def __init__(
         self,
@@ -86,15 +89,19 @@ class UfMStar(StatefulModule):
 
         Args:
             depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype.
-                Pixels that are NaN, infinite, zero or negative are left out and counted.
+                Accepted is [1e-6 m, 1e6 m], and at most ``config.segment.max_depth``: state the network's largest depth
+                there. Pixels beyond (``statistics.beyond``) or otherwise outside (``out_of_range``) are not valid, nor
+                are those that are NaN, infinite, zero or negative.
             pose: [B, 4, 4] or [4, 4] camera-to-world (T_world_cam) [m]. Rotations off by at most
                 ``config.rotation_tolerance`` are projected onto SO(3) and reported.
-            intrinsics: [B, 3, 3] or [3, 3] in pixels of this depth map, first pixel's centre at (0, 0).
-            aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it is not a
-                finite number >= 0 are left out.
+                Coordinates of up to 1e9 m are accepted.
+            intrinsics: [B, 3, 3] or [3, 3] in pixels of this depth map (not of the image: ``resize_intrinsics``), first
+                pixel's centre at (0, 0); a focal length of 0.01 to 1e7 px, and the principal point on the map.
+            aleatoric: like ``depth``, the network's own variance A [m^2]; pixels where it does not lie in [0, 1e12] are
+                left out and counted.
             epistemic: likewise E [m^2].
             valid: like ``depth``, bool, True = use.
-            features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed.
+            features: [B, F, H, W] with F = ``config.features``, averaged per component and regressed; of at most 1e12.
             anchors: sparse depths of this frame, with ``config.anchored``; None = none.
 
         Returns:
@@ -118,6 +125,7 @@ class UfMStar(StatefulModule):
             anchored=None if anchored is None else anchored.reshape(shape),
             bias=None if out.residual is None else out.residual[..., 0].reshape(shape),
             features=out.features,
+            measured=out.measured.reshape(shape),
             valid=frame.valid.reshape(shape),
             labels=out.labels,
             current_cam=out.current_cam,
@@ -174,7 +182,8 @@ class UfMStar(StatefulModule):
             frame: "world" (the poses' frame) or "first" (each stream's first camera).
 
         Returns:
-            disagreement [B, N] [m^2] and features [B, N, F]; the prior far from everything seen.
+            disagreement [B, N] [m^2] and features [B, N, F]; far from everything measured what ``config.unmeasured``
+            states, where "relative" reads as "paper", since a point has no depth.
 
         Raises:
             ValueError: wrong shape or frame, or no frame has been taken in yet.
@@ -192,7 +201,9 @@ class UfMStar(StatefulModule):
                 T = invert_rigid(self.T_world_first)
                 local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-            return regress(self.mixture, local.to(dtype), self.config)
+            mixture = unmeasured.before_regression(self.mixture, self.config)
+            result = regress(mixture, local.to(dtype), self.config)
+            return unmeasured.after_regression(result, None, self.config)[0]
 
     # ---- the state ----
 
@@ -253,6 +264,7 @@ class UfMStar(StatefulModule):
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
+            max_depth=self.config.segment.max_depth,
         )  # fmt: skip
 
     def _observe(
@@ -283,6 +295,7 @@ class UfMStar(StatefulModule):
                 observer=self.observer,
             )  # fmt: skip
             self._store(state.tensors())
+            self._warn_without_segments(frame, out)
 
         def chosen(value: Tensor) -> Tensor:
             return value if pixels is None else torch.gather(value.flatten(1), 1, pixels)
@@ -297,6 +310,24 @@ class UfMStar(StatefulModule):
         if self.config.variance_floor:
             variance = variance.clamp_min(self.config.variance_floor)
         return out, variance, anchored
+
+    def _warn_without_segments(self, frame: FrameInput, out: StepOutput) -> None:
+        """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
+        if self._warned or frame.depth.device.type != "cpu":
+            return
+        given = frame.valid.sum((1, 2)) + frame.beyond + frame.out_of_range
+        empty = (given > 0) & (out.statistics.segments == 0)
+        if not bool(empty.any()):
+            return
+        self._warned = True
+        b = int(empty.nonzero()[0])
+        warnings.warn(
+            f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(given[b])} pixels "
+            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.max_depth} m and "
+            f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
+            "intrinsics the depth map's? (said once)",
+            stacklevel=5,
+        )
 
     def _own(self, frame: FrameInput) -> list[Tensor]:
         """The network's own variances A and E as far as they count [m^2]."""

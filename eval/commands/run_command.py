@@ -66,10 +66,12 @@ class UfMOptions:
     Attributes:
         preset: segmentation thresholds of the authors' code for a kind of recording; single --ufm.segment.* take
             precedence
+        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper); --preset and single --ufm.* take precedence
         anchors: track corners of the images: their depths show the error on which all views agree (docs/anchors.md)
     """
 
     preset: str | None = option(None, choices=PRESETS)
+    ufm_preset: str | None = option(None, choices=("paper",))
     anchors: bool = False
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
@@ -148,10 +150,16 @@ def read(words: Sequence[str]) -> RunOptions:
     """
     prog = "ufmstar run"
     options = parse(RunOptions, words, prog)
-    if options.uncertainty.preset is None:
-        return options
-    preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
-    return parse(RunOptions, words, prog, {f"ufm.segment.{name}": value for name, value in preset.items()})
+    defaults: dict[str, Any] = {}
+    if options.uncertainty.ufm_preset is not None:
+        paper = UfMStarConfig.paper()
+        changed = {**vars(paper), "on_bad_frame": "skip"}
+        defaults = {f"ufm.{name}": value for name, value in changed.items() if name != "segment"}
+        defaults |= {f"ufm.segment.{name}": value for name, value in paper.segment.to_dict().items()}
+    if options.uncertainty.preset is not None:
+        preset = SPGFConfig.preset(options.uncertainty.preset).to_dict()
+        defaults |= {f"ufm.segment.{name}": value for name, value in preset.items()}
+    return parse(RunOptions, words, prog, defaults) if defaults else options
 
 
 def main(options: RunOptions) -> int:

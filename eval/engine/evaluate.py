@@ -234,7 +234,9 @@ def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range
 def frame_fault(frame: Frame) -> str | None:
     """What is wrong with a frame's pose or intrinsics for UfM*, None if nothing is."""
     pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-    one = torch.ones(1, 1, 1)
+    pictured = frame.image if frame.image is not None else frame.depth
+    height, width = (1, 1) if pictured is None else pictured.shape[:2]
+    one = torch.ones(1, 1, 1).expand(1, height, width)
     checked = check_frame(one, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
     code = int(checked.fault[0])
     return FRAME_FAULTS[code] if code else None

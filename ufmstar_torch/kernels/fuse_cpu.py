@@ -154,11 +154,31 @@ def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
 
 
 @compiled
+def _exceeds(S, floor):
+    """Whether every eigenvalue of S is certainly above ``floor``: S - floor I has a Cholesky factor.
+
+    What its pivots, and the eigenvalues that it spares, round off is far below 1e-13 tr S.
+    """
+    least = 1e-13 * (S[0, 0] + S[1, 1] + S[2, 2])
+    a = S[0, 0] - floor - least
+    if not a > least:
+        return False
+    l10, l20 = S[1, 0] / a, S[2, 0] / a
+    b = S[1, 1] - floor - least - l10 * S[1, 0]
+    if not b > least:
+        return False
+    c = S[2, 1] - l20 * S[1, 0]
+    return S[2, 2] - floor - least - l20 * S[2, 0] - c * c / b > least
+
+
+@compiled
 def _floor(covariance, floor):
     """Lift the eigenvalues of every covariance [N, 3, 3] to floor [N], in place."""
     M, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for n in range(covariance.shape[0]):
         S = covariance[n]
+        if _exceeds(S, floor[n]):
+            continue
         for i in range(3):  # a slice assignment would compile for seconds, for the sake of its error message
             for j in range(3):
                 M[i, j] = S[i, j]

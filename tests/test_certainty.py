@@ -1,0 +1,186 @@
+"""What was not measured must not read as certain, and what no algorithm can use must not get in."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_ufmstar import SPGF, oracle_settings
+
+import oracle
+import scenes
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors.given import Anchors
+
+pytestmark = pytest.mark.numerics
+
+H, W = 30, 40
+CONFIG = UfMStarConfig(segment=SPGF)
+DEPTHS, POSES, K_ = scenes.sequence(6, H, W, 0.05)
+K = torch.tensor(K_)
+HOSTILE = [0.0, -1.0, 1e-45, 1e-40, 1e-20, 1e-7, 1e6, 1e10, 1e20, 3e38, float("inf"), float("nan")]
+
+
+def frame(i, dtype=torch.float32):
+    return torch.tensor(DEPTHS[i], dtype=dtype)[None], torch.tensor(POSES[i])[None], K[None]
+
+
+@pytest.mark.parametrize("max_depth", [20.0, 1e6])
+@given(st.data())
+@settings(max_examples=25, deadline=None)
+def test_no_single_value_spoils_the_state_or_a_map(max_depth, data):
+    """One hostile pixel of depth, A, E or an anchor per frame: everything that is valid stays finite, also later."""
+    segment = SPGFConfig(
+        **{**SPGF.to_dict(), "max_depth": max_depth, "min_gaussian_length": max(0.5, max_depth / 9000)}
+    )
+    ufm = UfMStar(CONFIG.replace(segment=segment, anchored=True, aleatoric_in_moments=data.draw(st.booleans())))
+    for i in range(3):
+        depth, pose, intrinsics = frame(i)
+        a, e = torch.full_like(depth, 1e-3), torch.full_like(depth, 1e-3)
+        v, u = data.draw(st.integers(0, H - 1)), data.draw(st.integers(0, W - 1))
+        for values in (depth, a, e):
+            if data.draw(st.booleans()):
+                values[0, v, u] = data.draw(st.sampled_from(HOSTILE))
+        n = torch.tensor([[[u, v], [5, 5], [20, 10], [30, 20], [10, 25]]], dtype=torch.float64)
+        g = torch.full((1, 5), 2.5, dtype=torch.float64)
+        g[0, 0] = data.draw(st.sampled_from(HOSTILE))
+        out = ufm(depth, pose, intrinsics, a, e, anchors=Anchors(n, g, torch.full_like(g, 1e-3)))
+        assert bool(out.variance[out.valid].isfinite().all())
+        assert bool(out.variance[~out.valid].isnan().all())
+        given = int(((depth > 0) & depth.isfinite()).sum())
+        counts = out.statistics
+        assert int(counts.valid_pixels + counts.beyond + counts.out_of_range) == given
+    for name, value in ufm.state.tensors().items():
+        assert name == "smoothed" or bool(value.isfinite().all()), name
+
+
+def test_beyond_the_networks_range_nothing_is_certain():
+    """25 m, then 40 m from one pose: V was 0 everywhere."""
+    ufm = UfMStar(CONFIG)
+    for far in (25.0, 40.0):
+        depth = torch.full((1, H, W), 2.0)
+        depth[:, :, W // 2 :] = far
+        out = ufm(depth, torch.eye(4), K)
+        assert bool(out.variance[..., W // 2 :].isnan().all())
+        assert bool(out.variance[..., : W // 2].isfinite().all())
+        assert int(out.statistics.beyond[0]) == int((~out.valid).sum()) == H * (W // 2)
+        assert int(out.statistics.out_of_range[0]) == 0
+    reaching = CONFIG.replace(segment=SPGFConfig(**{**SPGF.to_dict(), "max_depth": 80.0}))
+    out = UfMStar(reaching)(depth, torch.eye(4), K)
+    assert bool(out.valid.all())
+    assert int(out.statistics.beyond[0]) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({(0, 0): 1e100}, "focal length"),
+        ({(1, 1): 1e-9}, "focal length"),
+        ({(0, 2): 320.0}, "principal point outside the depth map; expected the intrinsics of the depth map"),
+        ({(1, 2): -3.0}, "principal point outside the depth map"),
+    ],
+)
+def test_intrinsics_that_cannot_be_the_depth_maps_are_refused(changes, text):
+    depth, pose, intrinsics = frame(0)
+    intrinsics = intrinsics.clone()
+    for at, value in changes.items():
+        intrinsics[0][at] = value
+    ufm = UfMStar(CONFIG)
+    with pytest.raises(ValueError, match=text):
+        ufm(depth, pose, intrinsics)
+    skipping = UfMStar(CONFIG.replace(on_bad_frame="skip"))
+    assert int(skipping(depth, pose, intrinsics).statistics.fault[0]) > 0
+    pose = pose.clone()
+    pose[0, 0, 3] = 1e12
+    with pytest.raises(ValueError, match="farther from the origin than 1e9 m"):
+        ufm(depth, pose, K)
+
+
+CHOICES = {
+    "paper": {},
+    "prior": {"prior_mean": 0.3},
+    "relative": {"unmeasured_relative": 0.2},
+    "nan": {},
+}
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@pytest.mark.parametrize("choice", CHOICES)
+def test_what_was_not_measured_agrees_with_the_oracle(choice, backend):
+    config = CONFIG.replace(unmeasured=choice, backend=backend, **CHOICES[choice])
+    ufm = UfMStar(config, dtype=torch.float64)
+    judge = oracle.Oracle(oracle_settings(SPGF), unmeasured=choice, **CHOICES[choice])
+    for i in range(4):
+        depth, pose, intrinsics = frame(i, torch.float64)
+        out = ufm(depth, pose, intrinsics)
+        V, _ = judge.step(DEPTHS[i], POSES[i], K_)
+        np.testing.assert_allclose(out.variance[0].numpy(), V, rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(out.measured[0].numpy(), judge.share, rtol=1e-7, atol=1e-9)
+        assert int(out.statistics.unmeasured[0]) == int((judge.share < 0.5).sum())
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_a_first_frame_reads_as_chosen(backend):
+    depth, pose, intrinsics = frame(0)
+    read = {}
+    for choice, values in CHOICES.items():
+        ufm = UfMStar(CONFIG.replace(unmeasured=choice, backend=backend, **values))
+        out = ufm(depth, pose, intrinsics)
+        assert int(out.statistics.unmeasured[0]) == int(out.statistics.valid_pixels[0]) == int(out.valid.sum())
+        read[choice] = out.variance[out.valid]
+    assert bool((read["paper"] == 0).all())
+    np.testing.assert_allclose(read["prior"].numpy(), 0.3, rtol=1e-5)
+    np.testing.assert_allclose(read["relative"].numpy(), (0.2 * depth[out.valid].numpy()) ** 2, rtol=1e-5)
+    assert bool(read["nan"].isnan().all())
+    with pytest.raises(ValueError, match="needs a prior_mean above 0"):
+        UfMStarConfig(unmeasured="prior")
+
+
+def test_a_point_far_from_everything_reads_as_chosen():
+    far = torch.full((1, 1, 3), 500.0)
+    for choice, expected in (("paper", 0.0), ("prior", 0.3), ("nan", float("nan"))):
+        ufm = UfMStar(CONFIG.replace(unmeasured=choice, **CHOICES[choice]))
+        for i in range(2):
+            ufm(*frame(i))
+        np.testing.assert_allclose(float(ufm.query(far).disagreement), expected, rtol=1e-6)
+
+
+def test_a_frame_without_a_segment_warns_once():
+    ufm = UfMStar(CONFIG)
+    depth, pose, intrinsics = frame(0)
+    with pytest.warns(UserWarning, match=r"no segment.*beyond segment\.max_depth = 20\.0 m.*in metres"):
+        out = ufm(1000 * depth, pose, intrinsics)
+    assert int(out.statistics.beyond[0]) > 0
+    assert int(out.statistics.valid_pixels[0]) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ufm(1000 * depth, pose, intrinsics)
+        UfMStar(CONFIG)(torch.zeros_like(depth), pose, intrinsics)  # nothing was given, so nothing is missing
+
+
+def test_the_papers_configuration():
+    paper = UfMStarConfig.paper()
+    assert (paper.segment.min_pixels, paper.segment.min_rows, paper.segment.prune) == (2000, 32, "either")
+    assert (paper.regression, paper.near_radius, paper.far_radius) == ("neighbourhood", 0.1, 0.5)
+    assert paper.unmeasured == "paper"
+    changed = {"segment", "regression"}
+    ours, theirs = UfMStarConfig().to_dict(), paper.to_dict()
+    assert {name for name in ours if ours[name] != theirs[name]} == changed
+    assert UfMStarConfig.from_dict(theirs) == paper
+
+
+def test_outputs_print_as_a_line():
+    ufm = UfMStar(CONFIG)
+    mean = ufm.mean_uncertainty(*frame(0), pixels=50)
+    out = ufm(*frame(1))
+    for value, start in ((out, "UfMStarOutput(1 x 30 x 40, median std "), (mean, "MeanUncertainty(mean=")):
+        text = repr(value)
+        assert text.startswith(start), text
+        assert "\n" not in text
+        assert len(text) < 300
+        assert "valid_pixels=" in text
+    assert "tensor(" not in repr(out.statistics)

@@ -1,0 +1,56 @@
+"""Where M was not measured, and what it reads there (``config.unmeasured``): two ends around step 5's regression.
+
+A surface seen from one view has m = 0 because nothing was compared, and where no component is near M is the prior's
+mean. Both read as certain in the paper. The share of a pixel's M that rests on surfaces seen from two views or more,
+
+    s(x) = sum of w_k(x) over the components with a count above 1,
+
+is regressed as one more feature. A pixel counts as measured where s is at least one half.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import Regression
+
+HALF = 0.5
+
+
+def before_regression(mixture: GaussianMixture, config: UfMStarConfig) -> GaussianMixture:
+    """The mixture [B, K] with one more feature, 1 where a component was seen from two views or more and else 0.
+
+    With ``config.unmeasured == "prior"`` the others have the disagreement ``config.prior_mean``.
+    """
+    compared = mixture.count > 1
+    features = torch.cat([mixture.features, compared[..., None].to(mixture.features.dtype)], dim=-1)
+    mixture = mixture.replace(features=features)
+    if config.unmeasured != "prior":
+        return mixture
+    stated = torch.full_like(mixture.disagreement, config.prior_mean)
+    return mixture.replace(disagreement=torch.where(compared, mixture.disagreement, stated))
+
+
+def after_regression(result: Regression, depth: Tensor | None, config: UfMStarConfig) -> tuple[Regression, Tensor]:
+    """Separate the share s from the regressed features, and fill in what was not measured.
+
+    Args:
+        result: of the mixture of :func:`before_regression`.
+        depth: of the same pixels [m]; None = points without a depth.
+        config: of UfM*.
+
+    Returns:
+        The regression without the share, and s, NaN where not valid.
+    """
+    measured = result.features[..., -1]
+    disagreement = result.disagreement
+    if config.unmeasured == "nan":
+        disagreement = torch.where(measured < HALF, torch.nan, disagreement)
+    elif config.unmeasured == "relative" and depth is not None:
+        disagreement = disagreement + (1 - measured).clamp_min(0) * (config.unmeasured_relative * depth).square()
+    return replace(result, disagreement=disagreement, features=result.features[..., :-1]), measured
