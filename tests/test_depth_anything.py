@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from scenes import look, render
 from ufmstar_torch import UncertainDepth, cli
+from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.load import network_source, sha256
 from ufmstar_torch.models import (
     Alignment,
@@ -160,13 +161,14 @@ def test_names_on_the_hub():
 
 
 def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative):
+    K_photo = resize_intrinsics(K, (480, 640), (48, 64))
     network = DepthAnything.from_pretrained(relative, size=(70, 84))
-    x, K_net = network.preprocess(photos(1), K)
+    x, K_net = network.preprocess(photos(1), K_photo)
     assert (network.kind, network.is_metric) == ("inverse", False)
     with pytest.raises(ValueError, match=r"predicts relative depth .*inverse depth up to scale and shift"):
         network(x)
     with pytest.raises(ValueError, match="fit_inverse_depth"):
-        UncertainDepth(network, preprocess=network.preprocess)(photos(1), torch.eye(4), K)
+        UncertainDepth(network, preprocess=network.preprocess)(photos(1), torch.eye(4), K_photo)
     with torch.no_grad():
         raw = network.raw(x)
         reference = transformers.DepthAnythingForDepthEstimation.from_pretrained(relative).eval()
@@ -175,7 +177,7 @@ def test_a_relative_checkpoint_is_no_depth_network_until_it_is_aligned(relative)
         measured = torch.where(torch.rand(truth.shape, generator=torch.Generator().manual_seed(0)) < 0.02, truth, 0)
         aligned = network.aligned(fit_inverse_depth(raw, measured, pooled=True).alignment)
         torch.testing.assert_close(aligned(x).depth, truth, rtol=1e-4, atol=0)
-    out = UncertainDepth(aligned, preprocess=aligned.preprocess)(photos(1), torch.eye(4, dtype=torch.float64), K)
+    out = UncertainDepth(aligned, preprocess=aligned.preprocess)(photos(1), torch.eye(4, dtype=torch.float64), K_photo)
     torch.testing.assert_close(out.depth, truth, rtol=1e-4, atol=0)
     torch.testing.assert_close(out.intrinsics[0], K_net)
     assert out.variance.isfinite().any()

@@ -28,7 +28,7 @@ FRAME_FAULTS = (
     "pose lies farther from the origin than 1e9 m",
     "intrinsics have a focal length outside [0.01, 1e7] px",
     "intrinsics have their principal point outside the depth map; expected the intrinsics of the depth map, not those "
-    "of an image of another size (ufmstar_torch.resize_intrinsics)",
+    "of an image of another size (ufmstar_torch.camera.resize_intrinsics)",
 )
 # What is accepted. Within these ranges nothing that the algorithm squares or divides by leaves float32.
 DEPTH_RANGE = (1e-6, 1e6)  # [m]
