@@ -100,9 +100,9 @@ def demo_explanation(summary: Mapping[str, Any]) -> str:
         "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
     ]
     hints = {
-        SHEET: f"the last three columns share a scale: does sigma glow where the error does? {unseen} rooms below",
-        CURVES: "nearer to the diagonal is better; on the left, below it a method claims too much",
-        PLY: f"what UfM* remembers, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
+        SHEET: f"the last three columns share a scale, so sigma can be compared with the error; {unseen} rooms below",
+        CURVES: "nearer to the diagonal is better; on the left, a curve below it is over-confident",
+        PLY: f"the mixture, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
     }
     lines += [f"{out}/{name}: {hint}" for name, hint in hints.items() if outputs[name] is None]
     lines += [f"no {name}: {reason}" for name, reason in outputs.items() if reason is not None]
