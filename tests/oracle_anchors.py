@@ -66,13 +66,14 @@ class AnchoredOracle(oracle.Oracle):
     def _learn(self, mixture, depth, own, K, anchors):
         full = [(u, v, g, s2, depth[round(v), round(u)]) for u, v, g, s2 in anchors]
         used = [anchor for anchor, fine in zip(full, believed(full), strict=True) if fine]
-        if used:
+        errors = [(g - d) / d for *_, g, _, d in used]
+        claims = [(s2 + own[round(v), round(u)]) / d**2 for u, v, _, s2, d in used]
+        weights = [weight(claim, errors[:i] + errors[i + 1 :]) for i, claim in enumerate(claims)]
+        if any(w >= 0.5 for w in weights):
             self.sums = [self.memory * row for row in self.sums]
             self.total = self.memory * self.total
-        errors = [(g - d) / d for *_, g, _, d in used]
-        for i, (u, v, _, s2, d) in enumerate(used):
-            r, claim = errors[i], (s2 + own[round(v), round(u)]) / d**2
-            row = weight(claim, errors[:i] + errors[i + 1 :]) * np.array([1.0, r, r**2 - claim])
+        for (u, v, *_), r, claim, own_weight in zip(used, errors, claims, weights, strict=True):
+            row = own_weight * np.array([1.0, r, r**2 - claim])
             self.total = self.total + row
             for k, w in enumerate(self._shares(mixture, depth, K, round(u), round(v))):
                 self.sums[k] = self.sums[k] + w * row
