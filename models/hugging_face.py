@@ -244,6 +244,8 @@ def own_preprocess(
         size = (int(own["height"]), int(own["width"]))
     if size is None or not processor:
         raise ValueError(f"{name} does not say what its input needs: give size or a Preprocess of your own")
+    if len(size) != 2:
+        raise ValueError(f"{name}: size must be (height, width) in pixels, got {size}")
     keep = bool(processor.get("keep_aspect_ratio")) if keep_aspect is None else keep_aspect
     divisor = int(processor.get("ensure_multiple_of") or processor.get("size_divisor") or 1)
     mean, std = processor.get("image_mean"), processor.get("image_std")
@@ -253,7 +255,7 @@ def own_preprocess(
         raise ValueError(f"{name}: its image processor normalises, but names no image_mean and image_std")
     factor = float(processor.get("rescale_factor", 1 / 255)) if processor.get("do_rescale", True) else 1.0
     return Preprocess(
-        size=tuple(size),  # type: ignore[arg-type]
+        size=(size[0], size[1]),
         aspect_multiple=max(patch_size(checkpoint), divisor) if keep else None,
         value_range=255 * factor,
         mean=tuple(mean),

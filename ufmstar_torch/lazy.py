@@ -28,9 +28,9 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
     def origins() -> dict[str, tuple[str, str]]:
         """Module and name there of every public name."""
         import ast
+        import inspect
 
-        spec = sys.modules[package].__spec__
-        source = spec.loader.get_source(package)  # type: ignore[union-attr]
+        source = inspect.getsource(sys.modules[package])
         blocks = (node.body for node in ast.parse(source).body if isinstance(node, ast.If))
         imports = (node for body in blocks for node in body if isinstance(node, ast.ImportFrom))
         return {alias.asname or alias.name: (str(i.module), alias.name) for i in imports for alias in i.names}

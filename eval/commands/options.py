@@ -39,9 +39,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
     from jsonargparse import ArgumentParser
 
-T = TypeVar("T")
+T = TypeVar("T", bound="DataclassInstance")
 
 
 class UsageError(Exception):
@@ -230,7 +231,7 @@ def _build(options: type[T], values: Mapping[str, Any]) -> T:
     """The dataclass of parsed values, groups and settings included."""
     hints = get_type_hints(options)
     built: dict[str, Any] = {}
-    for f in fields(options):  # type: ignore[arg-type]
+    for f in fields(options):
         hint = hints[f.name]
         if "fields_of" in f.metadata:
             built[f.name] = _settings(f.metadata["fields_of"], values)

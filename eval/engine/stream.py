@@ -72,16 +72,12 @@ class Sink(Protocol):
 
 
 class FrameSink:
-    """A sink that does nothing at the beginning and the end."""
+    """The parts of a :class:`Sink` that most sinks leave empty; each defines its own ``take``."""
 
     stage: str | None = None
 
     def begin(self, stream: FrameStream) -> None:
         """See :class:`Sink`."""
-
-    def take(self, result: FrameResult) -> None:
-        """See :class:`Sink`."""
-        raise NotImplementedError
 
     def end(self) -> None:
         """See :class:`Sink`."""

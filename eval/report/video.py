@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -109,10 +110,8 @@ class VideoWriter:
             raise ValueError(f"path must end in .mp4, got {self.path.name}")
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}")
-        try:
-            import imageio_ffmpeg  # noqa: F401
-        except ImportError as error:
-            raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'") from error
+        if find_spec("imageio_ffmpeg") is None:
+            raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'")
         self.fps = fps
         self._size: tuple[int, ...] = ()
         self._writer: Any = None

@@ -6,6 +6,7 @@ program did not make are never touched.
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 _SHOWN = 5  # differences that a message names
 _POLL_SECONDS = 0.02
 _UNFINISHED = "not finished"
+# What a file system without locks answers.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 Manifest = Mapping[str, Any]
 
@@ -234,8 +237,8 @@ def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
         lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
     except Timeout:
         return None
-    except (OSError, NotImplementedError) as error:
-        if isinstance(error, PermissionError | FileNotFoundError | IsADirectoryError):
+    except (OSError, NotImplementedError) as error:  # the latter is filelock's word for ENOSYS
+        if isinstance(error, OSError) and error.errno not in _NO_LOCKS:
             raise
         reason = getattr(error, "strerror", None) or error
         text = f"the file system does not support locks ({reason}), choose a folder on another one"
