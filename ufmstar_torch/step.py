@@ -298,6 +298,7 @@ def _segment(
     z = mixture.mean[..., 2].clamp_min(config.near_plane)
     floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
     floor = torch.maximum(floor, storage_floor(mixture.covariance, stored))
+    floor = torch.where(mixture.valid, floor, torch.zeros_like(floor))  # an empty slot holds zeros
     return mixture.replace(covariance=kernels.floor_covariance(mixture.covariance, floor)), labels
 
 

@@ -77,7 +77,7 @@ def distribute(mixture: GaussianMixture, points: Tensor, values: Tensor, config:
     return out
 
 
-def smooth_maps(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
+def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
     """As :func:`ufmstar_torch.regress.smooth`, for CPU tensors, in one pass."""
     memory, shown = torch.empty_like(previous), torch.empty_like(current)
     given = (value.detach().contiguous().view(-1).numpy() for value in (previous, current))

@@ -24,7 +24,8 @@ from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
-from ufmstar_torch.kernels.regress_cpu import distribute, regress_image, smooth_maps
+from ufmstar_torch.kernels.regress_cpu import distribute, regress_image
+from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.rigid_cpu import move, relative
 from ufmstar_torch.kernels.segment_cpu import segment
 from ufmstar_torch.kernels.threads_cpu import each
