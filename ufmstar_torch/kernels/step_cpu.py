@@ -46,7 +46,7 @@ class _Slots(NamedTuple):
     covariance: Floats
     weight: Floats
     disagreement: Floats
-    count: NDArray[np.int64]
+    observations: NDArray[np.int64]
     features: Floats
 
     @classmethod
@@ -251,7 +251,7 @@ def _counts(
 ) -> dict[str, Tensor]:  # fmt: skip
     """The statistics [B] that the step counts itself."""
 
-    def each_stream(values: Iterable[object]) -> NDArray[np.int64]:
+    def each_stream(values: Iterable[NDArray[Any]]) -> NDArray[np.int64]:
         return np.array([int(np.count_nonzero(value)) for value in values], np.int64)
 
     segments = each_stream(current_cam.weight.numpy())
