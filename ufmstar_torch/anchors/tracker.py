@@ -88,12 +88,14 @@ class Landmarks:
         depth: [N] along the optical axis [m].
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests.
+        confirmed: [N] int64, in how many later views each was confirmed; None = unknown.
     """
 
     pixel: NDArray[np.float64]
     depth: NDArray[np.float64]
     variance: NDArray[np.float64]
     tracked: int
+    confirmed: NDArray[np.int64] | None = None
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
         """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
@@ -111,13 +113,14 @@ class Landmarks:
         if room < n:
             raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
 
-        def padded(values: NDArray) -> Tensor:
-            full = np.zeros((1, room, *values.shape[1:]))
+        def padded(values: NDArray, dtype: type = np.float64) -> Tensor:
+            full = np.zeros((1, room, *values.shape[1:]), dtype)
             full[0, :n] = values
             return torch.from_numpy(full).to(intrinsics.device)
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
-        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid)
+        confirmed = None if self.confirmed is None else padded(self.confirmed, np.int64)
+        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, confirmed)
         return found.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
