@@ -68,11 +68,13 @@ class UfMOptions:
             precedence
         ufm_preset: paper: the paper's own settings (UfMStarConfig.paper); --preset and single --ufm.* take precedence
         anchors: track corners of the images: their depths show the error on which all views agree (docs/anchors.md)
+        recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 
     preset: str | None = option(None, choices=PRESETS)
     ufm_preset: str | None = option(None, choices=("paper",))
     anchors: bool = False
+    recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
 

@@ -17,6 +17,7 @@ from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.output import FrameStatistics
+from ufmstar_torch.recalibrate import Recalibration, read_recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -81,20 +82,29 @@ def make_estimator(row: Row, device: torch.device) -> Estimator:
     """The estimator of a row, in its initial state.
 
     Raises:
-        ValueError: the setting changes what UfM* does not have, or what the method does not use.
+        ValueError: the setting changes what UfM* does not have, or what the method does not use; or a recalibration
+            that was fitted under other settings.
+        FileNotFoundError: the setting's recalibration does not exist.
     """
     method = row.method
     if row.setting.overrides and method.fusion in (ALONE, UFM):
         raise ValueError(f"{row.label}: settings of UfM* go with UfM* only")
     if row.setting.anchors and method.fusion != UFM_STAR:
         raise ValueError(f"{row.label}: anchors go with UfM* only")
+    if row.setting.recalibration and method.fusion != UFM_STAR:
+        raise ValueError(f"{row.label}: a recalibration goes with UfM* only")
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         config = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(config, device, uses_variances=method.uses_aleatoric)
+    recalibration = read_recalibration(row.setting.recalibration) if row.setting.recalibration else None
     return Gaussians(
-        ufm_star_config(row), device, uses_variances=method.uses_aleatoric, corrected=row.setting.corrected
+        ufm_star_config(row),
+        device,
+        uses_variances=method.uses_aleatoric,
+        corrected=row.setting.corrected,
+        recalibration=recalibration,
     )
 
 
@@ -221,12 +231,19 @@ class Gaussians:
         device: of the mixture.
         uses_variances: False leaves A and E aside.
         corrected: answer with the depth corrected by the anchors' bias, and the variance that remains.
+        recalibration: of the variance; None = as it is.
     """
 
     def __init__(
-        self, config: UfMStarConfig, device: torch.device, *, uses_variances: bool = True, corrected: bool = False
+        self,
+        config: UfMStarConfig,
+        device: torch.device,
+        *,
+        uses_variances: bool = True,
+        corrected: bool = False,
+        recalibration: Recalibration | None = None,
     ) -> None:
-        self.ufm = UfMStar(config, device=device)
+        self.ufm = UfMStar(config, recalibration=recalibration, device=device)
         self._uses_variances, self._corrected = uses_variances, corrected
         self._anchors = 0
 
