@@ -87,13 +87,15 @@ class Landmarks:
         pixel: [N, 2] position (u, v) [px].
         depth: [N] along the optical axis [m].
         variance: [N] of ``depth`` [m^2].
-        tracked: corners followed into this image, of which these N passed all tests.
+        tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
+        none: why there is no landmark, where N = 0 and ``tracked`` > 0.
     """
 
     pixel: NDArray[np.float64]
     depth: NDArray[np.float64]
     variance: NDArray[np.float64]
     tracked: int
+    none: str = "no parallax, or no track that fits the poses"
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
         """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
@@ -135,9 +137,16 @@ class LandmarkTracker:
             out = ufm(depth, T_world_cam, K_map, anchors=landmarks.anchors(K, K_map))
     """
 
+    needs_image = True
+
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = config if config is not None else TrackerConfig()
         self.reset()
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Plain values on which the landmarks depend."""
+        return {"anchors": "tracked", "tracker": self.config.to_dict()}
 
     def reset(self) -> None:
         """Forget everything."""
@@ -171,7 +180,9 @@ class LandmarkTracker:
         self._gray, self._K = (gray, K) if gray.size else (None, None)
         self._view = int(state["view"])
 
-    def update(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]) -> Landmarks:
+    def update(
+        self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
         """Take in the next image.
 
         Args:
@@ -251,7 +262,7 @@ class LandmarkTracker:
         return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
 
 
-def _checked(image: NDArray, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
+def _checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
     """Gray image, pose and intrinsics.
 
     Raises:
