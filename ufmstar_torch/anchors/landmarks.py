@@ -174,7 +174,7 @@ class LandmarkMap:
         kept = np.flatnonzero(found.valid[0].numpy())
         kept = kept[:: -(-len(kept) // _MOST) or 1]
         pixel, depth, variance = (x[0].numpy()[kept] for x in (found.pixel, found.depth, found.variance))
-        return Landmarks(pixel - offset, depth, variance, len(self.sigma), "no landmark of the map is in view")
+        return Landmarks(pixel - offset, depth, variance, len(self.sigma), none="no landmark of the map is in view")
 
     def reset(self) -> None:
         """Nothing: a map remembers no image."""

@@ -88,6 +88,7 @@ class Landmarks:
         depth: [N] along the optical axis [m].
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
+        confirmed: [N] int64, in how many later views each was confirmed; None = unknown.
         none: why there is no landmark, where N = 0 and ``tracked`` > 0.
     """
 
@@ -95,6 +96,7 @@ class Landmarks:
     depth: NDArray[np.float64]
     variance: NDArray[np.float64]
     tracked: int
+    confirmed: NDArray[np.int64] | None = None
     none: str = "no parallax, or no track that fits the poses"
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
@@ -113,13 +115,14 @@ class Landmarks:
         if room < n:
             raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
 
-        def padded(values: NDArray) -> Tensor:
-            full = np.zeros((1, room, *values.shape[1:]))
+        def padded(values: NDArray, dtype: type = np.float64) -> Tensor:
+            full = np.zeros((1, room, *values.shape[1:]), dtype)
             full[0, :n] = values
             return torch.from_numpy(full).to(intrinsics.device)
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
-        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid)
+        confirmed = None if self.confirmed is None else padded(self.confirmed, np.int64)
+        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, confirmed)
         return found.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
@@ -194,6 +197,7 @@ class LandmarkTracker:
             The landmarks that it shows; none before there is parallax.
 
         Raises:
+            TypeError: ``image`` is no array.
             ValueError: wrong shape or dtype, a pose that is not finite, another size or camera than before (call
                 :meth:`reset` first); the tracker is as it was then.
             ModuleNotFoundError: OpenCV is not installed.
@@ -266,8 +270,10 @@ def _checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[N
     """Gray image, pose and intrinsics.
 
     Raises:
-        ValueError: as :meth:`LandmarkTracker.update`.
+        TypeError, ValueError: as :meth:`LandmarkTracker.update`.
     """
+    if not isinstance(image, np.ndarray):
+        raise TypeError(f"image must be a NumPy array [H, W, 3] or [H, W], got {type(image).__name__}")
     if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ValueError(f"image must be uint8 [H, W, 3] or [H, W], got {image.dtype} {image.shape}")
     T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)
