@@ -223,7 +223,7 @@ def test_run_uses_the_map_beside_the_weights(evaluated, tmp_path, capsys):
     finally:
         file.unlink()
     plain, mapped, none = (
-        np.stack([np.load(path)["sigma"] for path in sorted((tmp_path / name / "frames").glob("*.npz"))])
+        np.stack([np.load(path)["variance"] for path in sorted((tmp_path / name / "frames").glob("*.npz"))])
         for name in ("plain", "mapped", "none")
     )
     np.testing.assert_array_equal(plain, none)
