@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT
+from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import BY_ERROR, Merged, Results
 from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
@@ -108,7 +107,7 @@ def _figures(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 
 def _default_rows(results: Results, base: str | None = None) -> list[Row]:
-    return [row for row in results.rows if row.setting == DEFAULT and base in (None, row.method.base)]
+    return [row for row in plain_rows(results.rows) if base in (None, row.method.base)]
 
 
 def _hidden_panels(figure: Any, lines: int, columns: int) -> Any:
