@@ -222,9 +222,9 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
-            keep_evidence: keep what anchors taught of a stream as a whole, what this network has been getting wrong
-                lately: a robot that starts in the same place again is not blind at its first frames. What was learnt
-                of single components goes with them. The batch size stays.
+            keep_evidence: keep the sums over anchors of a stream as a whole, the recent error of this network: a robot
+                that starts in the same place again has an estimate at its first frames. The sums of single components
+                go with the components. The batch size stays.
 
         Raises:
             IndexError: an index is out of range.

@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import LandmarkSource
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
 from ufmstar_torch.eval.engine.estimators import Gaussians
@@ -52,6 +54,7 @@ class RunJob:
         every: all members predict on every image, instead of one in turn.
         video: whether to make preview.mp4.
         sheet: whether to make contact_sheet.png.
+        landmarks: makes the source of the anchors, in its initial state; for ``config.anchored``.
     """
 
     sequence: FrameSequence
@@ -63,6 +66,7 @@ class RunJob:
     every: bool = False
     video: bool = True
     sheet: bool = True
+    landmarks: Callable[[], LandmarkSource] = LandmarkTracker
 
     def row(self, module: Mapping[str, Tensor], position: int) -> RowRunner:
         """UfM* on the source after ``position`` frames, in the state that a checkpoint holds; {} at the start."""
@@ -71,7 +75,7 @@ class RunJob:
             self.source,
             Gaussians(self.config, self.device),
             every=self.every,
-            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks()) if self.config.anchored else None,
+            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks())) if self.config.anchored else None,
             skips_faults=True,
             device=self.device,
         )
@@ -82,7 +86,7 @@ class RunJob:
     @property
     def source_identity(self) -> dict[str, Any]:
         """Plain values on which depth and anchors depend."""
-        return {**self.source.identity, **(Tracks().identity if self.config.anchored else {})}
+        return {**self.source.identity, **(self.landmarks().identity if self.config.anchored else {})}
 
     def identity(self) -> dict[str, Any]:
         """Plain values on which the results depend: a run can only go on with the same ones."""

@@ -68,12 +68,13 @@ class UfMOptions:
             precedence
         ufm_preset: paper: the paper's own settings (UfMStarConfig.paper), default: ours; --preset and single --ufm.*
             take precedence
-        anchors: track corners of the images: their depths show the error on which all views agree (docs/anchors.md)
+        anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
+            corners tracked in the images; FILE: landmarks, a line x y z sigma [m] each, in the world of the poses
     """
 
     preset: str | None = option(None, choices=PRESETS)
     ufm_preset: str | None = option(None, choices=("paper", "default"))
-    anchors: bool = False
+    anchors: bool | str = option(False, const=True)
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
 
@@ -133,7 +134,7 @@ class RunOptions:
     @property
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
-        return UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": self.uncertainty.anchors})
+        return UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": bool(self.uncertainty.anchors)})
 
     def settings(self) -> dict[str, Any]:
         """What is run, as plain values that a configuration file may hold: not how it is started."""

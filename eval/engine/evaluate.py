@@ -119,7 +119,7 @@ def evaluate_sequence(
         if fault is not None:
             raise FrameError(frame.name, fault)
 
-    anchors = anchor_sources(rows)
+    anchors = anchor_sources(rows, sequence.folder)
     runners = [
         RowRunner(
             row.slug,

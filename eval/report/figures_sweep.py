@@ -193,7 +193,7 @@ def _end(line: SweepLine) -> str:
 
 
 def _styles(lines: Iterable[SweepLine]) -> Iterator[Style]:
-    """The method's own look, or one that says what is fixed."""
+    """The method's own look, or one that states what is fixed."""
     others = cycle(_OTHERS)
     for line in lines:
         known = {(): style_of(line.method), (("anchors", TRACKED),): _TRACKED, (("anchors", TRUTH),): _TRUTH}

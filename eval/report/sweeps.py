@@ -51,7 +51,7 @@ class SweepLine:
     def words(self) -> str:
         """What is fixed, for people: "", "anchored", "truth anchors, shrinkage κ 1 anchors"."""
         values = dict(self.rest)
-        anchors = _ANCHORED.get(values.pop("anchors", ""), "")
+        anchors = _ANCHORED.get(kind := values.pop("anchors", ""), kind)
         return ", ".join(filter(None, (anchors, setting_label(values))))
 
     def at(self, value: float) -> Point | None:
@@ -120,7 +120,7 @@ def _is_number(value: Any) -> bool:
 
 def _value(row: Row, name: str) -> Any:
     if name == COUNT and row.setting.anchor_count is None:
-        return _COUNTS[row.setting.anchors]
+        return _COUNTS.get(row.setting.anchors, math.nan)
     return row.setting.to_dict().get(name, default_value(name, row.setting.ufm_preset))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -218,10 +219,11 @@ class _Worker:
         try:
             sequence = item.open()
             digest = content_digest(sequence)
+            landmarks = landmark_digests(self.job.suite.rows, sequence.folder)
         except (*_BROKEN, OSError) as error:
             self._fail(item, error, missing)
             return
-        self.folder.require_same_sequence(item, digest)
+        self.folder.require_same_sequence(item, digest, landmarks)
         possible = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
         left_out = [row for row in missing if row not in possible]
         started = time.monotonic()
@@ -230,7 +232,7 @@ class _Worker:
         except _BROKEN as error:
             self._fail(item, error, missing)
             return
-        self._store(item, digest, [result for result in results if result.row in missing])
+        self._store(item, digest, landmarks, [result for result in results if result.row in missing])
         if missing:
             frames = results[0].frames.get("done", 0) if results else 0
             rows, seconds = len(missing) - len(left_out), time.monotonic() - started
@@ -263,11 +265,12 @@ class _Worker:
         self.folder.fail(item, reason, rows, self.context.launch)
         self.context.report(f"{item.label}: failed: {reason}")
 
-    def _store(self, item: WorkItem, digest: str, results: Iterable[RowResult]) -> None:
+    def _store(self, item: WorkItem, digest: str, landmarks: Mapping[str, str], results: Iterable[RowResult]) -> None:
         """Store rows with what they were computed from."""
         common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": digest}
         for result in results:
             row, network = result.row, self.networks[result.row.method.base]
+            own = {"landmarks": landmarks[row.slug]} if row.slug in landmarks else {}
             record = Record(
                 suite=self.job.suite.name,
                 dataset=item.dataset,
@@ -280,7 +283,7 @@ class _Worker:
                 curves=result.curves,
                 state=result.state,
                 ms=result.ms,
-                provenance={**common, "network": network.digest, "threads": torch.get_num_threads()},
+                provenance={**common, "network": network.digest, "threads": torch.get_num_threads(), **own},
             )
             self.folder.keep(item, record, result)
 
