@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ufmstar_torch.anchors.landmarks import FILE_TYPES
-from ufmstar_torch.checked import Checked, number
+from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.config import UfMStarConfig
 
 TRACKED, TRUTH = "tracked", "truth"
