@@ -12,6 +12,8 @@ from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
+PRESETS = ("paper", "default")
+
 if TYPE_CHECKING:
     from ufmstar_torch.eval.methods.suite import Suite
     from ufmstar_torch.eval.results.launch import EvalOutcome, LaunchOptions
@@ -25,6 +27,7 @@ class SuiteOptions:
     Attributes:
         suite: name of a suite (see --list), or a TOML file of your own
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
+        ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
         network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
         samples: passes of MC-Dropout where a row asks for all; default: 10
         recalibration: file of `ufmstar recalibrate`: its row is judged under it as well, as a row of its own, on
@@ -34,6 +37,7 @@ class SuiteOptions:
 
     suite: str | None = None
     base: str | None = None
+    ufm_preset: str | None = option(None, choices=PRESETS)
     network: tuple[str, ...] = option((), repeat=True)
     samples: int | None = None
     recalibration: tuple[str, ...] = option((), repeat=True)
@@ -184,7 +188,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     from ufmstar_torch.eval.sequences.options import Options
 
     what, data, output = options.what, options.data, options.output
-    suite = _recalibrated(suite_named(str(what.suite), what.base), what.recalibration)
+    suite = _recalibrated(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
     choices = [NetworkChoice.parse(text) for text in what.network]
     networks = {choice.base: choice for choice in choices}
     if len(networks) < len(choices):

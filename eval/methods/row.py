@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,20 @@ class Row:
         changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
         return f"{self.name} ({changed})" if changed else self.name
 
+    @property
+    def base_line(self) -> Row:
+        """The same method with the same preset and preprocessing, and nothing varied."""
+        return Row(self.method, self.setting.chosen)
+
     def to_dict(self) -> dict[str, Any]:
         """The row as plain values, as eval.json has it."""
         return {"method": self.method.name, "setting": self.setting.to_dict()}
+
+
+def plain_rows(rows: Iterable[Row]) -> list[Row]:
+    """Of each method the first row that no ablation varies; of the paper's suites that with the paper's settings."""
+    first: dict[Method, Row] = {}
+    for row in rows:
+        if row.setting.plain:
+            first.setdefault(row.method, row)
+    return list(first.values())
