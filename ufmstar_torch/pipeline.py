@@ -150,7 +150,7 @@ class UncertainDepth(NetworksInTurn):
         preprocess: maps image and intrinsics to the network's input; None passes both through.
         anchors: what yields the anchors of every image, with ``config.anchored``: "corners" (tracked in the image),
             a file of landmarks, or a :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a
-            sequence with one for each. Saved and reset with the state. None: those given with an image, if any.
+            list with one for each. Saved and reset with the state. None: those given with an image, if any.
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself
     to sample in eval mode, as decoder dropout at test time does.
@@ -177,7 +177,7 @@ class UncertainDepth(NetworksInTurn):
         mode: str = "alternate",
         samples: int | None = None,
         preprocess: Preprocess | None = None,
-        anchors: Given | Sequence[Given] | None = None,
+        anchors: Given | list[Given] | tuple[Given, ...] | None = None,
     ) -> None:
         single = len(_modules(networks)) == 1
         if mode not in ("alternate", "full"):

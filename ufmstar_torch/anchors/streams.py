@@ -12,6 +12,7 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
 
 Given = str | Path | LandmarkSource
+_PARTS = ("pixel", "depth", "variance", "valid")
 
 
 class StreamLandmarks:
@@ -24,9 +25,9 @@ class StreamLandmarks:
         FileNotFoundError, ValueError: as :func:`landmark_source`.
     """
 
-    def __init__(self, sources: Given | Sequence[Given]) -> None:
-        several = isinstance(sources, Sequence) and not isinstance(sources, str)
-        self._sources = [landmark_source(one) for one in (sources if several else [sources])]  # type: ignore[list-item]
+    def __init__(self, sources: Given | list[Given] | tuple[Given, ...]) -> None:
+        given = sources if isinstance(sources, list | tuple) else [sources]
+        self._sources = [landmark_source(one) for one in given]
         self._before = self._states()
 
     def update(self, image: Tensor, pose: Tensor, intrinsics: Tensor) -> Anchors:
@@ -60,10 +61,8 @@ class StreamLandmarks:
         room = max(len(landmarks.depth) for landmarks in found)
         each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(found)]
         known = [one.confirmed for one in each if one.confirmed is not None]
-        return Anchors(
-            *(torch.cat([getattr(one, name) for one in each]) for name in ("pixel", "depth", "variance", "valid")),
-            torch.cat(known) if len(known) == b else None,
-        ).to(image.device)
+        parts = {name: torch.cat([getattr(one, name) for one in each]) for name in _PARTS}
+        return Anchors(**parts, confirmed=torch.cat(known) if len(known) == b else None).to(image.device)
 
     def undo(self, streams: Sequence[int] | None = None) -> None:
         """Forget the last image of these streams (None: of all): it was not used."""
