@@ -19,6 +19,7 @@ from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
 from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
@@ -151,6 +152,7 @@ class UncertainDepth(NetworksInTurn):
         anchors: what yields the anchors of every image, with ``config.anchored``: "corners" (tracked in the image),
             a file of landmarks, or a :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a
             list with one for each. Saved and reset with the state. None: those given with an image, if any.
+        recalibration: of the variance, as :class:`UfMStar` takes it (``Recalibration.from_json(FILE)``).
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself
     to sample in eval mode, as decoder dropout at test time does.
@@ -178,6 +180,7 @@ class UncertainDepth(NetworksInTurn):
         samples: int | None = None,
         preprocess: Preprocess | None = None,
         anchors: Given | list[Given] | tuple[Given, ...] | None = None,
+        recalibration: Recalibration | None = None,
     ) -> None:
         single = len(_modules(networks)) == 1
         if mode not in ("alternate", "full"):
@@ -187,7 +190,7 @@ class UncertainDepth(NetworksInTurn):
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         super().__init__(networks, samples=samples, preprocess=preprocess)
-        self.ufm = UfMStar(config)
+        self.ufm = UfMStar(config, recalibration=recalibration)
         if anchors is not None and not self.ufm.config.anchored:
             raise ValueError("anchors go with UfMStarConfig(anchored=True)")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)

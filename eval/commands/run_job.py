@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.recalibrate import beside, named, read_recalibration
 
 
 def job_from(chosen: RunOptions) -> RunJob:
@@ -38,11 +40,13 @@ def job_from(chosen: RunOptions) -> RunJob:
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
+    source = _source(options, sequence, device)
     return RunJob(
         sequence=sequence,
         indices=indices,
-        source=_source(options, sequence, device),
+        source=source,
         config=config,
+        recalibration=_recalibration(chosen, source),
         device=torch.device(device),
         settings=options,
         every=options["model"] is not None and options["mode"] == "full",
@@ -50,6 +54,25 @@ def job_from(chosen: RunOptions) -> RunJob:
         sheet=not options["no_sheet"],
         landmarks=landmarks,
     )
+
+
+def _recalibration(chosen: RunOptions, source: DepthSource) -> str:
+    """FILE@DIGEST of the map that is named or lies beside the weights; "" = none.
+
+    Raises:
+        FileNotFoundError: the named file does not exist.
+        ValueError: it is no recalibration, or was fitted under other settings or to another network.
+    """
+    name, weights = chosen.uncertainty.recalibration, chosen.network.weights
+    if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
+        return ""
+    file = beside(weights[0]) if name is None else Path(name)
+    try:
+        files = source.identity.get("weights", ())
+        read_recalibration(str(file)).require(chosen.config, [one["sha256"] for one in files])
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
+    return named(file)
 
 
 def _sequence(chosen: RunOptions) -> FrameSequence:

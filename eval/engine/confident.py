@@ -49,9 +49,9 @@ def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
     return judged & (torch.where(judged, estimate.variance, torch.inf) <= threshold)
 
 
-def _frames(row: Row) -> int:
-    """What decides which frames a row sees."""
-    return row.setting.skip
+def _frames(row: Row) -> tuple[int, str]:
+    """What decides which frames a row sees, and which part of them."""
+    return row.setting.skip, row.setting.preprocess
 
 
 def _noise(row: Row) -> tuple[float, ...]:

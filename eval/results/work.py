@@ -27,6 +27,7 @@ from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.recalibrate import read_recalibration
 
 Evaluate = Callable[..., list[RowResult]]
 # Errors of a sequence that cannot be used, raised when it is opened or evaluated. Any other error is a mistake in this
@@ -36,6 +37,7 @@ _POLL_SECONDS = 0.2
 DIED = "the process that evaluated it was killed (for want of memory?)"
 # Of a sequence of single images.
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
+_FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,8 @@ class _Worker:
             self._fail(item, error, missing)
             return
         self.folder.require_same_sequence(item, digest, landmarks)
-        possible = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        posed = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        possible = [row for row in posed if not _fitted_to(row, digest)]
         left_out = [row for row in missing if row not in possible]
         started = time.monotonic()
         try:
@@ -238,7 +241,7 @@ class _Worker:
             rows, seconds = len(missing) - len(left_out), time.monotonic() - started
             self.context.report(f"{item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
         if left_out:
-            self._fail(item, _NO_POSES.format(len(left_out)), left_out)
+            self._fail(item, (_FITTED if sequence.posed else _NO_POSES).format(len(left_out)), left_out)
         else:
             self.folder.succeeded(item)
 
@@ -286,6 +289,12 @@ class _Worker:
                 provenance={**common, "network": network.digest, "threads": torch.get_num_threads(), **own},
             )
             self.folder.keep(item, record, result)
+
+
+def _fitted_to(row: Row, digest: str) -> bool:
+    """Whether the row's recalibration was fitted to the sequence with this digest."""
+    name = row.setting.recalibration
+    return bool(name) and digest in read_recalibration(name).digests
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
