@@ -26,6 +26,8 @@ class SuiteOptions:
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
         network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
         samples: passes of MC-Dropout where a row asks for all; default: 10
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        precision: of the networks; bf16: torch's autocast
         list: show the suites and stop
     """
 
@@ -33,6 +35,8 @@ class SuiteOptions:
     base: str | None = None
     network: tuple[str, ...] = option((), repeat=True)
     samples: int | None = None
+    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
+    precision: str = option("float32", choices=("float32", "bf16"))
     list: bool = False
 
 
@@ -201,6 +205,8 @@ def job_from(options: EvalOptions) -> EvalJob:
         confident=output.confident,
         examples=output.examples,
         samples=what.samples,
+        runtime=what.runtime,
+        precision=what.precision,
     )
 
 

@@ -18,6 +18,7 @@ from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.models.inference import Inference
 
 
 def job_from(chosen: RunOptions) -> RunJob:
@@ -79,7 +80,7 @@ def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) ->
             mode=options["mode"],
             samples=options["samples"],
             offload=options["offload"],
-            threads=options["threads"],
+            inference=Inference(options["runtime"], options["precision"], options["threads"]),
             device=device,
         )
     if options["depth"] in OWN_DEPTH:
