@@ -1,7 +1,7 @@
 """Loaded networks as they run fastest where nothing is trained: ONNX Runtime, or torch's better form of them.
 
-Weights that come as an ONNX file run in ONNX Runtime on the processor, and on a GPU where ONNX Runtime has its provider;
-everything else in torch: ``Backbone`` networks with channels last, FastDepth with its batch norms folded
+Weights that come as an ONNX file run in ONNX Runtime on the processor, and on a GPU where it has its
+provider. Everything else runs in torch: ``Backbone`` networks with channels last, FastDepth with its batch norms folded
 (docs/results/benchmark.md has the times). The results equal those of the loaded network up to rounding.
 """
 
