@@ -21,8 +21,8 @@ def tensor_bytes(tensors: Iterable[Tensor]) -> int:
 
 
 def weight_bytes(*modules: nn.Module) -> int:
-    """Bytes of the parameters and buffers of modules, and of the files that ONNX Runtime runs; what several of them share
-    counts once."""
+    """Bytes of the parameters and buffers of modules, and of files that ONNX Runtime runs; what several share counts
+    once."""
     graphs = {m.path for module in modules for m in module.modules() if isinstance(m, OnnxNetwork)}
     tensors = (t for module in modules for t in (*module.parameters(), *module.buffers()))
     return tensor_bytes(tensors) + sum(Path(path).stat().st_size for path in graphs)
