@@ -121,8 +121,8 @@ def _fast_in_torch(network: DepthNetwork) -> DepthNetwork:
     if isinstance(network, BatchEnsembleMember) or not any(isinstance(module, Backbone) for module in modules):
         return network
     if isinstance(network, FastDepth) and not network.dropout:
-        return network.folded().to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+        return network.folded().to(memory_format=torch.channels_last)
     fast = copy.deepcopy(network)
     if isinstance(fast, UncertaintyNetwork) and isinstance(fast.backbone, FastDepth) and not fast.backbone.dropout:
         fast.backbone = fast.backbone.folded()
-    return fast.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+    return fast.to(memory_format=torch.channels_last)

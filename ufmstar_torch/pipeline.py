@@ -17,6 +17,7 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import MeanUncertainty
 from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
@@ -146,6 +147,7 @@ class UncertainDepth(NetworksInTurn):
         samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
             network must sample by itself in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the network's input; None passes both through.
+        recalibration: of the variance, as :class:`UfMStar` takes it (``Recalibration.from_json(FILE)``).
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself
     to sample in eval mode, as decoder dropout at test time does.
@@ -174,6 +176,7 @@ class UncertainDepth(NetworksInTurn):
         mode: str = "alternate",
         samples: int | None = None,
         preprocess: Preprocess | None = None,
+        recalibration: Recalibration | None = None,
     ) -> None:
         single = len(_modules(networks)) == 1
         if mode not in ("alternate", "full"):
@@ -183,7 +186,7 @@ class UncertainDepth(NetworksInTurn):
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         super().__init__(networks, samples=samples, preprocess=preprocess)
-        self.ufm = UfMStar(config)
+        self.ufm = UfMStar(config, recalibration=recalibration)
         self.mode = mode
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, cast
 
@@ -10,12 +12,14 @@ from torch import Tensor, nn
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.methods.setting import OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
 from ufmstar_torch.models.inference import BF16, runtime_of
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.pipeline import NetworksInTurn
 
 # Sample n of frame i is seeded by i + 1,000,003 n: another seed for every pair as long as a sequence has fewer
@@ -75,6 +79,27 @@ class NetworkSource:
     def passes(self) -> int:
         """Inferences that all members, or all samples, take."""
         return self._turns.passes
+
+    def prepared(self, how: str) -> NetworkSource:
+        """The same networks, which draw from the same generator, on images that are prepared otherwise.
+
+        Raises:
+            ValueError: the networks do not declare their input by a ``Preprocess``.
+        """
+        own = self._turns.preprocess
+        if how == OF_NETWORK:
+            return self
+        if not isinstance(own, Preprocess):
+            raise ValueError(f'preprocess = "{how}" needs networks that declare their input by a Preprocess')
+        changed = own.of_whole_frame() if how == RESIZE else own.of_nyu_crop()
+        if changed == own:
+            return self
+        other = copy.copy(self)
+        other._turns = NetworksInTurn(self._members, samples=self._turns.samples, preprocess=changed)
+        other._input, other._timer = None, StageTimer(self._device)
+        other.identity = {**self.identity, "preprocess": how}
+        other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
+        return other
 
     @property
     def cacheable(self) -> bool:

@@ -119,6 +119,14 @@ class DepthSource(Protocol):
     @property
     def runtime(self) -> Mapping[str, Any] | None: ...
 
+    def prepared(self, how: str) -> DepthSource:
+        """The same source with its images prepared as ``Setting.preprocess`` says; itself where that is no change.
+
+        Raises:
+            ValueError: there are no images to prepare.
+        """
+        ...
+
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""
         ...

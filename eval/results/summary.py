@@ -15,7 +15,7 @@ from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
-# [m] A sigma below it claims more than any depth network knows.
+# [m] A sigma below it claims more than any depth network can measure.
 NEAR_ZERO = 1e-3
 STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")

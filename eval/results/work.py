@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -27,6 +28,7 @@ from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.recalibrate import read_recalibration
 
 Evaluate = Callable[..., list[RowResult]]
 # Errors of a sequence that cannot be used, raised when it is opened or evaluated. Any other error is a mistake in this
@@ -36,6 +38,7 @@ _POLL_SECONDS = 0.2
 DIED = "the process that evaluated it was killed (for want of memory?)"
 # Of a sequence of single images.
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
+_FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
 
 
 @dataclass(frozen=True)
@@ -224,11 +227,13 @@ class _Worker:
         try:
             sequence = item.open()
             digest = content_digest(sequence)
+            landmarks = landmark_digests(self.job.suite.rows, sequence.folder)
         except (*_BROKEN, OSError) as error:
             self._fail(item, error, missing)
             return
-        self.folder.require_same_sequence(item, digest)
-        possible = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        self.folder.require_same_sequence(item, digest, landmarks)
+        posed = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        possible = [row for row in posed if not _fitted_to(row, digest)]
         left_out = [row for row in missing if row not in possible]
         started = time.monotonic()
         try:
@@ -236,13 +241,13 @@ class _Worker:
         except _BROKEN as error:
             self._fail(item, error, missing)
             return
-        self._store(item, digest, [result for result in results if result.row in missing])
+        self._store(item, digest, landmarks, [result for result in results if result.row in missing])
         if missing:
             frames = results[0].frames.get("done", 0) if results else 0
             rows, seconds = len(missing) - len(left_out), time.monotonic() - started
             self.context.report(f"{item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
         if left_out:
-            self._fail(item, _NO_POSES.format(len(left_out)), left_out)
+            self._fail(item, (_FITTED if sequence.posed else _NO_POSES).format(len(left_out)), left_out)
         else:
             self.folder.succeeded(item)
 
@@ -269,11 +274,12 @@ class _Worker:
         self.folder.fail(item, reason, rows, self.context.launch)
         self.context.report(f"{item.label}: failed: {reason}")
 
-    def _store(self, item: WorkItem, digest: str, results: Iterable[RowResult]) -> None:
+    def _store(self, item: WorkItem, digest: str, landmarks: Mapping[str, str], results: Iterable[RowResult]) -> None:
         """Store rows with what they were computed from."""
         common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": digest}
         for result in results:
             row, network = result.row, self.networks[result.row.method.base]
+            own = {"landmarks": landmarks[row.slug]} if row.slug in landmarks else {}
             record = Record(
                 suite=self.job.suite.name,
                 dataset=item.dataset,
@@ -291,9 +297,16 @@ class _Worker:
                     "network": network.digest,
                     "runtime": network.runtime,
                     "threads": torch.get_num_threads(),
+                    **own,
                 },
             )
             self.folder.keep(item, record, result)
+
+
+def _fitted_to(row: Row, digest: str) -> bool:
+    """Whether the row's recalibration was fitted to the sequence with this digest."""
+    name = row.setting.recalibration
+    return bool(name) and digest in read_recalibration(name).digests
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
