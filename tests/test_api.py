@@ -43,7 +43,8 @@ def test_signatures():
     assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average"]
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
-    assert names(UncertainDepth.__init__) == ["networks", "config", "mode", "samples", "preprocess", "recalibration"]
+    made_of = ["networks", "config", "mode", "samples", "preprocess", "anchors", "recalibration"]
+    assert names(UncertainDepth.__init__) == made_of
     images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
     assert names(UncertainDepth.forward) == images
     assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]

@@ -30,6 +30,8 @@ class SuiteOptions:
         ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
         network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
         samples: passes of MC-Dropout where a row asks for all; default: 10
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        precision: of the networks; bf16: torch's autocast
         recalibration: file of `ufmstar recalibrate`: its row is judged under it as well, as a row of its own, on
             sequences other than those that it was fitted to; repeatable
         list: show the suites and stop
@@ -40,6 +42,8 @@ class SuiteOptions:
     ufm_preset: str | None = option(None, choices=PRESETS)
     network: tuple[str, ...] = option((), repeat=True)
     samples: int | None = None
+    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
+    precision: str = option("float32", choices=("float32", "bf16"))
     recalibration: tuple[str, ...] = option((), repeat=True)
     list: bool = False
 
@@ -209,6 +213,8 @@ def job_from(options: EvalOptions) -> EvalJob:
         confident=output.confident,
         examples=output.examples,
         samples=what.samples,
+        runtime=what.runtime,
+        precision=what.precision,
     )
 
 

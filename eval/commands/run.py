@@ -281,6 +281,7 @@ def _write_summary(
         sequence=job.sequence,
         selected=len(job.indices),
         source=job.source_identity,
+        runtime=job.source.runtime,
         records=folder.records,
         sessions=folder.checkpoint.sessions,
         mixture=_ufm(job, folder).mixture,

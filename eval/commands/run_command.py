@@ -30,6 +30,8 @@ class NetworkOptions:
         samples: passes per image of an mc_dropout network in mode full; default: 10
         offload: trained: keep the weights in host memory, only the member in turn on the device
         spec: JSON file that declares what the weights do not say: inputs, outputs, an alignment
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        precision: of the networks; bf16: torch's autocast
     """
 
     model: str | None = None
@@ -38,6 +40,8 @@ class NetworkOptions:
     samples: int | None = None
     offload: bool = False
     spec: str | None = None
+    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
+    precision: str = option("float32", choices=("float32", "bf16"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import beside, named, read_recalibration
 
 
@@ -109,7 +110,7 @@ def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) ->
             mode=options["mode"],
             samples=options["samples"],
             offload=options["offload"],
-            threads=options["threads"],
+            inference=Inference(options["runtime"], options["precision"], options["threads"]),
             device=device,
         )
     if options["depth"] in OWN_DEPTH:

@@ -58,7 +58,7 @@ class MapSource:
         digest: of the identity.
     """
 
-    needs_image, cacheable, passes = False, False, 1
+    needs_image, cacheable, passes, runtime = False, False, 1, None
     networks: tuple[DepthNetwork, ...] = ()
 
     def __init__(

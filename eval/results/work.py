@@ -27,6 +27,7 @@ from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import read_recalibration
 
 Evaluate = Callable[..., list[RowResult]]
@@ -56,6 +57,7 @@ class EvalJob:
         confident: share of a frame's pixels of which a reference method counts as confident.
         examples: of each data set, sequences of which a few frames are stored for pictures.
         samples: passes of MC-Dropout.
+        runtime, precision: of the networks (``Inference``).
     """
 
     suite: Suite
@@ -69,6 +71,8 @@ class EvalJob:
     confident: float = 0.5
     examples: int = 3
     samples: int | None = None
+    runtime: str = "auto"
+    precision: str = "float32"
 
     def load(self, device: torch.device) -> dict[str, DepthSource]:
         """The networks that the rows need.
@@ -78,7 +82,8 @@ class EvalJob:
         """
         passes = {} if self.samples is None else {"samples": self.samples}
         needed = [self.networks[base] for base in self.suite.bases]
-        return {choice.base: choice.load(device, **passes) for choice in needed}
+        inference = Inference(self.runtime, self.precision)
+        return {choice.base: choice.load(device, inference=inference, **passes) for choice in needed}
 
     def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """eval.json."""
@@ -105,7 +110,8 @@ class EvalJob:
 
     def to_dict(self) -> dict[str, Any]:
         """The job as plain values, for another process."""
-        own = {name: getattr(self, name) for name in ("missing_bases", "device", "confident", "examples", "samples")}
+        plain = ("missing_bases", "device", "confident", "examples", "samples", "runtime", "precision")
+        own = {name: getattr(self, name) for name in plain}
         return own | {
             "suite": self.suite.to_dict(),
             "networks": [asdict(choice) for choice in self.networks.values()],
@@ -286,7 +292,13 @@ class _Worker:
                 curves=result.curves,
                 state=result.state,
                 ms=result.ms,
-                provenance={**common, "network": network.digest, "threads": torch.get_num_threads(), **own},
+                provenance={
+                    **common,
+                    "network": network.digest,
+                    "runtime": network.runtime,
+                    "threads": torch.get_num_threads(),
+                    **own,
+                },
             )
             self.folder.keep(item, record, result)
 
