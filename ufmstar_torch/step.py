@@ -47,8 +47,10 @@ class StepObserver(Protocol):
         ...
 
     def kernel(self, name: str) -> AbstractContextManager[object]:
-        """Around the kernel of this name, a field of :class:`Kernels`; a compiled step names spgf, correspond, fuse (which
-        appends as well) and regress_image."""
+        """Around the kernel of this name, a field of :class:`Kernels`.
+
+        A compiled step names spgf, correspond, fuse (which appends as well) and regress_image.
+        """
         ...
 
 
