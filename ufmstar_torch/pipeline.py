@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import MeanUncertainty
-from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
@@ -93,6 +93,11 @@ class NetworksInTurn(nn.Module):
         self.preprocess = preprocess
 
     @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that the networks can predict, where each of them states one."""
+        return stated_range(self.networks)
+
+    @property
     def passes(self) -> int:
         """Inferences that :meth:`every` takes."""
         return len(self.networks) if self.samples is None else self.samples
@@ -137,7 +142,8 @@ class UncertainDepth(NetworksInTurn):
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
             separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one with an
             attribute ``takes_intrinsics = True`` is called as ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
-        config: of UfM*. With ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
+        config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`). With
+            ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
             as the second entry of H (``ufm.features``), unless other features are given.
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
@@ -183,7 +189,7 @@ class UncertainDepth(NetworksInTurn):
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         super().__init__(networks, samples=samples, preprocess=preprocess)
-        self.ufm = UfMStar(config)
+        self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth))
         self.mode = mode
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0

@@ -38,11 +38,12 @@ def job_from(chosen: RunOptions) -> RunJob:
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
+    source = _source(options, sequence, device)
     return RunJob(
         sequence=sequence,
         indices=indices,
-        source=_source(options, sequence, device),
-        config=config,
+        source=source,
+        config=config.within(source.max_depth),
         device=torch.device(device),
         settings=options,
         every=options["model"] is not None and options["mode"] == "full",

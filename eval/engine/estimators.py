@@ -77,8 +77,13 @@ class Estimator(Protocol):
         ...
 
 
-def make_estimator(row: Row, device: torch.device) -> Estimator:
+def make_estimator(row: Row, device: torch.device, max_depth: float | None = None) -> Estimator:
     """The estimator of a row, in its initial state.
+
+    Args:
+        row: which.
+        device: where it runs.
+        max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
 
     Raises:
         ValueError: the setting changes what UfM* does not have, or what the method does not use.
@@ -94,7 +99,7 @@ def make_estimator(row: Row, device: torch.device) -> Estimator:
         config = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(config, device, uses_variances=method.uses_aleatoric)
     return Gaussians(
-        ufm_star_config(row),
+        ufm_star_config(row).within(max_depth),
         device,
         uses_variances=method.uses_aleatoric,
         corrected=row.setting.corrected,

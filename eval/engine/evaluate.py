@@ -124,7 +124,7 @@ def evaluate_sequence(
         RowRunner(
             row.slug,
             sources[row.method.base, row.setting.preprocess],
-            make_estimator(row, device),
+            make_estimator(row, device, sources[row.method.base, row.setting.preprocess].max_depth),
             every=row.method.every_member,
             setting=row.setting,
             anchors=anchors.get(row),

@@ -60,6 +60,7 @@ class MapSource:
 
     needs_image, cacheable, passes = False, False, 1
     networks: tuple[DepthNetwork, ...] = ()
+    max_depth: float | None = None
 
     def __init__(
         self,

@@ -68,6 +68,11 @@ class NetworkSource:
         return self._members
 
     @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that the members can predict, where each of them states one."""
+        return self._turns.max_depth
+
+    @property
     def passes(self) -> int:
         """Inferences that all members, or all samples, take."""
         return self._turns.passes

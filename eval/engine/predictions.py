@@ -97,6 +97,7 @@ class DepthSource(Protocol):
         needs_image: whether it predicts from the image; from the depth map otherwise.
         cacheable: whether a store may keep its predictions. They are then of single precision, read or computed.
         is_truth: whether it is the sequence's own depth, which has no error.
+        max_depth: [m] the largest depth that its networks can predict; None where it is not known.
     """
 
     @property
@@ -115,6 +116,8 @@ class DepthSource(Protocol):
     def cacheable(self) -> bool: ...
     @property
     def is_truth(self) -> bool: ...
+    @property
+    def max_depth(self) -> float | None: ...
 
     def prepared(self, how: str) -> DepthSource:
         """The same source with its images prepared as ``Setting.preprocess`` says; itself where that is no change.
