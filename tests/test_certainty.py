@@ -224,6 +224,9 @@ def test_the_papers_configuration():
     assert (paper.segment.min_pixels, paper.segment.min_rows, paper.segment.prune) == (2000, 32, "either")
     assert (paper.regression, paper.near_radius, paper.far_radius) == ("neighbourhood", 0.1, 0.5)
     assert paper.unmeasured == "paper"
+    # SPGF's own t = a z^2 / f at the paper's 224 x 224, whatever the camera; the same in metres at 518 x 518.
+    assert paper.segment.scaled_to(224, 224).slope(123.0) == pytest.approx(2.4 / 123)
+    assert paper.segment.scaled_to(518, 518).slope(123.0 * 518 / 224) == pytest.approx(2.4 / 123)
     changed = {"segment", "regression"}
     ours, theirs = UfMStarConfig().to_dict(), paper.to_dict()
     assert {name for name in ours if ours[name] != theirs[name]} == changed
