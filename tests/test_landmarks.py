@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 import torch
-from runs import job_of, outputs, read_summary
+from runs import Brightness, job_of, outputs, read_summary
 from test_suite_anchors import Biased, evaluate, in_memory, row
 
-from ufmstar_torch import UfMStar, UfMStarConfig, cli
+from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source
 from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.anchors import landmark_digests, landmarks_of
@@ -18,6 +18,7 @@ from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.tour.name import open_tour
+from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:5?frames=6&size=96x128&sensor=0"
 ON = UfMStarConfig(on_bad_frame="skip", anchored=True)
@@ -208,3 +209,80 @@ def test_a_row_takes_a_file_of_each_sequence(tour, file, tmp_path):
     assert mapped.figures["ece_delta"] < plain.figures["ece_delta"]
     digests = landmark_digests(rows, tmp_path)
     assert digests == {r.slug: LandmarkMap.read(file).identity["landmarks"] for r in rows[1:]}
+
+
+# ---- UncertainDepth ----
+
+
+def pictures(sequence):
+    return [
+        (torch.from_numpy(f.image).permute(2, 0, 1), torch.from_numpy(f.T_world_cam), torch.from_numpy(f.intrinsics))
+        for f in sequence
+    ]
+
+
+def wrapped(source, **config):
+    return UncertainDepth(Brightness(), ON.replace(**config), preprocess=Preprocess(size=(48, 64)), anchors=source)
+
+
+def test_a_model_with_a_source_equals_one_that_is_given_its_anchors(tour, file):
+    tracker, mapped = LandmarkTracker(), LandmarkMap.read(file)
+    by_hand, corners, both = wrapped(None), wrapped("corners"), wrapped(["corners", mapped])
+    for i, (image, T, K) in enumerate(pictures(tour)):
+        found = tracker.update(image.permute(1, 2, 0).numpy(), T.numpy(), K.numpy()).anchors(K.numpy(), K)
+        expected = by_hand(image[None], T, K, anchors=found)
+        assert torch.equal(corners(image[None], T, K).variance, expected.variance)
+        stacked = image[None].expand(2, -1, -1, -1) if i % 2 else image[None].expand(2, -1, -1, -1).float() / 255
+        out = both(stacked, T.expand(2, 4, 4), K.expand(2, 3, 3))
+        assert out.ufm.statistics.anchors[1] > 0
+    torch.testing.assert_close(out.variance[0], expected.variance[0], rtol=1e-4, atol=1e-6)
+    assert expected.ufm.statistics.anchors_used > 0
+
+
+def test_its_state_continues_and_errors_change_nothing(tour):
+    frames, model = pictures(tour), wrapped("corners", on_bad_frame="raise")
+    for image, T, K in frames[:3]:
+        model(image[None], T, K)
+    saved = {name: value.clone() for name, value in model.state_dict().items()}
+    assert "landmarks.0.gray" in saved
+    image, T, K = frames[3]
+    wrong = [
+        {"image": image[None].float()},  # 0 to 255
+        {"pose": 1.1 * T},
+        {"valid": torch.ones(1, 3, 3, dtype=torch.bool)},
+        {"anchors": LandmarkTracker().update(tour[0].image, tour[0].T_world_cam, K.numpy()).anchors(K.numpy(), K)},
+        {"image": image[None].expand(2, -1, -1, -1)},
+    ]
+    for change in wrong:
+        with pytest.raises(ValueError, match=r"image must|floating-point image|pose|valid|give none|each of the 2"):
+            model(**{"image": image[None], "pose": T, "intrinsics": K, **change})
+        after = model.state_dict()
+        assert all(torch.equal(after[name], value) for name, value in saved.items())
+    expected = model(image[None], T, K).variance
+    again = wrapped("corners", on_bad_frame="raise")
+    again.load_state_dict(saved)
+    assert torch.equal(again(image[None], T, K).variance, expected)
+    with pytest.raises(RuntimeError, match="landmarks"):
+        wrapped(None, on_bad_frame="raise").load_state_dict(saved)
+    with pytest.raises(RuntimeError, match="anchors: the state must hold"):
+        again.load_state_dict({name: value for name, value in saved.items() if "gray" not in name})
+    again.reset()
+    assert int(again.state_dict()["landmarks.0.view"]) == -1
+
+
+def test_a_skipped_frame_is_forgotten_by_its_source(tour):
+    frames, model, clean = pictures(tour), wrapped("corners"), wrapped("corners")
+    for i, (image, T, K) in enumerate(frames):
+        if i == 3:
+            assert model(image[None], 1.1 * T, K).ufm.statistics.fault
+        out, expected = model(image[None], T, K), clean(image[None], T, K)
+    assert torch.equal(out.variance, expected.variance)
+    model.reset([0])
+    assert int(model.state_dict()["landmarks.0.view"]) == -1
+
+
+def test_a_source_needs_the_anchored_configuration():
+    with pytest.raises(ValueError, match="anchored=True"):
+        UncertainDepth(Brightness(), anchors="corners")
+    with pytest.raises(ValueError, match="neither 'corners' nor a file"):
+        wrapped("lidar")

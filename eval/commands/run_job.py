@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,6 +22,8 @@ from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.recalibrate import beside, named, read_recalibration
 
 
 def job_from(chosen: RunOptions) -> RunJob:
@@ -38,12 +41,13 @@ def job_from(chosen: RunOptions) -> RunJob:
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
-    source = _source(options, sequence, device)
+    source = _source(options, sequence, indices, device)
     return RunJob(
         sequence=sequence,
         indices=indices,
         source=source,
         config=config.within(source.max_depth),
+        recalibration=_recalibration(chosen, source),
         device=torch.device(device),
         settings=options,
         every=options["model"] is not None and options["mode"] == "full",
@@ -51,6 +55,25 @@ def job_from(chosen: RunOptions) -> RunJob:
         sheet=not options["no_sheet"],
         landmarks=landmarks,
     )
+
+
+def _recalibration(chosen: RunOptions, source: DepthSource) -> str:
+    """FILE@DIGEST of the map that is named or lies beside the weights; "" = none.
+
+    Raises:
+        FileNotFoundError: the named file does not exist.
+        ValueError: it is no recalibration, or was fitted under other settings or to another network.
+    """
+    name, weights = chosen.uncertainty.recalibration, chosen.network.weights
+    if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
+        return ""
+    file = beside(weights[0]) if name is None else Path(name)
+    try:
+        files = source.identity.get("weights", ())
+        read_recalibration(str(file)).require(chosen.config, [one["sha256"] for one in files])
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
+    return named(file)
 
 
 def _sequence(chosen: RunOptions) -> FrameSequence:
@@ -77,7 +100,7 @@ def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], Landm
     return (lambda: landmarks_of(value, sequence.folder)) if source.needs_image else (lambda: source)
 
 
-def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) -> DepthSource:
+def _source(options: Mapping[str, Any], sequence: FrameSequence, indices: range, device: str) -> DepthSource:
     size = parse_size(options["size"])
     if options["model"] is not None:
         return network_source(
@@ -87,7 +110,7 @@ def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) ->
             mode=options["mode"],
             samples=options["samples"],
             offload=options["offload"],
-            threads=options["threads"],
+            inference=Inference(options["runtime"], options["precision"], options["threads"]),
             device=device,
         )
     if options["depth"] in OWN_DEPTH:
@@ -101,4 +124,5 @@ def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) ->
         scale=options["depth_scale"],
         intrinsics=parse_intrinsics(options["map_intrinsics"], "--map-intrinsics"),
         size=size,
+        indices=indices,
     )

@@ -17,6 +17,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.output import FrameStatistics
+from ufmstar_torch.recalibrate import Recalibration, read_recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -86,23 +87,29 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
 
     Raises:
-        ValueError: the setting changes what UfM* does not have, or what the method does not use.
+        ValueError: the setting changes what UfM* does not have, or what the method does not use; or a recalibration
+            that was fitted under other settings.
+        FileNotFoundError: the setting's recalibration does not exist.
     """
     method = row.method
     if row.setting.of_ufm_star and method.fusion in (ALONE, UFM):
         raise ValueError(f"{row.label}: settings of UfM* go with UfM* only")
     if row.setting.anchors and method.fusion != UFM_STAR:
         raise ValueError(f"{row.label}: anchors go with UfM* only")
+    if row.setting.recalibration and method.fusion != UFM_STAR:
+        raise ValueError(f"{row.label}: a recalibration goes with UfM* only")
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         config = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(config, device, uses_variances=method.uses_aleatoric)
+    recalibration = read_recalibration(row.setting.recalibration) if row.setting.recalibration else None
     return Gaussians(
         ufm_star_config(row).within(max_depth),
         device,
         uses_variances=method.uses_aleatoric,
         corrected=row.setting.corrected,
+        recalibration=recalibration,
         aleatoric_in_h=row.setting.aleatoric_in_h,
     )
 
@@ -202,6 +209,7 @@ class Gaussians:
         device: of the mixture.
         uses_variances: False leaves A and E aside.
         corrected: answer with the depth corrected by the anchors' bias, and the variance that remains.
+        recalibration: of the variance; None = as it is.
         aleatoric_in_h: the config has two features: the aleatoric variance, kept in the mixture, and 1. What is read
             back is added instead of the pixel's own, A'(x) = sum_k w_k(x) a_k + (1 - sum_k w_k(x)) A: the pixel's own
             as far as no component explains it, where the mixture alone would read as 0.
@@ -214,9 +222,10 @@ class Gaussians:
         *,
         uses_variances: bool = True,
         corrected: bool = False,
+        recalibration: Recalibration | None = None,
         aleatoric_in_h: bool = False,
     ) -> None:
-        self.ufm = UfMStar(config, device=device)
+        self.ufm = UfMStar(config, recalibration=recalibration, device=device)
         self._uses_variances, self._corrected, self._in_h = uses_variances, corrected, aleatoric_in_h
         self._anchors = 0
 

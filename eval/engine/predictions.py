@@ -98,6 +98,7 @@ class DepthSource(Protocol):
         cacheable: whether a store may keep its predictions. They are then of single precision, read or computed.
         is_truth: whether it is the sequence's own depth, which has no error.
         max_depth: [m] the largest depth that its networks can predict; None where it is not known.
+        runtime: what runs the networks, for the record: name, version, threads, precision; None of maps.
     """
 
     @property
@@ -118,6 +119,8 @@ class DepthSource(Protocol):
     def is_truth(self) -> bool: ...
     @property
     def max_depth(self) -> float | None: ...
+    @property
+    def runtime(self) -> Mapping[str, Any] | None: ...
 
     def prepared(self, how: str) -> DepthSource:
         """The same source with its images prepared as ``Setting.preprocess`` says; itself where that is no change.

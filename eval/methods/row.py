@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting
+from ufmstar_torch.recalibrate import split_name
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class Row:
     def changed(self) -> dict[str, Any]:
         """Settings that are not the default, but for what is part of ``name``."""
         values = self.setting.to_dict()
+        if self.setting.recalibration:  # without the folder
+            values["recalibration"] = Path(split_name(self.setting.recalibration)[0]).name
         return {name: value for name, value in values.items() if (name, value) != ("anchors", TRACKED)}
 
     @property

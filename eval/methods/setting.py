@@ -48,6 +48,7 @@ class Setting(Checked):
         anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
+        recalibration: FILE or FILE@DIGEST of a map of the variance (``ufmstar recalibrate``); "" = none.
 
     Raises:
         ValueError: a value is out of range, or they do not go together.
@@ -67,6 +68,7 @@ class Setting(Checked):
     anchor_count: int | None = number(None, "", "1", 0)
     track_noise: float = number(0.0, "", "px", 0.0, open_high=True)
     corrected: bool = False
+    recalibration: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()

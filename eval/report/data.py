@@ -287,7 +287,7 @@ def _merge_sums(paths: Sequence[Path]) -> Merged:
     """Add sums in the order given, which decides the last bits, and compute figures and curves from them."""
     total: Sums = {}
     for path in paths:
-        for name, states in _read_sums(path).items():
+        for name, states in read_sums(path).items():
             mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
             if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
                 raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
@@ -296,7 +296,7 @@ def _merge_sums(paths: Sequence[Path]) -> Merged:
     return _compute(total, paths)
 
 
-def _read_sums(path: Path) -> Sums:
+def read_sums(path: Path) -> Sums:
     """``RowResult.sums`` of one row on one sequence."""
     try:
         sums = torch.load(path, map_location="cpu", weights_only=True)
