@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from ufmstar_torch.anchors.dense import DenseConfig as DenseConfig
+    from ufmstar_torch.anchors.dense import DenseEvidence as DenseEvidence
     from ufmstar_torch.anchors.given import Anchors as Anchors
     from ufmstar_torch.anchors.tracker import Landmarks as Landmarks
     from ufmstar_torch.anchors.tracker import LandmarkTracker as LandmarkTracker
@@ -12,4 +14,4 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__ = lazy_names(__name__)
 
-__all__ = ["Anchors", "LandmarkTracker", "Landmarks", "TrackerConfig"]
+__all__ = ["Anchors", "DenseConfig", "DenseEvidence", "LandmarkTracker", "Landmarks", "TrackerConfig"]
