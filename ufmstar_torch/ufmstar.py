@@ -19,6 +19,7 @@ from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
@@ -36,6 +37,7 @@ class UfMStar(StatefulModule):
 
     Args:
         config: see :class:`UfMStarConfig`; None = the paper's.
+        recalibration: maps V, after everything else; its parts M, A, E and B stay as they are. None = V as it is.
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; it follows the first frame otherwise.
 
@@ -53,12 +55,14 @@ class UfMStar(StatefulModule):
     STATE = UfMStarState.names()
     config: UfMStarConfig
     observer: StepObserver | None = None
+    recalibration: Recalibration | None
     _warned: bool = False
 
     def __init__(
         self,
         config: UfMStarConfig | None = None,
         *,
+        recalibration: Recalibration | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
@@ -68,6 +72,9 @@ class UfMStar(StatefulModule):
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
+        if recalibration is not None:
+            recalibration.require(self.config)
+        self.recalibration = recalibration
         for name, value in UfMStarState.initial(0, self.config, dtype, device or "cpu").tensors().items():
             self.register_buffer(name, value)
 
@@ -222,9 +229,9 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
-            keep_evidence: keep what anchors taught of a stream as a whole, what this network has been getting wrong
-                lately: a robot that starts in the same place again is not blind at its first frames. What was learnt
-                of single components goes with them. The batch size stays.
+            keep_evidence: keep the sums over anchors of a stream as a whole, the recent error of this network: a robot
+                that starts in the same place again has an estimate at its first frames. The sums of single components
+                go with the components. The batch size stays.
 
         Raises:
             IndexError: an index is out of range.
@@ -309,6 +316,8 @@ class UfMStar(StatefulModule):
             variance = variance + chosen(own)
         if self.config.variance_floor:
             variance = variance.clamp_min(self.config.variance_floor)
+        if self.recalibration is not None:
+            variance = self.recalibration(variance)
         return out, variance, anchored
 
     def _warn_without_segments(self, frame: FrameInput, out: StepOutput) -> None:

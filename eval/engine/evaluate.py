@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.confident import references
@@ -98,13 +99,16 @@ def evaluate_sequence(
     Raises:
         SequenceError: the sequence cannot be used.
         Stopped: ``stop`` returned True; nothing of the sequence counts.
-        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know.
+        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know, or
+            preprocessing of maps that exist already.
     """
     _check_arguments(rows, networks, confident)
     indices = range(len(sequence))[limit]
     _check_sequence(sequence, rows, indices)
-    used = [networks[base] for base in dict.fromkeys(row.method.base for row in rows)]
-    tracked = any(row.setting.anchors == TRACKED for row in rows)
+    wanted = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
+    sources = {(base, how): networks[base].prepared(how) for base, how in wanted}
+    used = list(sources.values())
+    tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
 
     def check(frame: Frame) -> None:
         """Raises FrameError unless all networks and UfM* can use the frame."""
@@ -116,11 +120,11 @@ def evaluate_sequence(
         if fault is not None:
             raise FrameError(frame.name, fault)
 
-    anchors = anchor_sources(rows)
+    anchors = anchor_sources(rows, sequence.folder)
     runners = [
         RowRunner(
             row.slug,
-            networks[row.method.base],
+            sources[row.method.base, row.setting.preprocess],
             make_estimator(row, device),
             every=row.method.every_member,
             setting=row.setting,

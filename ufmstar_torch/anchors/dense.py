@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -82,10 +82,17 @@ class DenseEvidence:
             out = ufm(depth, T_world_cam, K_map, anchors=landmarks.anchors(K, K_map))
     """
 
+    needs_image = True
+
     def __init__(self, config: DenseConfig | None = None) -> None:
         self.config = config if config is not None else DenseConfig()
         self._keyframes = Keyframes(self.config.keyframes)
         self.reset()
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Plain values on which the anchors depend."""
+        return {"anchors": "dense", "dense": self.config.to_dict()}
 
     def reset(self) -> None:
         """Forget everything."""
@@ -114,7 +121,9 @@ class DenseEvidence:
         self._camera = ((height, width), K) if height else None
         self._depth, self._disagreement = state["numbers"].tolist()
 
-    def update(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]) -> Landmarks:
+    def update(
+        self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
         """Take in the next image.
 
         Args:
@@ -126,6 +135,7 @@ class DenseEvidence:
             The depths measured in it; none before there is parallax. ``tracked`` counts the pixels that were searched.
 
         Raises:
+            TypeError: ``image`` is no array.
             ValueError: wrong shape or dtype, a pose that is not finite, another size or camera than before (call
                 :meth:`reset` first); everything is as it was then.
             ModuleNotFoundError: OpenCV is not installed.
