@@ -10,11 +10,12 @@ from torch import Tensor
 
 from ufmstar_torch import unmeasured
 from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, check_anchors
+from ufmstar_torch.arguments import require_float
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_step
+from ufmstar_torch.kernels.select import select_check, select_step
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
@@ -268,10 +269,11 @@ class UfMStar(StatefulModule):
 
     def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
+        require_float("depth", depth)
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
-            max_depth=self.config.segment.max_depth,
+            max_depth=self.config.segment.max_depth, kernel=select_check(self.config.backend, depth.device.type),
         )  # fmt: skip
 
     def _observe(
@@ -324,7 +326,7 @@ class UfMStar(StatefulModule):
         """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
         if self._warned or frame.depth.device.type != "cpu":
             return
-        given = frame.valid.sum((1, 2)) + frame.beyond + frame.out_of_range
+        given = out.statistics.valid_pixels + frame.beyond + frame.out_of_range
         empty = (given > 0) & (out.statistics.segments == 0)
         if not bool(empty.any()):
             return
