@@ -101,9 +101,9 @@ def test_words_and_files_become_sources(file, tmp_path):
     assert isinstance(landmark_source(file), LandmarkMap)
     own = LandmarkMap.read(file)
     assert landmark_source(own) is own
-    for value, told in (("lidar", "'lidar' is neither 'corners', 'dense' nor a file .csv"),):
-        with pytest.raises(ValueError, match=told):
-            landmark_source(value)
+    assert isinstance(landmark_source("dense"), DenseEvidence)
+    with pytest.raises(ValueError, match="'lidar' is neither 'corners', 'dense' nor a file .csv"):
+        landmark_source("lidar")
     for value in (True, "corners", "tracked"):
         assert isinstance(landmarks_of(value, None), LandmarkTracker)
     assert landmarks_of(file.name, file.parent).identity == own.identity

@@ -68,7 +68,8 @@ def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
     """The source that a word or a file's name stands for, in its initial state.
 
     Args:
-        value: "corners": tracked corners; "dense": dense evidence; the name of a file: :meth:`LandmarkMap.read`; a source: itself.
+        value: "corners": tracked corners; "dense": dense evidence; the name of a file:
+            :meth:`LandmarkMap.read`; a source: itself.
 
     Raises:
         FileNotFoundError: no such file.
