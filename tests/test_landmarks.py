@@ -12,6 +12,7 @@ from test_suite_anchors import Biased, evaluate, in_memory, row
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source
+from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.anchors import landmark_digests, landmarks_of
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
@@ -102,7 +103,7 @@ def test_words_and_files_become_sources(file, tmp_path):
     own = LandmarkMap.read(file)
     assert landmark_source(own) is own
     assert isinstance(landmark_source("dense"), DenseEvidence)
-    with pytest.raises(ValueError, match="'lidar' is neither 'corners', 'dense' nor a file .csv"):
+    with pytest.raises(ValueError, match=r"'lidar' is neither 'corners', 'dense' nor a file \.csv"):
         landmark_source("lidar")
     for value in (True, "corners", "tracked"):
         assert isinstance(landmarks_of(value, None), LandmarkTracker)
