@@ -14,7 +14,8 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_step
+from ufmstar_torch.kernels.select import select_merge, select_step
+from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
@@ -294,7 +295,8 @@ class UfMStar(StatefulModule):
                 state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
-            self._store(state.tensors())
+            kernels = select_merge(self.config.backend, frame.depth.device.type)
+            self._store(merged(state, frame.fault == 0, self.config, kernels).tensors())
             self._warn_without_segments(frame, out)
 
         def chosen(value: Tensor) -> Tensor:

@@ -9,6 +9,8 @@ from typing import Any
 
 from torch import Tensor
 
+from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
+from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
@@ -43,6 +45,15 @@ def select_kernels(name: str, device_type: str) -> Kernels:
     if compiled is None or device_type == "cpu":
         return compiled or REFERENCE
     return replace(REFERENCE, spgf=_on_host(compiled.spgf))
+
+
+def select_merge(name: str, device_type: str) -> MergeKernels:
+    """The kernels of merging for a device; the step's selection has checked the name."""
+    if device_type != "cpu" or name == "torch" or (name == "auto" and _numba_or_none() is None):
+        return MERGE_REFERENCE
+    from ufmstar_torch.kernels import merge_cpu
+
+    return MergeKernels(merge_cpu.partition, merge_cpu.own_shares)
 
 
 @functools.cache
