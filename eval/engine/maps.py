@@ -14,6 +14,7 @@ import torch
 
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.methods.setting import CROP
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
@@ -57,7 +58,7 @@ class MapSource:
         digest: of the identity.
     """
 
-    needs_image, cacheable, passes = False, False, 1
+    needs_image, cacheable, passes, runtime = False, False, 1, None
     networks: tuple[DepthNetwork, ...] = ()
 
     def __init__(
@@ -72,6 +73,12 @@ class MapSource:
     ) -> None:
         self._read, self._size = read, size
         self.identity, self.is_truth, self.label, self.digest = dict(identity), is_truth, label, digest
+
+    def prepared(self, how: str) -> MapSource:
+        """Itself: maps show the whole frame; "crop" raises ValueError."""
+        if how == CROP:
+            raise ValueError(f'preprocess = "{CROP}" goes with networks: maps exist already')
+        return self
 
     def turn(self, position: int) -> int:
         """0: maps have no members."""
