@@ -304,8 +304,10 @@ class UfMStar(StatefulModule):
                 state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
-            kernels = select_merge(self.config.backend, frame.depth.device.type)
-            self._store(merged(state, frame.fault == 0, self.config, kernels).tensors())
+            if self.config.merge:
+                kernels = select_merge(self.config.backend, frame.depth.device.type)
+                state = merged(state, frame.fault == 0, self.config, kernels)
+            self._store(state.tensors())
             self._warn_without_segments(frame, out)
 
         def chosen(value: Tensor) -> Tensor:
