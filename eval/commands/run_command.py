@@ -49,7 +49,8 @@ class MapOptions:
     """Depth from files, instead of a network.
 
     Attributes:
-        depth: folder of predicted maps (16-bit PNG, EXR, npy); 'self': the sequence's own depth
+        depth: folder of predicted maps (16-bit PNG, EXR, npy), or an earlier run's output; 'self': the sequence's own
+            depth
         variance: folder of variance maps [m^2] that belong to them
         depth_scale: metres per unit of the maps in the folder
         map_intrinsics: of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]
