@@ -285,5 +285,5 @@ def test_a_skipped_frame_is_forgotten_by_its_source(tour):
 def test_a_source_needs_the_anchored_configuration():
     with pytest.raises(ValueError, match="anchored=True"):
         UncertainDepth(Brightness(), anchors="corners")
-    with pytest.raises(ValueError, match="neither 'corners' nor a file"):
+    with pytest.raises(ValueError, match="neither 'corners', 'dense' nor a file"):
         wrapped("lidar")
