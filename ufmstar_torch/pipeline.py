@@ -156,8 +156,9 @@ class UncertainDepth(NetworksInTurn):
             network must sample by itself in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the network's input; None passes both through.
         anchors: what yields the anchors of every image, with ``config.anchored``: "corners" (tracked in the image),
-            a file of landmarks, or a :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a
-            list with one for each. Saved and reset with the state. None: those given with an image, if any.
+            "dense" (searched in earlier images), a file of landmarks, or a
+            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
+            each. Saved and reset with the state. None: those given with an image, if any.
         recalibration: of the variance, as :class:`UfMStar` takes it (``Recalibration.from_json(FILE)``).
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself

@@ -15,7 +15,8 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_check, select_step
+from ufmstar_torch.kernels.select import select_check, select_merge, select_step
+from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
@@ -303,6 +304,9 @@ class UfMStar(StatefulModule):
                 state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
+            if self.config.merge:
+                kernels = select_merge(self.config.backend, frame.depth.device.type)
+                state = merged(state, frame.fault == 0, self.config, kernels)
             self._store(state.tensors())
             self._warn_without_segments(frame, out)
 

@@ -10,6 +10,8 @@ from typing import Any
 from torch import Tensor
 
 from ufmstar_torch.frame import CheckKernel, check_values
+from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
+from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
@@ -43,6 +45,15 @@ def select_check(name: str, device_type: str) -> CheckKernel:
 
         return check_cpu.check_values
     return check_values
+
+
+def select_merge(name: str, device_type: str) -> MergeKernels:
+    """The parts of merging; arguments and errors as :func:`select_step`."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import merge_cpu
+
+        return MergeKernels(merge_cpu.partition, merge_cpu.own_shares)
+    return MERGE_REFERENCE
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:
