@@ -71,7 +71,9 @@ def correspond(
     camera = intrinsics.to(torch.float64).contiguous()
     previous, current = candidates(previous_cam, still, current_cam, camera, size, config)
     matched, pairs = match.new_zeros(b, 1), match.new_zeros(b, dtype=torch.int32)
-    _launch_match(previous, current, config, match, overlap, match.new_zeros(1, dtype=torch.int64), matched, pairs, True)
+    _launch_match(
+        previous, current, config, match, overlap, match.new_zeros(1, dtype=torch.int64), matched, pairs, True
+    )
     return Correspondence(match, overlap)
 
 

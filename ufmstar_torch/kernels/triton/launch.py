@@ -15,7 +15,9 @@ def interpreted() -> bool:
     return os.environ.get("TRITON_INTERPRET", "0") == "1"
 
 
-def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, fused: bool = False, **known: Any) -> None:
+def launch(
+    kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 4, fused: bool = False, **known: Any
+) -> None:
     """Queue a kernel on the current stream of its tensors' device.
 
     Args:

@@ -64,6 +64,14 @@ def regress_image(
     return Regression(maps, features)
 
 
+def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
+    """As :func:`ufmstar_torch.regress.smooth`, in one launch."""
+    before, now = previous.contiguous(), current.contiguous()
+    memory, shown = torch.empty_like(before), torch.empty_like(now)
+    launch(_smooth, (triton.cdiv(now.numel(), 1024),), before, now, memory, shown, now.numel(), alpha=alpha, chunk=1024)
+    return memory, shown
+
+
 def prepare(
     mixture: GaussianMixture,
     camera: Tensor,
@@ -101,6 +109,22 @@ def prepare(
         share=math.log2(EPSILON[dtype] / 3) - 0.01 + math.log2(_PRIOR * config.prior_weight), chunk=_SLOTS,
     )  # fmt: skip
     return means, fields, index, count
+
+
+@triton.jit
+def mixed(before, now, alpha: tl.constexpr):
+    """The new memory of the moving average; NaN is no value."""
+    both = (1 - alpha) * before + alpha * now
+    return tl.where(now != now, before, tl.where(before != before, now, both))
+
+
+@triton.jit
+def _smooth(previous, current, memory, shown, count, alpha: tl.constexpr, chunk: tl.constexpr):
+    i = tl.program_id(0) * chunk + tl.arange(0, chunk)
+    now = tl.load(current + i, mask=i < count, other=0.0).to(memory.dtype.element_ty)
+    kept = mixed(tl.load(previous + i, mask=i < count, other=0.0), now, alpha)
+    tl.store(memory + i, kept, mask=i < count)
+    tl.store(shown + i, tl.where(now != now, now, kept).to(shown.dtype.element_ty), mask=i < count)
 
 
 @triton.jit
@@ -299,4 +323,6 @@ def _regress(
     tl.store(out + target, tl.where(ok, total / evidence, nan), mask=inside)
     if channels > 0:
         values = tl.where(ok[:, None], sums / evidence[:, None], nan)
-        tl.store(out_f + target[:, None] * channels + f[None, :], values, mask=inside[:, None] & (f < channels)[None, :])
+        tl.store(
+            out_f + target[:, None] * channels + f[None, :], values, mask=inside[:, None] & (f < channels)[None, :]
+        )
