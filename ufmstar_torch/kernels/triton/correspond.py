@@ -1,8 +1,8 @@
 """Correspondence on a GPU in two launches: candidates are projected and listed, then each is matched.
 
-The second launch has a program per candidate k of the mixture. It compares k with all candidates c of the image, 32 at a
-time, and only where some match looks for members k' that hide k: a c loses k to a nearer k' that overlaps k by more than
-eta_occl and belongs to c's set as well. That is the reference's rule, turned around so that a program needs no memory.
+The second launch has a program per candidate k of the mixture. It compares k with all candidates c of the image, 32 at
+a time. Where some match it looks for what hides k: a c loses k to a nearer k' that overlaps k by more than eta_occl and
+belongs to c's set as well. That is the reference's rule, turned around so that a program needs no memory.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ def _fuse(
         h = tl.load(features + k[:, None] * channels + f[None, :], mask=in_f, other=0.0).to(tl.float64)
     at = tl.load(place + k, mask=there, other=-1)
     n = tl.load(listed_c + b)
-    for w in range(0, tl.cdiv(n, word)):
+    for w in range(tl.cdiv(n, word)):
         left = tl.load(bits + (b * many_k + at) * words + w, mask=at >= 0, other=0)
         while tl.max(left, 0) > 0:
             use = left != 0

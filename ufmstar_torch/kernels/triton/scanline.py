@@ -86,6 +86,12 @@ def _or(value: Tensor | None, other: Tensor) -> Tensor:
 
 
 @triton.jit
+def slope_of(focal, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr):
+    """a/f [1/m] (``SPGFConfig.slope``)."""
+    return scale * (focal / reference) / focal if scaled else scale / focal
+
+
+@triton.jit
 def _bins(
     depth, camera, lengths2, bins, height, width,
     number: tl.constexpr, shortest: tl.constexpr, longest: tl.constexpr, chunk: tl.constexpr,
@@ -155,10 +161,7 @@ def _scanline(
     ry = (v.to(tl.float64) - cy) / fy
     y_factor = (1.0 + ry * ry)[:, None]
     focal = tl.minimum(fx, fy)
-    if scaled:
-        slope = scale * (focal / reference) / focal
-    else:
-        slope = scale / focal
+    slope = slope_of(focal, scale, reference, scaled)
 
     q = tl.arange(0, places)[None, :]
     empty = tl.zeros([lanes, places], tl.float64)

@@ -1,8 +1,8 @@
 """SPGF on a GPU: rows (``scanline``), then a program per stream joins the segments of successive rows.
 
-The active Gaussians are the lanes of one block, at most two for every segment that a row can hold: those that go on and
-those that a row adds. Of every segment all lanes are tested at once. A Gaussian is pruned as soon as it ends, so what is
-kept goes straight to its slot of the mixture.
+The active Gaussians are the lanes of one block, at most two for every segment that a row can hold: those that go on
+and those that a row adds. A segment is tested against all lanes at once. A Gaussian is pruned as soon as it ends, so
+what is kept goes straight to its slot of the mixture.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import floored, store_symmetric
-from ufmstar_torch.kernels.triton.scanline import Rows, scanlines
+from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment import _most_kept
 from ufmstar_torch.segment_input import SegmentInput
@@ -142,6 +142,12 @@ def _feature_means(features, slots, weight, out, pixels, capacity, channels, chu
 
 
 @triton.jit
+def _stored(x, single: tl.constexpr):
+    """x with the precision of float32, if it is to be stored so."""
+    return x.to(tl.float32).to(tl.float64) if single else x
+
+
+@triton.jit
 def _join(
     camera, lengths2, moments, whole, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
     height, most, capacity, total,
@@ -153,10 +159,7 @@ def _join(
     b = tl.program_id(0).to(tl.int64)
     fx, fy, cy = tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4), tl.load(camera + 9 * b + 5)
     focal = tl.minimum(fx, fy)
-    if scaled:
-        slope = scale * (focal / reference) / focal
-    else:
-        slope = scale / focal
+    slope = slope_of(focal, scale, reference, scaled)
     lane = tl.arange(0, lanes)
     zero = tl.zeros([lanes], tl.float64)
     mx, my, mz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -261,34 +264,14 @@ def _join(
             out = b * capacity + slot
             ratio = tl.where(n > 1, n - 1, 1).to(tl.float64)
             some = n > 1
-            cxx, cxy, cxz = (
-                tl.where(some, sxx / ratio, 0.0),
-                tl.where(some, sxy / ratio, 0.0),
-                tl.where(some, sxz / ratio, 0.0),
-            )
-            cyy, cyz, czz = (
-                tl.where(some, syy / ratio, 0.0),
-                tl.where(some, syz / ratio, 0.0),
-                tl.where(some, szz / ratio, 0.0),
-            )
+            cxx, cxy = tl.where(some, sxx / ratio, 0.0), tl.where(some, sxy / ratio, 0.0)
+            cxz, cyy = tl.where(some, sxz / ratio, 0.0), tl.where(some, syy / ratio, 0.0)
+            cyz, czz = tl.where(some, syz / ratio, 0.0), tl.where(some, szz / ratio, 0.0)
             ax, ay, az = mx, my, mz
             if lifted:
-                if rounded:
-                    ax, ay, az = (
-                        ax.to(tl.float32).to(tl.float64),
-                        ay.to(tl.float32).to(tl.float64),
-                        az.to(tl.float32).to(tl.float64),
-                    )
-                    cxx, cxy, cxz = (
-                        cxx.to(tl.float32).to(tl.float64),
-                        cxy.to(tl.float32).to(tl.float64),
-                        cxz.to(tl.float32).to(tl.float64),
-                    )
-                    cyy, cyz, czz = (
-                        cyy.to(tl.float32).to(tl.float64),
-                        cyz.to(tl.float32).to(tl.float64),
-                        czz.to(tl.float32).to(tl.float64),
-                    )
+                ax, ay, az = _stored(ax, rounded), _stored(ay, rounded), _stored(az, rounded)
+                cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
+                cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
                 across = tl.maximum(az, near_plane) / focal
                 least = tl.maximum(across * across * pixel_variance, epsilon * (cxx + cyy + czz))
                 cxx, cxy, cxz, cyy, cyz, czz = floored(cxx, cxy, cxz, cyy, cyz, czz, least)
