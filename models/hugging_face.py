@@ -290,7 +290,7 @@ def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
     own = METRIC if model_type in _METRIC else _DECLARED.get(str(stated))
     if own is not None and kind not in (None, own):
         said = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
-        raise ValueError(f"kind={kind!r}, but {name} says {said}, which is {own!r}")
+        raise ValueError(f"kind={kind!r}, but {name} states {said}, which is {own!r}")
     if stated == METRIC and "max_depth" not in config:
-        raise ValueError(f"{name} says metric, but not the max_depth [m] that its output is a share of")
+        raise ValueError(f"{name} states metric depth, but not the max_depth [m] that its output is a share of")
     return own or str(kind)

@@ -21,7 +21,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 for dtype in (torch.float32, torch.float64):
     depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
     K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
-    ufm = UfMStar(UfMStarConfig(backend="numba"))
+    ufm = UfMStar(UfMStarConfig(backend="numba", merge=1.0, merge_every=1))
     for _ in range(2):
         ufm(depth, pose, K)
 """

@@ -51,6 +51,15 @@ def words_for(rooms, out, *more, suite="depth-only"):
     return ["eval", "--suite", suite, "--network", TRUTH, "--root", f"rooms={rooms}", "--out", out, *more]
 
 
+def test_one_preset_for_all_rows(rooms, tmp_path):
+    words = [str(word) for word in words_for(rooms, tmp_path / "out")[1:]]
+    settings = {preset: job_from(read([*words, "--ufm-preset", preset])).suite.rows[-1].setting.to_dict()
+                for preset in ("paper", "default")}  # fmt: skip
+    assert settings == {"paper": {"ufm_preset": "paper"}, "default": {}}
+    with pytest.raises(ValueError, match="ufm-preset"):
+        read([*words, "--ufm-preset", "papers"])
+
+
 def test_list_names_every_suite(ufmstar):
     code, out, _ = ufmstar("eval", "--list")
     assert code == 0

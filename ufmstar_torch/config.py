@@ -156,6 +156,9 @@ class UfMStarConfig(Checked):
         anchored: use anchors, sparse measured depths (an extension)
         anchor_half_life: age after which an anchor's evidence counts half
         anchor_shrinkage: anchors that a Gaussian needs to be believed half
+        merge: loss per pixel up to which two Gaussians are joined; 0 = Gaussians are never merged
+        merge_share: share in its own points below which a Gaussian is dissolved in the others
+        merge_every: frames of a stream from one merging to the next
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians; null = no limit
@@ -197,6 +200,11 @@ class UfMStarConfig(Checked):
     anchored: bool = False
     anchor_half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
     anchor_shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
+
+    # Merging (an extension, not in the paper: ``merge``)
+    merge: float = number(0.0, "l_max", "nat", 0.0, 10.0)
+    merge_share: float = number(0.05, "s_min", "1", 0.0, 0.5)
+    merge_every: int = number(50, "n", "frames", 1)
 
     # State
     features: int = number(0, "dim H - 1", "1", 0)

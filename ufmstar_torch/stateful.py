@@ -77,7 +77,8 @@ class StatefulModule(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
-        saved = _config_of(state)
+        # A setting younger than the state had its default.
+        saved = type(self.config)().to_dict() | _config_of(state)
         ours = self.config.to_dict()
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:

@@ -10,15 +10,18 @@ from torch import Tensor
 
 from ufmstar_torch import unmeasured
 from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, check_anchors
+from ufmstar_torch.arguments import require_float
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_step
+from ufmstar_torch.kernels.select import select_check, select_merge, select_step
+from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
@@ -36,6 +39,7 @@ class UfMStar(StatefulModule):
 
     Args:
         config: see :class:`UfMStarConfig`; None = the paper's.
+        recalibration: maps V, after everything else; its parts M, A, E and B stay as they are. None = V as it is.
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; it follows the first frame otherwise.
 
@@ -53,12 +57,14 @@ class UfMStar(StatefulModule):
     STATE = UfMStarState.names()
     config: UfMStarConfig
     observer: StepObserver | None = None
+    recalibration: Recalibration | None
     _warned: bool = False
 
     def __init__(
         self,
         config: UfMStarConfig | None = None,
         *,
+        recalibration: Recalibration | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
@@ -68,6 +74,9 @@ class UfMStar(StatefulModule):
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
+        if recalibration is not None:
+            recalibration.require(self.config)
+        self.recalibration = recalibration
         for name, value in UfMStarState.initial(0, self.config, dtype, device or "cpu").tensors().items():
             self.register_buffer(name, value)
 
@@ -222,9 +231,9 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
-            keep_evidence: keep what anchors taught of a stream as a whole, what this network has been getting wrong
-                lately: a robot that starts in the same place again is not blind at its first frames. What was learnt
-                of single components goes with them. The batch size stays.
+            keep_evidence: keep the sums over anchors of a stream as a whole, the recent error of this network: a robot
+                that starts in the same place again has an estimate at its first frames. The sums of single components
+                go with the components. The batch size stays.
 
         Raises:
             IndexError: an index is out of range.
@@ -261,10 +270,11 @@ class UfMStar(StatefulModule):
 
     def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
+        require_float("depth", depth)
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
-            max_depth=self.config.segment.max_depth,
+            max_depth=self.config.segment.max_depth, kernel=select_check(self.config.backend, depth.device.type),
         )  # fmt: skip
 
     def _observe(
@@ -294,6 +304,9 @@ class UfMStar(StatefulModule):
                 state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
+            if self.config.merge:
+                kernels = select_merge(self.config.backend, frame.depth.device.type)
+                state = merged(state, frame.fault == 0, self.config, kernels)
             self._store(state.tensors())
             self._warn_without_segments(frame, out)
 
@@ -309,13 +322,15 @@ class UfMStar(StatefulModule):
             variance = variance + chosen(own)
         if self.config.variance_floor:
             variance = variance.clamp_min(self.config.variance_floor)
+        if self.recalibration is not None:
+            variance = self.recalibration(variance)
         return out, variance, anchored
 
     def _warn_without_segments(self, frame: FrameInput, out: StepOutput) -> None:
         """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
         if self._warned or frame.depth.device.type != "cpu":
             return
-        given = frame.valid.sum((1, 2)) + frame.beyond + frame.out_of_range
+        given = out.statistics.valid_pixels + frame.beyond + frame.out_of_range
         empty = (given > 0) & (out.statistics.segments == 0)
         if not bool(empty.any()):
             return

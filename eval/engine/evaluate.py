@@ -98,12 +98,15 @@ def evaluate_sequence(
     Raises:
         SequenceError: the sequence cannot be used.
         Stopped: ``stop`` returned True; nothing of the sequence counts.
-        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know.
+        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know, or
+            preprocessing of maps that exist already.
     """
     _check_arguments(rows, networks, confident)
     indices = range(len(sequence))[limit]
     _check_sequence(sequence, rows, indices)
-    used = [networks[base] for base in dict.fromkeys(row.method.base for row in rows)]
+    wanted = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
+    sources = {(base, how): networks[base].prepared(how) for base, how in wanted}
+    used = list(sources.values())
     tracked = any(row.setting.anchors == TRACKED for row in rows)
 
     def check(frame: Frame) -> None:
@@ -116,11 +119,11 @@ def evaluate_sequence(
         if fault is not None:
             raise FrameError(frame.name, fault)
 
-    anchors = anchor_sources(rows)
+    anchors = anchor_sources(rows, sequence.folder)
     runners = [
         RowRunner(
             row.slug,
-            networks[row.method.base],
+            sources[row.method.base, row.setting.preprocess],
             make_estimator(row, device),
             every=row.method.every_member,
             setting=row.setting,

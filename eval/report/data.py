@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
+from ufmstar_torch.eval.methods.row import Row, plain_rows
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import unpack
 from ufmstar_torch.eval.results.record import Record
 
@@ -113,8 +113,8 @@ class Results:
         return self._by_row.get((row, dataset), ())
 
     def default_rows(self, base: str | None = None) -> list[Row]:
-        """The rows of a base (None: of all) with the default setting."""
-        return [row for row in self.rows if row.setting == DEFAULT and base in (None, row.method.base)]
+        """Of each method of a base (None: of all) the first row that no ablation varies."""
+        return [row for row in plain_rows(self.rows) if base in (None, row.method.base)]
 
     def sequences(self, dataset: str | None = None) -> tuple[tuple[str, str], ...]:
         """(dataset, sequence) with a record, sorted."""
@@ -287,7 +287,7 @@ def _merge_sums(paths: Sequence[Path]) -> Merged:
     """Add sums in the order given, which decides the last bits, and compute figures and curves from them."""
     total: Sums = {}
     for path in paths:
-        for name, states in _read_sums(path).items():
+        for name, states in read_sums(path).items():
             mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
             if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
                 raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
@@ -296,7 +296,7 @@ def _merge_sums(paths: Sequence[Path]) -> Merged:
     return _compute(total, paths)
 
 
-def _read_sums(path: Path) -> Sums:
+def read_sums(path: Path) -> Sums:
     """``RowResult.sums`` of one row on one sequence."""
     try:
         sums = torch.load(path, map_location="cpu", weights_only=True)

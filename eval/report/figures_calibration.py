@@ -176,7 +176,7 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
         title: over the picture.
 
     Raises:
-        ValueError: there are no curves, or more than can be told apart.
+        ValueError: there are no curves, or more than have a look of their own.
         ImportError: matplotlib is missing.
     """
     if not 1 <= len(curves) <= len(_BY_ORDER):

@@ -141,7 +141,7 @@ def label_ends(axes: Any, ends: Iterable[tuple[float, str, str]], *, size: float
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, as the suffix says (.svg or .png); the same figure gives the same bytes.
+    """Write a figure, by its suffix (.svg or .png); the same figure gives the same bytes.
 
     Raises:
         OSError: see ``write_atomic``.

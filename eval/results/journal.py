@@ -166,7 +166,8 @@ def _anchor_figures(row: RowFrame) -> dict[str, Any]:
     """Of a run with anchors: what became of the frame's corners, and the means of B [m^2] and of r.
 
     ``tracked`` were followed from the frame before, of which ``found`` were triangulated; ``usable`` lie on a pixel
-    with a depth, and ``used`` agree with others. Without any used, ``without`` says why.
+    with a depth, and ``used`` agree with others. Without any used, ``without`` says why. Of a map of landmarks,
+    ``tracked`` counts all, and ``found`` those in view.
     """
     anchors, estimate = row.anchors, row.estimate
     if anchors is None or estimate.anchored is None or estimate.bias is None:
@@ -182,15 +183,16 @@ def _corners(anchors: FrameAnchors, estimate: Estimate) -> dict[str, Any]:
     assert estimate.statistics is not None
     used, usable = int(estimate.statistics.anchors_used[0]), int(estimate.statistics.anchors[0])
     counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
-    return {**counts, "without": None if used else why_none(anchors.tracked, anchors.triangulated, usable)}
+    why = None if used else why_none(anchors.tracked, anchors.triangulated, usable, anchors.none)
+    return {**counts, "without": why}
 
 
-def why_none(tracked: int, triangulated: int, usable: int) -> str:
-    """Why a frame has no anchors, from how many were left at each stage."""
+def why_none(tracked: int, triangulated: int, usable: int, none: str) -> str:
+    """Why a frame has no anchors, from how many were left at each stage, and why none was triangulated."""
     if not tracked:
         return "no corner followed from the frame before"
     if not triangulated:
-        return "no parallax, or no track that fits the poses"
+        return none
     return "none lies on a pixel with a depth" if not usable else "they contradict each other"
 
 
