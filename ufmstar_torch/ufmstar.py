@@ -274,7 +274,7 @@ class UfMStar(StatefulModule):
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
-            max_depth=self.config.segment.max_depth, kernel=select_check(self.config.backend, depth.device.type),
+            max_depth=self.config.segment.depth_limit, kernel=select_check(self.config.backend, depth.device.type),
         )  # fmt: skip
 
     def _observe(
@@ -338,7 +338,7 @@ class UfMStar(StatefulModule):
         b = int(empty.nonzero()[0])
         warnings.warn(
             f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(given[b])} pixels "
-            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.max_depth} m and "
+            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.depth_limit} m and "
             f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
             "intrinsics the depth map's? (said once)",
             stacklevel=5,
