@@ -84,7 +84,9 @@ class StatefulModule(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
-        saved, ours = _flat(_config_of(state)), _flat(self.config.to_dict())
+        # A setting younger than the state had its default.
+        saved = _flat(type(self.config)().to_dict()) | _flat(_config_of(state))
+        ours = _flat(self.config.to_dict())
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
             each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)

@@ -74,7 +74,8 @@ class UfMOptions:
         ufm_preset: paper: the paper's own settings (UfMStarConfig.paper), default: ours; --preset and single --ufm.*
             take precedence
         anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
-            corners tracked in the images; FILE: landmarks, a line x y z sigma [m] each, in the world of the poses
+            corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
+            landmarks, a line x y z sigma [m] each, in the world of the poses
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 

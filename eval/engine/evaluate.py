@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.confident import references
@@ -107,7 +108,7 @@ def evaluate_sequence(
     wanted = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
     sources = {(base, how): networks[base].prepared(how) for base, how in wanted}
     used = list(sources.values())
-    tracked = any(row.setting.anchors == TRACKED for row in rows)
+    tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
 
     def check(frame: Frame) -> None:
         """Raises FrameError unless all networks and UfM* can use the frame."""
@@ -124,7 +125,7 @@ def evaluate_sequence(
         RowRunner(
             row.slug,
             sources[row.method.base, row.setting.preprocess],
-            make_estimator(row, device),
+            make_estimator(row, device, sources[row.method.base, row.setting.preprocess].max_depth),
             every=row.method.every_member,
             setting=row.setting,
             anchors=anchors.get(row),
