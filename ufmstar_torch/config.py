@@ -232,7 +232,7 @@ class UfMStarConfig(Checked):
     # Input checks and speed
     rotation_tolerance: float = number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
     on_bad_frame: str = choice("raise", "skip")
-    backend: str = choice("auto", "torch", "numba")
+    backend: str = choice("auto", "torch", "numba", "triton")
 
     def __post_init__(self) -> None:
         super().__post_init__()
