@@ -12,6 +12,7 @@ from test_suite_anchors import Biased, evaluate, in_memory, row
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source
+from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.anchors import landmark_digests, landmarks_of
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
@@ -101,9 +102,9 @@ def test_words_and_files_become_sources(file, tmp_path):
     assert isinstance(landmark_source(file), LandmarkMap)
     own = LandmarkMap.read(file)
     assert landmark_source(own) is own
-    for value, told in (("dense", "reserved"), ("lidar", "'lidar' is neither 'corners' nor a file .csv")):
-        with pytest.raises(ValueError, match=told):
-            landmark_source(value)
+    assert isinstance(landmark_source("dense"), DenseEvidence)
+    with pytest.raises(ValueError, match=r"'lidar' is neither 'corners', 'dense' nor a file \.csv"):
+        landmark_source("lidar")
     for value in (True, "corners", "tracked"):
         assert isinstance(landmarks_of(value, None), LandmarkTracker)
     assert landmarks_of(file.name, file.parent).identity == own.identity
@@ -284,5 +285,5 @@ def test_a_skipped_frame_is_forgotten_by_its_source(tour):
 def test_a_source_needs_the_anchored_configuration():
     with pytest.raises(ValueError, match="anchored=True"):
         UncertainDepth(Brightness(), anchors="corners")
-    with pytest.raises(ValueError, match="neither 'corners' nor a file"):
+    with pytest.raises(ValueError, match="neither 'corners', 'dense' nor a file"):
         wrapped("lidar")

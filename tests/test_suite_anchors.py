@@ -49,6 +49,9 @@ class Biased:
 
     digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
 
+    def prepared(self, how):
+        return self
+
     def turn(self, position):
         return 0
 

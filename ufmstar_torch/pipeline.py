@@ -18,7 +18,7 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
-from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
@@ -96,6 +96,11 @@ class NetworksInTurn(nn.Module):
         self.preprocess = preprocess
 
     @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that the networks can predict, where each of them states one."""
+        return stated_range(self.networks)
+
+    @property
     def passes(self) -> int:
         """Inferences that :meth:`every` takes."""
         return len(self.networks) if self.samples is None else self.samples
@@ -140,7 +145,8 @@ class UncertainDepth(NetworksInTurn):
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
             separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one with an
             attribute ``takes_intrinsics = True`` is called as ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
-        config: of UfM*. With ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
+        config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`). With
+            ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
             as the second entry of H (``ufm.features``), unless other features are given.
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
@@ -150,8 +156,9 @@ class UncertainDepth(NetworksInTurn):
             network must sample by itself in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the network's input; None passes both through.
         anchors: what yields the anchors of every image, with ``config.anchored``: "corners" (tracked in the image),
-            a file of landmarks, or a :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a
-            list with one for each. Saved and reset with the state. None: those given with an image, if any.
+            "dense" (searched in earlier images), a file of landmarks, or a
+            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
+            each. Saved and reset with the state. None: those given with an image, if any.
         recalibration: of the variance, as :class:`UfMStar` takes it (``Recalibration.from_json(FILE)``).
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself
@@ -190,7 +197,7 @@ class UncertainDepth(NetworksInTurn):
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         super().__init__(networks, samples=samples, preprocess=preprocess)
-        self.ufm = UfMStar(config, recalibration=recalibration)
+        self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth), recalibration=recalibration)
         if anchors is not None and not self.ufm.config.anchored:
             raise ValueError("anchors go with UfMStarConfig(anchored=True)")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)

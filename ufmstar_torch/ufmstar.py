@@ -15,7 +15,8 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_check, select_step
+from ufmstar_torch.kernels.select import select_check, select_merge, select_step
+from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
@@ -54,6 +55,7 @@ class UfMStar(StatefulModule):
     """
 
     STATE = UfMStarState.names()
+    CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
     recalibration: Recalibration | None
@@ -273,7 +275,7 @@ class UfMStar(StatefulModule):
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
-            max_depth=self.config.segment.max_depth, kernel=select_check(self.config.backend, depth.device.type),
+            max_depth=self.config.segment.depth_limit, kernel=select_check(self.config.backend, depth.device.type),
         )  # fmt: skip
 
     def _observe(
@@ -303,6 +305,9 @@ class UfMStar(StatefulModule):
                 state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
+            if self.config.merge:
+                kernels = select_merge(self.config.backend, frame.depth.device.type)
+                state = merged(state, frame.fault == 0, self.config, kernels)
             self._store(state.tensors())
             self._warn_without_segments(frame, out)
 
@@ -334,7 +339,7 @@ class UfMStar(StatefulModule):
         b = int(empty.nonzero()[0])
         warnings.warn(
             f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(given[b])} pixels "
-            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.max_depth} m and "
+            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.depth_limit} m and "
             f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
             "intrinsics the depth map's? (said once)",
             stacklevel=5,

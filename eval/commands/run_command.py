@@ -49,7 +49,8 @@ class MapOptions:
     """Depth from files, instead of a network.
 
     Attributes:
-        depth: folder of predicted maps (16-bit PNG, EXR, npy); 'self': the sequence's own depth
+        depth: folder of predicted maps (16-bit PNG, EXR, npy), or an earlier run's output; 'self': the sequence's own
+            depth
         variance: folder of variance maps [m^2] that belong to them
         depth_scale: metres per unit of the maps in the folder
         map_intrinsics: of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]
@@ -73,7 +74,8 @@ class UfMOptions:
         ufm_preset: paper: the paper's own settings (UfMStarConfig.paper), default: ours; --preset and single --ufm.*
             take precedence
         anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
-            corners tracked in the images; FILE: landmarks, a line x y z sigma [m] each, in the world of the poses
+            corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
+            landmarks, a line x y z sigma [m] each, in the world of the poses
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 

@@ -41,12 +41,12 @@ def job_from(chosen: RunOptions) -> RunJob:
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
-    source = _source(options, sequence, device)
+    source = _source(options, sequence, indices, device)
     return RunJob(
         sequence=sequence,
         indices=indices,
         source=source,
-        config=config,
+        config=config.within(source.max_depth),
         recalibration=_recalibration(chosen, source),
         device=torch.device(device),
         settings=options,
@@ -100,7 +100,7 @@ def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], Landm
     return (lambda: landmarks_of(value, sequence.folder)) if source.needs_image else (lambda: source)
 
 
-def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) -> DepthSource:
+def _source(options: Mapping[str, Any], sequence: FrameSequence, indices: range, device: str) -> DepthSource:
     size = parse_size(options["size"])
     if options["model"] is not None:
         return network_source(
@@ -124,4 +124,5 @@ def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) ->
         scale=options["depth_scale"],
         intrinsics=parse_intrinsics(options["map_intrinsics"], "--map-intrinsics"),
         size=size,
+        indices=indices,
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.given import Anchors
-from ufmstar_torch.anchors.landmarks import CORNERS, FILE_TYPES, LandmarkSource, landmark_source
+from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.row import Row
@@ -217,7 +217,7 @@ def landmark_digests(rows: Iterable[Row], folder: Path | None) -> dict[str, str]
     Raises:
         FileNotFoundError, ValueError: as :func:`landmarks_of`.
     """
-    files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, TRUTH)}
+    files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
     known = {file: landmarks_of(file, folder).identity for file in set(files.values())}
     return {slug: known[file]["landmarks"] for slug, file in files.items() if "landmarks" in known[file]}
 

@@ -71,6 +71,11 @@ class NetworkSource:
         return self._members
 
     @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that the members can predict, where each of them states one."""
+        return self._turns.max_depth
+
+    @property
     def runtime(self) -> Mapping[str, Any]:
         """What runs the networks: name, version, threads, precision."""
         return runtime_of(self._members[0], self._precision)

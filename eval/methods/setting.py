@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any
 
-from ufmstar_torch.anchors.landmarks import FILE_TYPES
+from ufmstar_torch.anchors.landmarks import DENSE, FILE_TYPES
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.config import UfMStarConfig
 
@@ -43,8 +43,9 @@ class Setting(Checked):
         skip: images left out between two that are used; the paper's skip interval, 0 = consecutive ones.
         seed: of everything that is drawn: noise, and which anchors are taken.
         anchors: what UfM* is anchored by (``UfMStarConfig.anchored`` follows): "" nothing; "tracked": corners of the
-            images, triangulated with the row's poses; "truth": ground truth at pixels drawn at random, the upper bound;
-            or a file of landmarks in the folder of each sequence, see ``ufmstar_torch.anchors.LandmarkMap.read``.
+            images, triangulated with the row's poses; "dense": dense evidence, likewise; "truth": ground truth at
+            pixels drawn at random, the upper bound; or a file of landmarks in the folder of each sequence, see
+            ``ufmstar_torch.anchors.LandmarkMap.read``.
         anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
@@ -72,8 +73,8 @@ class Setting(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.anchors not in ("", TRACKED, TRUTH) and not str(self.anchors).lower().endswith(FILE_TYPES):
-            known = f"{TRACKED!r}, {TRUTH!r} or a file {', '.join(FILE_TYPES)}"
+        if self.anchors not in ("", TRACKED, DENSE, TRUTH) and not str(self.anchors).lower().endswith(FILE_TYPES):
+            known = f"{TRACKED!r}, {DENSE!r}, {TRUTH!r} or a file {', '.join(FILE_TYPES)}"
             raise ValueError(f"Setting.anchors must be {known}, got {self.anchors!r}")
         count = self.anchor_count
         if count is not None and not isinstance(count, int):

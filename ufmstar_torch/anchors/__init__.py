@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 from ufmstar_torch.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from ufmstar_torch.anchors.dense import DenseConfig as DenseConfig
+    from ufmstar_torch.anchors.dense import DenseEvidence as DenseEvidence
     from ufmstar_torch.anchors.given import Anchors as Anchors
     from ufmstar_torch.anchors.landmarks import LandmarkMap as LandmarkMap
     from ufmstar_torch.anchors.landmarks import landmark_source as landmark_source
@@ -14,4 +16,13 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__ = lazy_names(__name__)
 
-__all__ = ["Anchors", "LandmarkMap", "LandmarkTracker", "Landmarks", "TrackerConfig", "landmark_source"]
+__all__ = [
+    "Anchors",
+    "DenseConfig",
+    "DenseEvidence",
+    "LandmarkMap",
+    "LandmarkTracker",
+    "Landmarks",
+    "TrackerConfig",
+    "landmark_source",
+]

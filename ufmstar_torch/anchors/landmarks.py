@@ -1,4 +1,6 @@
-"""What yields the landmarks of one camera, image after image: the corner tracker, or a map of landmarks in a file."""
+"""What yields the landmarks of one camera, image after image: the corner tracker, dense evidence, or a map of
+landmarks in a file.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker
 from ufmstar_torch.camera import invert_rigid
@@ -24,7 +27,8 @@ _MOST = 500
 
 
 class LandmarkSource(Protocol):
-    """Landmarks of one camera, in the order of its images. :class:`LandmarkTracker` and :class:`LandmarkMap` are two.
+    """Landmarks of one camera, in the order of its images. :class:`LandmarkTracker`,
+    :class:`DenseEvidence` and :class:`LandmarkMap` are three.
 
     Attributes:
         needs_image: whether :meth:`update` looks at the image, beyond its size.
@@ -64,7 +68,8 @@ def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
     """The source that a word or a file's name stands for, in its initial state.
 
     Args:
-        value: "corners": tracked corners; the name of a file: :meth:`LandmarkMap.read`; a source: itself.
+        value: "corners": tracked corners; "dense": dense evidence; the name of a file:
+            :meth:`LandmarkMap.read`; a source: itself.
 
     Raises:
         FileNotFoundError: no such file.
@@ -75,7 +80,7 @@ def landmark_source(value: str | Path | LandmarkSource) -> LandmarkSource:
     if value == CORNERS:
         return LandmarkTracker()
     if value == DENSE:
-        raise ValueError("anchors: 'dense' is reserved for dense evidence, which this version has not")
+        return DenseEvidence()
     return LandmarkMap.read(value)
 
 
@@ -120,7 +125,9 @@ class LandmarkMap:
         """
         path = Path(path)
         if path.suffix.lower() not in FILE_TYPES:
-            raise ValueError(f"anchors: {str(path)!r} is neither {CORNERS!r} nor a file {', '.join(FILE_TYPES)}")
+            raise ValueError(
+                f"anchors: {str(path)!r} is neither {CORNERS!r}, {DENSE!r} nor a file {', '.join(FILE_TYPES)}"
+            )
         try:
             points, sigma = _read_npz(path) if path.suffix.lower() == ".npz" else _read_text(path)
             return cls(points, sigma)

@@ -202,7 +202,7 @@ class LandmarkTracker:
                 :meth:`reset` first); the tracker is as it was then.
             ModuleNotFoundError: OpenCV is not installed.
         """
-        gray, T, K = _checked(image, T_world_cam, K)
+        gray, T, K = checked(image, T_world_cam, K)
         if self._gray is not None and self._K is not None:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
                 raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
@@ -266,7 +266,7 @@ class LandmarkTracker:
         return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
 
 
-def _checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
+def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
     """Gray image, pose and intrinsics.
 
     Raises:
