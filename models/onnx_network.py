@@ -93,7 +93,7 @@ class OnnxNetwork(DepthNetwork):
 
     def _open(self) -> None:
         """Start a session and check the spec's names against the graph."""
-        self.session = _session(self.path, self.threads, self.providers)
+        self.session = open_session(self.path, self.threads, self.providers)
         inputs = {i.name: i for i in self.session.get_inputs()}
         name = self.spec.input
         if name is None and len(inputs) == 1:
@@ -228,11 +228,13 @@ class OnnxNetwork(DepthNetwork):
         self._open()
 
 
-def _session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSession:
+def open_session(graph: str | bytes, threads: int, providers: tuple[str, ...]) -> InferenceSession:
+    """A session on a file, or on a file's content; see :class:`OnnxNetwork`."""
     ort = _onnxruntime()
     from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
-    if not Path(path).is_file():
+    path = graph if isinstance(graph, str) else "the graph"
+    if isinstance(graph, str) and not Path(graph).is_file():
         raise FileNotFoundError(f"no ONNX file {path}")
     if absent := [p for p in providers if p not in ort.get_available_providers()]:
         raise ValueError(f"providers {absent} are not available; this ONNX Runtime has {ort.get_available_providers()}")
@@ -244,7 +246,7 @@ def _session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSe
     refusals = (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.InvalidArgument)
     failures = (ort_errors.Fail, ort_errors.NotImplemented)
     try:
-        return ort.InferenceSession(path, options, providers=list(providers))
+        return ort.InferenceSession(graph, options, providers=list(providers))
     except (*refusals, *failures) as error:
         raise ValueError(f"{path} is not an ONNX file that ONNX Runtime can run: {error}") from error
 
