@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -307,6 +308,7 @@ class UfMStar(StatefulModule):
             if self.config.merge:
                 kernels = select_merge(self.config.backend, frame.depth.device.type)
                 state = merged(state, frame.fault == 0, self.config, kernels)
+                out = replace(out, statistics=replace(out.statistics, components=state.mixture.components))
             self._store(state.tensors())
             self._warn_without_segments(frame, out)
 
