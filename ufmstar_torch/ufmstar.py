@@ -167,19 +167,26 @@ class UfMStar(StatefulModule):
             seed: of the sample; frame i of a stream uses another sample than frame j only if told so.
             average: apply the exponential moving average at the sampled pixels.
 
+        The first views of a place have nothing to be compared with: their mean is low for want of evidence
+        (``MeanUncertainty.measured`` near 0). With ``config.unmeasured="nan"`` only measured pixels are averaged, and
+        an image without any gets NaN.
+
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
         out, variance, _ = self._observe(frame, anchors, index, average=average)
+        sampled = used.sum(1)
+        measured = ((out.measured >= unmeasured.HALF) & used).sum(1) / sampled
+        used = used & ~variance.isnan()  # not measured, with config.unmeasured = "nan"
         count = used.sum(1)
         value = torch.where(used, variance, torch.zeros_like(variance))
         mean = total(value, 1) / count  # 0/0 = NaN where no pixel is valid
         squares = total(torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)), 1)
-        left = 1 - count / frame.valid.sum((1, 2)).clamp_min(1)  # without replacement: all pixels, no error
+        left = 1 - sampled / frame.valid.sum((1, 2)).clamp_min(1)  # without replacement: all pixels, no error
         error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
-        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, out.statistics)
+        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, measured, out.statistics)
 
     def query(self, points: Tensor, frame: str = "world") -> Regression:
         """The disagreement at any 3D point, from the present mixture, without touching the state.
@@ -297,6 +304,8 @@ class UfMStar(StatefulModule):
         with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
             if self.config.on_bad_frame == "raise":
+                if frame.fault.device.type == "meta":
+                    raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
                 raise_faults(frame.fault.tolist())
             if self.observer is not None:
                 self.observer.stage("check")
