@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -46,37 +47,50 @@ def start(words):
 
 
 def finish(words):
-    """Seconds that an undisturbed process took."""
-    began, process = time.monotonic(), start(words)
+    """An undisturbed process."""
+    process = start(words)
     _, said = process.communicate(timeout=300)
     assert process.returncode == 0, said.decode()
-    return time.monotonic() - began
 
 
-def kill_after(words, seconds):
-    """SIGKILL to the process and its children after so long; whether it was still at it."""
-    process = start(words)
-    try:
-        process.wait(seconds)
-    except subprocess.TimeoutExpired:
+def kill_at(words, out, files, delay):
+    """SIGKILL to the process and its children, ``delay`` [s] after it has written so many files to ``out``; whether it
+    was still at it."""
+    began, process = time.time(), start(words)
+    while process.poll() is None and written_since(out, began) < files:
+        time.sleep(0.02)
+    time.sleep(delay)
+    if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
     return process.returncode == -signal.SIGKILL
 
 
-def killed_and_finished(words, again, seconds, seed, finished):
+def written_since(out, began):
+    """Files in a folder that are younger than a time [s]."""
+    count = 0
+    for path in out.rglob("*"):
+        with suppress(FileNotFoundError):  # a temporary file
+            count += path.is_file() and path.stat().st_mtime >= began
+    return count
+
+
+def killed_and_finished(words, again, out, whole, seed, finished):
     """Kill a command a few times at random moments of its work, then let it finish.
 
     Args:
         words: of the first start.
         again: of the others.
-        seconds: that it takes undisturbed.
+        out: its folder.
+        whole: the folder of an undisturbed one.
         seed: of the moments.
         finished: what is finished so far, by name: it must stay as it is.
     """
     draw, kills, known = random.Random(seed), 0, {}
+    files = written_since(whole, 0)
     for _ in range(KILLS):
-        kills += kill_after(again if kills else words, draw.uniform(0.3, 1.0) * seconds)
+        at, delay = 1 + draw.randrange(max(1, int(0.6 * files))), draw.uniform(0, 0.3)
+        kills += kill_at(again if kills else words, out, at, delay)
         after = finished()
         assert {name: after.get(name) for name in known} == known, "finished work is lost"
         known = after
@@ -101,21 +115,21 @@ def without_clock(value):
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory):
-    """Words of an evaluation but for its folder, that folder after an undisturbed one, and the seconds that it took."""
+    """Words of an evaluation but for its folder, and that folder after an undisturbed one."""
     place = tmp_path_factory.mktemp("evaluation")
     rooms = write_rooms(place / "rooms", frames=6)
     (place / "kills.toml").write_text(SUITE)
     words = ["eval", "--suite", place / "kills.toml", "--network", TRUTH, "--root", f"rooms={rooms}", "--threads", 1]
-    finish([*words, "--out", place / "warm"])  # kernels are compiled
-    return words, place / "whole", finish([*words, "--out", place / "whole"])
+    finish([*words, "--out", place / "whole"])
+    return words, place / "whole"
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_eval(evaluation, tmp_path, seed):
-    words, whole, seconds = evaluation
+    words, whole = evaluation
     out = tmp_path / "out"
     words = [*words, "--out", out]
-    killed_and_finished(words, [*words, "--resume"], seconds, seed, lambda: content(out, "records/*/*/*.json"))
+    killed_and_finished(words, [*words, "--resume"], out, whole, seed, lambda: content(out, "records/*/*/*.json"))
     assert kept(out) == kept(whole)
     assert content(out, "tables/*").keys() == content(whole, "tables/*").keys()
     assert not list(out.rglob(".*.tmp"))
@@ -129,8 +143,8 @@ def test_report(evaluation, tmp_path):
         for made in ("tables", "figures"):
             shutil.rmtree(copy / made)
     words = ["report", again]
-    seconds = finish(["report", first])
-    killed_and_finished(words, words, seconds, 3, lambda: content(again, "records/*/*/*"))
+    finish(["report", first])
+    killed_and_finished(words, words, again, first / "tables", 3, lambda: content(again, "records/*/*/*"))
     made = ("tables/*", "figures/*.json", "results.csv", "table.csv", "figures/*.png")
     assert content(again, *made) == content(first, *made)
     assert (again / "report.html").stat().st_size == (first / "report.html").stat().st_size
@@ -142,9 +156,9 @@ def test_train(tmp_path, seed):
     frames = write_frames(tmp_path / "frames")
     words = ["train", *TRAINING.split(), "--root", frames, "--threads", 1, "--out"]
     whole, out = tmp_path / "whole", tmp_path / "out"
-    seconds = finish([*words, whole])
+    finish([*words, whole])
     again = [*words, out, "--resume"]
-    killed_and_finished([*words, out], again, seconds, seed, lambda: content(out, f"member_*/{RESULT}"))
+    killed_and_finished([*words, out], again, out, whole, seed, lambda: content(out, f"member_*/{RESULT}"))
     for member in ("member_0", "member_1"):
         mine, theirs = (read_safetensors(folder / member / WEIGHTS)[0] for folder in (out, whole))
         assert [name for name in theirs if not torch.equal(mine[name], theirs[name])] == []
@@ -154,8 +168,7 @@ def test_demo(weights, tmp_path):  # noqa: F811
     words = ["demo", "--weights", weights, "--frames", 5, "--seed", 5, "--threads", 1, "--out"]
     whole, out = tmp_path / "whole", tmp_path / "out"
     finish([*words, whole])
-    seconds = finish([*words, whole, "--overwrite"])
-    killed_and_finished([*words, out], [*words, out, "--overwrite"], seconds, 4, dict)
+    killed_and_finished([*words, out], [*words, out, "--overwrite"], out, whole, 4, dict)
     assert content(out, "*.ply", "*.png") == content(whole, "*.ply", "*.png")
     mine, theirs = (json.loads(Path(folder / "summary.json").read_text()) for folder in (out, whole))
     assert without_clock(mine) == without_clock(theirs)
