@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_check, select_merge, select_step
+from ufmstar_torch.kernels.select import LateStep, select_check, select_merge, select_step
 from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
@@ -25,7 +26,7 @@ from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
-from ufmstar_torch.step import StepObserver
+from ufmstar_torch.step import Step, StepObserver
 
 
 class UfMStar(StatefulModule):
@@ -59,6 +60,7 @@ class UfMStar(StatefulModule):
     observer: StepObserver | None = None
     recalibration: Recalibration | None
     _warned: bool = False
+    _kept_step: tuple[tuple[str, str], Step] | None = None
 
     def __init__(
         self,
@@ -224,7 +226,8 @@ class UfMStar(StatefulModule):
     @property
     def state(self) -> UfMStarState:
         """The state as a step (``ufmstar_torch.step``) takes it."""
-        return UfMStarState(**{name: getattr(self, name) for name in self.STATE})
+        self._settle()
+        return self._stored()
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
@@ -299,12 +302,13 @@ class UfMStar(StatefulModule):
                 raise_faults(frame.fault.tolist())
             if self.observer is not None:
                 self.observer.stage("check")
-            step = select_step(self.config.backend, frame.depth.device.type)
+            step = self._step(frame.depth.device.type)
             state, out = step(
                 state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
             if self.config.merge:
+                state = step.settled(state, self.config) if isinstance(step, LateStep) else state
                 kernels = select_merge(self.config.backend, frame.depth.device.type)
                 state = merged(state, frame.fault == 0, self.config, kernels)
             self._store(state.tensors())
@@ -349,6 +353,40 @@ class UfMStar(StatefulModule):
         both = [(frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)]
         return [value for value, counts in both if value is not None and counts]
 
+    def _stored(self) -> UfMStarState:
+        return UfMStarState(**{name: getattr(self, name) for name in self.STATE})
+
+    def _step(self, device_type: str) -> Step:
+        """The step for a device, the same one as long as the state goes on."""
+        key = (self.config.backend, device_type)
+        if self._kept_step is None or self._kept_step[0] != key:
+            self._settle()
+            self._kept_step = key, select_step(*key)
+        return self._kept_step[1]
+
+    def _settle(self) -> None:
+        """Let the state have what a step keeps for the next frame, before the state goes elsewhere."""
+        if self._kept_step is not None and isinstance(self._kept_step[1], LateStep):
+            with torch.inference_mode(False), torch.no_grad():
+                self._store(self._kept_step[1].settled(self._stored(), self.config).tensors())
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        self._settle()
+        return super()._apply(fn, recurse)
+
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        self._settle()
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+
+    def _load_from_state_dict(self, *given: Any) -> None:
+        self._settle()
+        super()._load_from_state_dict(*given)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy starts with a step of its own."""
+        self._settle()
+        return self.__dict__ | {"_kept_step": None}
+
     def _state_for(self, frame: FrameInput) -> UfMStarState:
         streams, device = frame.depth.shape[0], frame.depth.device
         if self.mean.shape[0] == 0:
@@ -359,7 +397,7 @@ class UfMStar(StatefulModule):
             )
         if self.mean.device != device:
             raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
-        return self.state
+        return self._stored()
 
     def extra_repr(self) -> str:
         """Streams and components."""
