@@ -275,3 +275,27 @@ def test_thirty_frames_agree_with_the_oracle(truth, kernels):  # noqa: F811
     for k, g in enumerate(expected):
         np.testing.assert_allclose(state.mean[0, k].cpu().numpy(), g["mean"], atol=1e-10)
         assert state.disagreement[0, k].item() == pytest.approx(g["m"], abs=1e-10)
+
+
+@pytest.mark.skipif(not INTERPRETED, reason="on a GPU tests/test_gpu.py records a graph")
+def test_capture_keeps_the_state_in_place():
+    """The bookkeeping of a capture, with a function in the place of the graph."""
+    from ufmstar_torch.capture import Captured
+
+    config = UfMStarConfig(segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16)
+    given = [frame[:3] for frame in walks(1, 3)]
+    ufm, plain = UfMStar(config), UfMStar(config)
+    captured = Captured(ufm, *given[0], record=lambda run: run)
+    memory = ufm.mean
+    for i, frame in enumerate(given):
+        if i == 2:
+            ufm.reset()
+            plain.reset()
+        out, expected = captured(*frame), plain(*frame)
+        close(out.variance, expected.variance, 0, 0)
+        assert ufm.mean is memory
+    assert torch.equal(ufm.frames, plain.frames)
+    with pytest.raises(ValueError, match="depth must be as at the capture"):
+        captured(given[0][0][:, :5], *given[0][1:])
+    with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a mixture that grows"):
+        Captured(UfMStar(UfMStarConfig(backend="triton")), *given[0])

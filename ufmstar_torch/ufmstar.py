@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
@@ -27,6 +27,9 @@ from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import Step, StepObserver
+
+if TYPE_CHECKING:
+    from ufmstar_torch.capture import Captured
 
 
 class UfMStar(StatefulModule):
@@ -216,6 +219,30 @@ class UfMStar(StatefulModule):
             result = regress(mixture, local.to(dtype), self.config)
             return unmeasured.after_regression(result, None, self.config)[0]
 
+    def capture(
+        self,
+        depth: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        aleatoric: Tensor | None = None,
+        epistemic: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> Captured:
+        """This module for frames of one shape as a CUDA graph: a function of frames that takes one launch for each.
+
+        Args:
+            depth, pose, intrinsics, aleatoric, epistemic, valid: as :meth:`forward`; only their shapes matter.
+
+        Raises:
+            ValueError: tensors that are not on CUDA; a config other than with ``on_bad_frame="skip"``, a mixture that
+                cannot grow (``max_components`` at most ``initial_capacity``), and the paper's step.
+        """
+        from ufmstar_torch.capture import Captured
+
+        if depth.device.type != "cuda":
+            raise ValueError(f"capture needs CUDA tensors, got depth on {depth.device}")
+        return Captured(self, depth, pose, intrinsics, aleatoric, epistemic, valid)
+
     # ---- the state ----
 
     @property
@@ -299,7 +326,7 @@ class UfMStar(StatefulModule):
         with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
             if self.config.on_bad_frame == "raise":
-                raise_faults(frame.fault.tolist())
+                raise_faults((frame.fault if frame.known_fault is None else frame.known_fault).tolist())
             if self.observer is not None:
                 self.observer.stage("check")
             step = self._step(frame.depth.device.type)

@@ -2,9 +2,10 @@
 
 The mixture has a fixed number of slots. What a frame adds is counted on the device, and the counts are copied to the
 host behind the frame's last change of the mixture. The host reads them when the next frame comes, so it waits only
-where it is more than a frame ahead of the device. Where slots ran short, it then doubles them and appends what had found
-none, before anything else: the next frame matches what it would have matched had the mixture grown in time, and only the map
-of the frame before was regressed without it. Growth starts before the last slot is taken, so that this is rare.
+where it is more than a frame ahead of the device. Where slots ran short, it then doubles them and appends what had
+found none, before anything else: the next frame matches what it would have matched had the mixture grown in time, and
+only the map of the frame before was regressed without it. Growth starts before the last slot is taken, so that this is
+rare.
 
 What the paper's step does not have (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
 ``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels, which reads one number a
