@@ -50,6 +50,7 @@ class BenchSettings:
         anchors: also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one
             thread (300 without a number; needs OpenCV)
         skip_compile: do not time compilation (some tens of seconds)
+        device: time steps of 1, 64 and 256 streams on this GPU instead (cuda)
         json: file for the report
     """
 
@@ -66,6 +67,7 @@ class BenchSettings:
     long: int | None = field(default=None, metadata={"const": 1000})
     anchors: int | None = field(default=None, metadata={"const": _TARGET_CORNERS})
     skip_compile: bool = False
+    device: str = "cpu"
     json: Path | None = None
 
     def __post_init__(self) -> None:
@@ -85,8 +87,8 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         progress: is called with a description of what is measured next.
 
     Returns:
-        The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run" and
-        "anchors" where asked for, and "targets".
+        The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run",
+        "anchors" and "device" where asked for, and "targets".
 
     Raises:
         ValueError: an option is out of range.
@@ -108,7 +110,15 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         "compilation": None,
         "long_run": None,
         "anchors": None,
+        "device": None,
+        "results": [],
     }
+    if options.device != "cpu":
+        from ufmstar_torch.eval.bench.device import measure_device
+
+        report["device"] = measure_device(options.device, options.sizes, options.frames, options.seed, progress)
+        report["load_average"]["after"] = machine.load_average()
+        return {**report, "targets": []}
     if "numba" in options.backends and not options.skip_compile:
         progress("compilation")
         report["compilation"] = measure_compilation()
