@@ -203,7 +203,7 @@ class UfMStarConfig(Checked):
     prior_weight: float = number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
     prior_mean: float = number(0.0, "mu_0", "m^2", 0.0)
     unmeasured: str = choice("paper", "prior", "relative", "nan")
-    unmeasured_relative: float = number(0.1, "rho", "1", 0.0, open_low=True)
+    unmeasured_relative: float = number(0.2, "rho", "1", 0.0, open_low=True)
     # The paper's neighbourhood approximates the exact sum to save time, which our kernel does not need.
     regression: str = choice("exact", "neighbourhood")
     near_radius: float = number(0.1, "r", "m", 0.0, open_low=True)

@@ -59,6 +59,7 @@ class UfMStar(StatefulModule):
     """
 
     STATE = UfMStarState.names()
+    CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
     recalibration: Recalibration | None

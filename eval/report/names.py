@@ -103,6 +103,8 @@ SETTINGS = {
     "overlap_weighted": ("fusion weighted by overlap", ""),
     "disagreement": ("disagreement", ""),
     "regression": ("regression", ""),
+    "unmeasured": ("not measured:", ""),
+    "unmeasured_relative": ("ρ", "of the depth"),
     "near_radius": ("search radius", "m"),
     "far_radius": ("far search radius", "m"),
     "variance_floor": ("variance floor", "m²"),
