@@ -278,9 +278,16 @@ def test_thirty_frames_agree_with_the_oracle(truth, kernels):  # noqa: F811
 
 
 @pytest.mark.skipif(not INTERPRETED, reason="on a GPU tests/test_gpu.py records a graph")
-def test_capture_keeps_the_state_in_place():
-    """The bookkeeping of a capture, with a function in the place of the graph."""
+def test_capture_keeps_the_state_in_place(monkeypatch):
+    """The bookkeeping of a capture, with a function in the place of the graph; and the launches of a step."""
+    from triton.runtime.jit import KernelInterface
+
     from ufmstar_torch.capture import Captured
+
+    launched, launch = [], KernelInterface.__getitem__
+    monkeypatch.setattr(
+        KernelInterface, "__getitem__", lambda kernel, grid: launched.append(kernel.fn.__name__) or launch(kernel, grid)
+    )
 
     config = UfMStarConfig(segment=SPGF, backend="triton", on_bad_frame="skip", initial_capacity=16, max_components=16)
     given = [frame[:3] for frame in walks(1, 3)]
@@ -291,7 +298,10 @@ def test_capture_keeps_the_state_in_place():
         if i == 2:
             ufm.reset()
             plain.reset()
-        out, expected = captured(*frame), plain(*frame)
+        launched.clear()
+        out = captured(*frame)
+        assert len(launched) == len(set(launched)) == 11, launched
+        expected = plain(*frame)
         close(out.variance, expected.variance, 0, 0)
         assert ufm.mean is memory
     assert torch.equal(ufm.frames, plain.frames)

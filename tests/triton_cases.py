@@ -38,14 +38,15 @@ def cases() -> dict[str, Callable[[], object]]:
         matches = words, new.index, previous.place, new.count
         fuse.fuse_bits(m.to(torch.float32), current, still, matches, config)
 
-    def device(**settings: Any) -> None:
+    def device(streams: int = 2, **settings: Any) -> None:
+        depth = torch.full((streams, *(SIZE if streams > 1 else (1, 1))), 2.0)
         kernels = select_kernels("triton", "cuda")
         chosen = UfMStarConfig(features=1, **settings)
         frame = check_frame(
-            depth, torch.eye(4), K, None, None, None, depth[:, None], feature_count=1, rotation_tolerance=0.01
+            depth, torch.eye(4), K[:streams], None, None, None, depth[:, None], feature_count=1, rotation_tolerance=0.01
         )
         late = step_device.DeviceStep(kernels)
-        state, _ = late(UfMStarState.initial(2, chosen, torch.float32, "cpu"), frame, chosen)
+        state, _ = late(UfMStarState.initial(streams, chosen, torch.float32, "cpu"), frame, chosen)
         waiting = late._waiting
         assert waiting is not None
         append.append(
@@ -67,6 +68,7 @@ def cases() -> dict[str, Callable[[], object]]:
         "floor": lambda: fuse.floor_covariance(m.covariance, m.weight),
         "segment": lambda: segment.segment(given),
         "device": device,
+        "device_one": lambda: device(1),
         "device_relative": lambda: device(unmeasured="relative"),
         "fit": lambda: segment.fit(SegmentInput.checked(depth, K), labels=False, floor=segment.Floor(0.05, 1e-6)),
     }

@@ -102,7 +102,7 @@ def _bins(
     inside = i < height * width
     z = tl.load(depth + b * height * width + i, mask=inside, other=0.0).to(tl.float64)
     fx, fy = tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4)
-    s = 0.5 * tl.minimum(width.to(tl.float64) / fx, height.to(tl.float64) / fy)
+    s = 0.5 * tl.minimum(width / fx, height / fy)
     length = s * 0.0 + shortest
     edge = s * 0.0
     k = tl.zeros([chunk], tl.int32)
