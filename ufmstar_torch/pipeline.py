@@ -321,11 +321,13 @@ class UncertainDepth(NetworksInTurn):
                 then.
         """
         given = self._predicted(image, intrinsics, features)
-        prediction, K, optional = given.arrived(), given.intrinsics, {"features": given.features}
+        prediction, K = given.arrived(), given.intrinsics
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
         with self._anchored(image, pose, intrinsics, K, anchors) as own:
             a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-            mean = self.ufm.mean_uncertainty(prediction.depth, pose, K, a, e, valid, anchors=own, **optional, **sample)
+            mean = self.ufm.mean_uncertainty(
+                prediction.depth, pose, K, a, e, valid, anchors=own, features=given.features, **sample
+            )
         self._done(mean.statistics)
         return mean
 
