@@ -90,11 +90,10 @@ def test_regress_without_components_or_pixels(kernels):
     assert out.disagreement.isnan().all()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_correspond(kernels, seed):
+def test_correspond(kernels):
     from ufmstar_torch.kernels.triton.correspond import candidates, match_bits
 
-    previous, current = mixture(2, 70, seed), mixture(2, 40, seed + 50)
+    previous, current = mixture(2, 70, 0), mixture(2, 40, 50)
     config = UfMStarConfig(eta=0.3, eta_occlusion=0.4)
     expected = correspond(previous, current, K, SIZE, config)
     assert (expected.overlap >= 0.3).sum() > expected.match.sum() > 50, "some must be hidden"
