@@ -197,6 +197,13 @@ def test_labels_of_the_reference_frames(kernels, name):
     assert labels.max() > 2
 
 
+@pytest.mark.slow
+def test_labels_of_a_whole_reference_frame(kernels):
+    r = reference(REFERENCES[0])
+    labels = kernels.spgf(moved(SegmentInput.checked(r.depth[:1], r.intrinsics[:1], r.config)), before_pruning=True)[1]
+    assert np.array_equal(labels[0].cpu().numpy(), r.frames[0]["labels"])
+
+
 def steps(config, streams, frames, device):
     """Outputs and module over a walk; the first stream's second frame has no depth."""
     ufm = UfMStar(config)
@@ -248,7 +255,6 @@ def test_whole_step(streams, settings):
         close(getattr(ufm.mixture, name)[:, :n], value[:, :n], 1e-5, 1e-7)
 
 
-@pytest.mark.slow
 def test_thirty_frames_agree_with_the_oracle(truth, kernels):  # noqa: F811
     """All kernels over the oracle's sequence; in the interpreter the CPU's segmentation, whose labels are the same."""
     from functools import partial
