@@ -251,6 +251,9 @@ def test_sample_is_seeded_uniform_and_valid():
     for seed in range(400):
         index, _ = sample_pixels(valid[:1], 10, seed)
         counts[index[0]] += 1
+    equal, _ = sample_pixels(valid[:1].expand(3, 10, 10), 10, 7)
+    assert torch.equal(equal[0], equal[1])
+    assert torch.equal(equal[0], sample_pixels(valid, 10, 7)[0][0]), "whatever is in the other streams"
     # Binomial(400, 0.2) per valid pixel: mean 80, sigma 8.
     assert (counts[:50] - 80).abs().max() < 5 * 8
     assert counts[50:].sum() == 0

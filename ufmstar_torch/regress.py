@@ -6,6 +6,7 @@ average of m_k with weights w_k(x), a weak prior (pi_0, mu_0) taking over where 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -248,16 +249,34 @@ def moving_average(
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """A uniform sample of the valid pixels of each image, without replacement.
 
+    The seed and the number of pixels alone decide in which random order an image's pixels are asked, and the first
+    ``count`` valid ones are taken: equal streams of a batch draw the same pixels.
+
     Args:
         valid: [B, H, W] bool.
         count: pixels per image, 1 <= count <= H W.
-        seed: of the random numbers, drawn on the CPU so that every device samples alike.
+        seed: of the random order, drawn on the CPU so that every device samples alike.
 
     Returns:
         index [B, count] into the flattened image and used [B, count]; fewer than ``count`` valid pixels
         leave the rest of ``used`` False.
     """
-    generator = torch.Generator().manual_seed(seed)
-    keys = torch.rand(valid.shape, generator=generator, device="cpu").to(valid.device, non_blocking=True)
-    score, index = torch.where(valid, keys, torch.full_like(keys, -1.0)).flatten(1).topk(count, dim=1)
-    return index, score >= 0
+    flat = valid.flatten(1)
+    pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
+    asked = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
+    while True:
+        order = _random_order(pixels, seed)[:asked].to(valid.device, non_blocking=not on_cpu)
+        usable = flat[:, order]
+        if asked >= pixels or bool((usable.sum(1) >= count).all()):
+            break
+        asked *= 2
+    behind = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
+    place = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
+    index = torch.empty_like(place).scatter_(1, place, order.expand_as(place))[:, :count]
+    return index, torch.gather(flat, 1, index)
+
+
+@functools.lru_cache(maxsize=4)  # the draw costs more than a sample
+def _random_order(pixels: int, seed: int) -> Tensor:
+    """A permutation of the numbers below ``pixels``; not to be modified."""
+    return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))

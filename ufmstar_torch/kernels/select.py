@@ -78,7 +78,7 @@ def select_kernels(name: str, device_type: str) -> Kernels:
     """The parts of the step where it is the reference's; arguments as :func:`select_step`."""
     if _on_gpu(name, device_type):
         return _triton()
-    if name == "torch" or device_type in ("cpu", "meta") or not _has_numba():
+    if name == "torch" or device_type in ("cpu", "meta") or not has_numba():
         return REFERENCE
     from ufmstar_torch.kernels import segment_cpu
 
@@ -93,7 +93,7 @@ def _compiled(name: str, device_type: str) -> bool:
         import numba as numba  # an ImportError for who asked for it by name
 
         return True
-    return name == "auto" and device_type == "cpu" and _has_numba()
+    return name == "auto" and device_type == "cpu" and has_numba()
 
 
 def _on_gpu(name: str, device_type: str) -> bool:
@@ -134,7 +134,7 @@ def _has_triton() -> bool:
 
 
 @functools.cache
-def _has_numba() -> bool:
+def has_numba() -> bool:
     """Whether numba can be imported; one warning where it cannot."""
     try:
         import numba as numba
@@ -142,6 +142,19 @@ def _has_numba() -> bool:
         warnings.warn(f"numba cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
         return False
     return True
+
+
+def compile_triangulation() -> None:
+    """Compile what triangulates tracked corners, where numba can be imported."""
+    if not has_numba():
+        return
+    import numpy as np
+
+    from ufmstar_torch.kernels.triangulate_cpu import triangulate
+
+    poses = np.stack([np.eye(4)] * 2)
+    poses[1, 0, 3] = 1.0
+    triangulate(np.array([[[0.5, 0.0], [-0.5, 0.0]]]), np.ones((1, 2), np.bool_), poses, np.eye(3))
 
 
 def _on_host(kernel: SegmentKernel) -> SegmentKernel:
