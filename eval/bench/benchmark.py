@@ -51,6 +51,7 @@ class BenchSettings:
         anchors: also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one
             thread (300 without a number; needs OpenCV)
         skip_compile: do not time compilation (some tens of seconds)
+        device: time steps of 1, 64 and 256 streams on this GPU instead (cuda)
         json: file for the report
     """
 
@@ -68,6 +69,7 @@ class BenchSettings:
     merge: tuple[float, ...] = (0.0,)
     anchors: int | None = field(default=None, metadata={"const": _TARGET_CORNERS})
     skip_compile: bool = False
+    device: str = "cpu"
     json: Path | None = None
 
     def __post_init__(self) -> None:
@@ -90,7 +92,7 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
 
     Returns:
         The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run", "growth"
-        (a long run for each limit of merging) and "anchors" where asked for, and "targets".
+        (a long run for each limit of merging), "anchors" and "device" where asked for, and "targets".
 
     Raises:
         ValueError: an option is out of range.
@@ -113,7 +115,15 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         "long_run": None,
         "growth": [],
         "anchors": None,
+        "device": None,
+        "results": [],
     }
+    if options.device != "cpu":
+        from ufmstar_torch.eval.bench.device import measure_device
+
+        report["device"] = measure_device(options.device, options.sizes, options.frames, options.seed, progress)
+        report["load_average"]["after"] = machine.load_average()
+        return {**report, "targets": []}
     if "numba" in options.backends and not options.skip_compile:
         progress("compilation")
         report["compilation"] = measure_compilation()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ufmstar_torch.eval.bench.device import device_text
 from ufmstar_torch.eval.bench.timing import STAGES
 
 _COLUMNS = ("median_ms", "p90_ms", "mean_ms", "min_ms", "cpu_median_ms", "cpu_p90_ms", "cpu_mean_ms", "cpu_min_ms")
@@ -30,6 +31,8 @@ def format_report(report: Mapping[str, Any]) -> str:
         lines += ["", *_long_run(run)]
     if report["anchors"] is not None:
         lines += ["", *_anchors(report["anchors"])]
+    if report.get("device") is not None:
+        return "\n".join([*lines, "", *device_text(report["device"])])
     lines += ["", f"{'target (for information)':26}{'value':>12}{'target':>12}"]
     for row in report["targets"]:
         verdict = {None: "not measured", True: "met", False: "missed"}[row["met"]]

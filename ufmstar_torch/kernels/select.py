@@ -5,22 +5,33 @@ from __future__ import annotations
 import functools
 import warnings
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 
 
+@runtime_checkable
+class LateStep(Protocol):
+    """A step that keeps something of a frame for the next one."""
+
+    def settled(self, state: UfMStarState, config: UfMStarConfig, /) -> UfMStarState:
+        """The state that it returned last, with what it keeps."""
+        ...
+
+
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device.
+    """The step for a device. That of a GPU has a memory (``step_device``): one for every state.
 
     Args:
         name: "torch": the reference on every device; it waits for the device only where the mixture may
@@ -38,6 +49,10 @@ def select_step(name: str, device_type: str) -> Step:
         from ufmstar_torch.kernels import step_cpu
 
         return step_cpu.step
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.step_device import DeviceStep
+
+        return DeviceStep(_triton())
     return functools.partial(step, kernels=select_kernels(name, device_type))
 
 
