@@ -52,7 +52,14 @@ class HuggingFaceDepth(DepthNetwork):
     """
 
     def __init__(
-        self, raw: RawDepth, preprocess: Preprocess, kind: str, *, scale: float = 1.0, source: str = ""
+        self,
+        raw: RawDepth,
+        preprocess: Preprocess,
+        kind: str,
+        *,
+        scale: float = 1.0,
+        source: str = "",
+        max_depth: float | None = None,
     ) -> None:
         super().__init__()
         if kind not in (METRIC, *KINDS):
@@ -66,6 +73,12 @@ class HuggingFaceDepth(DepthNetwork):
         self.kind = kind
         self.scale = scale
         self.source = source
+        self._max_depth = max_depth
+
+    @property
+    def max_depth(self) -> float | None:
+        """[m] The ``max_depth`` of a metric checkpoint, of which its output is a share."""
+        return self._max_depth
 
     @classmethod
     def of_checkpoint(
@@ -84,7 +97,9 @@ class HuggingFaceDepth(DepthNetwork):
         if reading is PaddedDepth and not checkpoint.processor.get("do_pad", True):
             reading = RawDepth
         raw = reading(model, patch_size(checkpoint))
-        return cls(raw, preprocess, kind, scale=scale, source=checkpoint.name).eval()
+        shares = checkpoint.config.get("depth_estimation_type") == METRIC
+        reach = scale * float(checkpoint.config["max_depth"]) if shares else None
+        return cls(raw, preprocess, kind, scale=scale, source=checkpoint.name, max_depth=reach).eval()
 
     @property
     def is_metric(self) -> bool:

@@ -148,6 +148,11 @@ class OnnxNetwork(DepthNetwork):
         """Whether the graph does, or the unit of its depth depends on the focal length."""
         return self.K_input is not None or self.spec.outputs.focal is not None
 
+    @property
+    def max_depth(self) -> float | None:
+        """[m] As declared."""
+        return self.spec.outputs.max_depth
+
     def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:
         height, width = self.size
         if height is None or width is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,17 @@ from test_ufmstar import SPGF, oracle_settings
 
 import oracle
 import scenes
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.eval.engine.estimators import make_estimator
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.models import Ensemble, wrap_network
+from ufmstar_torch.models.aligned import AlignedNetwork
+from ufmstar_torch.models.alignment import Alignment
+from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.prediction import DepthPrediction
 
 pytestmark = pytest.mark.numerics
 
@@ -22,6 +32,7 @@ H, W = 30, 40
 CONFIG = UfMStarConfig(segment=SPGF)
 DEPTHS, POSES, K_ = scenes.sequence(6, H, W, 0.05)
 K = torch.tensor(K_)
+DEPTHS_OF = [torch.tensor(depth, dtype=torch.float32)[None] for depth in DEPTHS]
 HOSTILE = [0.0, -1.0, 1e-45, 1e-40, 1e-20, 1e-7, 1e6, 1e10, 1e20, 3e38, float("inf"), float("nan")]
 
 
@@ -73,6 +84,53 @@ def test_beyond_the_networks_range_nothing_is_certain():
     out = UfMStar(reaching)(depth, torch.eye(4), K)
     assert bool(out.valid.all())
     assert int(out.statistics.beyond[0]) == 0
+
+
+class Ranged(torch.nn.Module):
+    """A network that predicts 3 m, but 60 m at the left, and states that it reaches ``max_depth``."""
+
+    def __init__(self, max_depth):
+        super().__init__()
+        self.max_depth = max_depth
+
+    def forward(self, x):
+        depth = torch.full((len(x), *x.shape[-2:]), 3.0)
+        depth[:, :, : W // 2] = 60.0
+        return DepthPrediction(depth)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "own", "expected"),
+    [
+        ([80.0], None, 80.0),
+        ([None], None, None),
+        ([80.0], 20.0, 20.0),  # the user's own word
+        ([10.0, 80.0], None, 80.0),
+        ([80.0, None], None, None),
+        (["80"], None, None),
+        ([-1.0], None, None),
+    ],
+)
+def test_the_pipeline_follows_the_networks_stated_range(ranges, own, expected):
+    model = UncertainDepth([Ranged(r) for r in ranges], UfMStarConfig(segment=replace(SPGF, max_depth=own)))
+    assert model.ufm.config.segment.max_depth == expected
+    out = model(torch.rand(1, 3, H, W), torch.eye(4), K)
+    left = out.ufm.valid[..., : W // 2]
+    assert bool(left.all()) is (expected == 80.0)
+    assert int(out.ufm.statistics.beyond[0]) == int((~left).sum())
+
+
+def test_declared_ranges_reach_the_pipeline_and_the_evaluation():
+    network = wrap_network(lambda x: x[:, :1], max_depth=7.0)
+    assert UncertainDepth(network).ufm.config.segment.depth_limit == 7.0
+    assert Ensemble([network, wrap_network(lambda x: x[:, :1], max_depth=9.0)]).max_depth == 9.0
+    assert AlignedNetwork(network, Alignment("inverse", 1.0, 0.0, max_depth=5.0)).max_depth == 5.0
+    assert UfMStarConfig().within(7.0).segment == SPGFConfig(max_depth=7.0)
+    assert UfMStarConfig().segment.depth_limit == 20.0
+    source = NetworkSource(NetworksInTurn(network), torch.device("cpu"), {}, seeding=None)
+    assert source.max_depth == 7.0
+    made = make_estimator(Row(Method.parse("UfM*-DepthOnly")), torch.device("cpu"), source.max_depth)
+    assert made.ufm.config.segment.max_depth == 7.0
 
 
 @pytest.mark.parametrize(
@@ -149,6 +207,59 @@ def test_a_point_far_from_everything_reads_as_chosen():
         np.testing.assert_allclose(float(ufm.query(far).disagreement), expected, rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:stream 0")
+@pytest.mark.parametrize("choice", CHOICES)
+def test_a_large_noisy_image_without_a_segment_reads_as_chosen(choice):
+    """5 cm of noise between neighbours leave no segment of the length that a large image asks for."""
+    size = (600, 900)
+    noisy = 1 + 0.05 * torch.randn(2, 1, *size, generator=torch.Generator().manual_seed(0))
+    camera = torch.tensor([[800.0, 0, 450], [0, 800, 300], [0, 0, 1]])
+    ufm = UfMStar(UfMStarConfig(unmeasured=choice, **CHOICES[choice]))
+    for depth in noisy:
+        out = ufm(depth, torch.eye(4), camera)
+        assert int(out.statistics.segments[0]) == 0
+        assert int(out.statistics.unmeasured[0]) == depth.numel()
+    expected = {"paper": 0.0, "prior": 0.3, "nan": float("nan")}
+    mean = (0.2 * noisy).square().mean(0) if choice == "relative" else torch.full((1, *size), expected[choice])
+    np.testing.assert_allclose(out.variance.numpy(), mean.numpy(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_what_was_not_measured_does_not_make_the_next_frame_certain(choice):
+    """The first view's M, 0 as the paper has it, halves that of the second by the moving average; chosen otherwise it
+    does not."""
+    first, second = frame(0), frame(1)
+    config = CONFIG.replace(unmeasured=choice, **CHOICES[choice])
+    smoothed, plain = UfMStar(config), UfMStar(config.replace(ema_alpha=1.0))
+    for ufm in (smoothed, plain):
+        ufm(*first)
+    a, b = smoothed(*second), plain(*second)
+    compared = b.measured > 0.5
+    assert int(compared.sum()) > 100
+    ratio = (a.disagreement / b.disagreement)[compared]
+    if choice == "paper":
+        assert float(ratio.median()) == pytest.approx(0.5, rel=1e-4)
+    elif choice == "nan":
+        np.testing.assert_allclose(ratio.numpy(), 1.0, rtol=1e-4)
+    else:
+        assert float(ratio.min()) > 0.5
+
+
+def test_depth_alone_through_the_pipeline_is_never_certain_unasked():
+    """First frame, a point far from every Gaussian, and a later frame: a choice other than the paper's leaves no 0."""
+    network = wrap_network(lambda x: DEPTHS_OF[int(x[0, 0, 0, 0] * 255)])
+    for choice in ("relative", "prior"):
+        model = UncertainDepth(network, CONFIG.replace(unmeasured=choice, **CHOICES[choice]))
+        for i in range(3):
+            image = torch.zeros(1, 3, H, W) + i / 255
+            out = model(image, torch.tensor(POSES[i]), K)
+            assert float(out.variance[out.ufm.valid].min()) > 1e-5
+    paper = UncertainDepth(network, CONFIG)
+    out = paper(torch.zeros(1, 3, H, W), torch.tensor(POSES[0]), K)
+    assert float(out.variance[out.ufm.valid].max()) == 0
+    assert int(out.ufm.statistics.unmeasured[0]) == int(out.ufm.valid.sum())
+
+
 def test_a_frame_without_a_segment_warns_once():
     ufm = UfMStar(CONFIG)
     depth, pose, intrinsics = frame(0)
@@ -167,6 +278,9 @@ def test_the_papers_configuration():
     assert (paper.segment.min_pixels, paper.segment.min_rows, paper.segment.prune) == (2000, 32, "either")
     assert (paper.regression, paper.near_radius, paper.far_radius) == ("neighbourhood", 0.1, 0.5)
     assert paper.unmeasured == "paper"
+    # SPGF's own t = a z^2 / f at the paper's 224 x 224, whatever the camera; the same in metres at 518 x 518.
+    assert paper.segment.scaled_to(224, 224).slope(123.0) == pytest.approx(2.4 / 123)
+    assert paper.segment.scaled_to(518, 518).slope(123.0 * 518 / 224) == pytest.approx(2.4 / 123)
     changed = {"segment", "regression"}
     ours, theirs = UfMStarConfig().to_dict(), paper.to_dict()
     assert {name for name in ours if ours[name] != theirs[name]} == changed

@@ -139,7 +139,7 @@ def test_thin_wide_plates_survive_a_thousand_fusions_in_float32():
 
 def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    select._has_numba.cache_clear()
+    select.has_numba.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba cannot be imported .* torch reference serves") as caught:
             chosen = [select.select_step("auto", "cpu") for _ in range(2)]
@@ -149,7 +149,7 @@ def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
         with pytest.raises(ImportError):
             select.select_step("numba", "cpu")
     finally:
-        select._has_numba.cache_clear()
+        select.has_numba.cache_clear()
 
 
 def test_seam():
@@ -160,11 +160,29 @@ def test_seam():
         assert select.select_kernels("torch", device) is select.select_step("torch", device).keywords["kernels"]
         assert select.select_kernels("torch", device) is REFERENCE
         assert select.select_check("torch", device) is frame.check_values
-    mixed = select.select_kernels("auto", "cuda")
+    mixed = select.select_kernels("auto", "mps")
     assert mixed.spgf is not REFERENCE.spgf, "on the host"
     assert replace(mixed, spgf=REFERENCE.spgf) == REFERENCE
     with pytest.raises(ValueError, match="needs CPU tensors"):
         select.select_step("numba", "cuda")
+
+
+def test_seam_of_the_gpu_kernels(monkeypatch):
+    pytest.importorskip("triton", reason="needs triton, which torch brings along on Linux")
+    compiled = select.select_kernels("triton", "cuda")
+    assert select.select_kernels("auto", "cuda") is select.select_kernels("auto", "xpu") is compiled is not REFERENCE
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    with pytest.raises(ValueError, match="'triton' needs tensors of a GPU, got device type 'cpu'"):
+        select.select_step("triton", "cpu")
+    monkeypatch.setitem(sys.modules, "triton", None)
+    select._has_triton.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match="triton cannot be imported .* torch reference serves") as caught:
+            chosen = [select.select_kernels("auto", "cuda") for _ in range(2)]
+        assert len(caught) == 1
+        assert all(kernels.fuse is REFERENCE.fuse for kernels in chosen)
+    finally:
+        select._has_triton.cache_clear()
 
 
 def test_whole_sequence_fast_and_slow():

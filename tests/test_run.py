@@ -436,9 +436,9 @@ def test_ctrl_c_leaves_what_is_finished_and_resume_goes_on(path, tmp_path, unint
 def test_asked_to_stop_it_stops_between_frames(path, tmp_path, uninterrupted):
     seen: list[Progress] = []
     out = tmp_path / "out"
-    summary = run(network_job(path, *pair()), out, progress=seen.append, stop=lambda: len(seen) > 3)
+    summary = run(network_job(path, *pair()), out, progress=seen.append, stop=lambda: len(seen) > 5)
     assert (summary["state"], summary["frames"]["done"]) == ("interrupted", 3)
-    assert [p.done for p in seen] == [0, 1, 2, 3]
+    assert [p.done for p in seen if p.stage == "frames"] == [0, 1, 2, 3]
     run(network_job(path, *pair()), out, resume=True)
     assert outputs(out) == uninterrupted
 
@@ -504,16 +504,20 @@ run(network_job(Path(sys.argv[1]), *networks), sys.argv[2])
 
 
 @pytest.mark.slow
-def test_sigkill_loses_the_frame_in_hand_only(path, tmp_path, uninterrupted):
+def test_sigkill_loses_the_frames_in_hand_only(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(out)], cwd=TESTS, check=False)
     assert ended.returncode == -9
     summary = read_summary(out)
     assert summary["state"] == "interrupted"
     assert "killed" in summary["reason"]
-    assert len(list((out / "frames").iterdir())) == 3
+    written = len(list((out / "frames").iterdir()))
+    assert written <= 3  # those behind the loop are lost
     resumed = run(network_job(path, *pair()), out, resume=True)
-    assert [(s["first"], s["frames"]) for s in resumed["time"]["sessions"]] == [(0, 3), (3, 3)]
+    sessions = [(s["first"], s["frames"]) for s in resumed["time"]["sessions"]]
+    first = sessions[-1][0]
+    assert sessions == ([(0, first), (first, 6 - first)] if first else [(0, 6)])
+    assert first in (written - 1, written)
     assert outputs(out) == uninterrupted
 
 

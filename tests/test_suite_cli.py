@@ -53,7 +53,7 @@ def words_for(rooms, out, *more, suite="depth-only"):
 
 def test_one_preset_for_all_rows(rooms, tmp_path):
     words = [str(word) for word in words_for(rooms, tmp_path / "out")[1:]]
-    settings = {preset: job_from(read([*words, "--ufm-preset", preset])).suite.rows[-1].setting.to_dict()
+    settings = {preset: job_from(read([*words, "--ufm-preset", preset])).suite.rows[3].setting.to_dict()
                 for preset in ("paper", "default")}  # fmt: skip
     assert settings == {"paper": {"ufm_preset": "paper"}, "default": {}}
     with pytest.raises(ValueError, match="ufm-preset"):
@@ -184,8 +184,8 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
     words = words_for(rooms, tmp_path / "out", "--dry-run", "--frames", "1:", "--shard", "1/2")
     code, text, _ = ufmstar(*words)
     assert code == 0
-    assert "4 rows:" in text
-    assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 8 records" in text
+    assert "5 rows:" in text
+    assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
     assert "cache of predictions: up to 0.0 MB" in text  # ground truth is not kept
     assert not (tmp_path / "out").exists()
 
@@ -226,10 +226,10 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 
     def measure(rows, networks, sequence, **how):
         measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames, how["plan"].threads))
-        return {"rows": []}
+        return {"rows": [], "sequence": {"name": sequence.name}, "count": len(measured)}
 
     monkeypatch.setattr(measurement, "measure", measure)
-    monkeypatch.setattr(measurement, "timed_networks", lambda networks: networks)
+    monkeypatch.setattr(measurement, "timed_networks", lambda networks, rows: networks)
     rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
     (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
     words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")
@@ -237,7 +237,9 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     assert measured == [], "another part may still be running"
     code, _, err = ufmstar(*words, "--shard", "2/2")
     assert (code, "measuring time, energy and memory" in err) == (0, True)
-    assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
-    assert measured == [(rows, "ash", 1, 1)]
+    written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
+    assert (written["sequence"], written["count"]) == ({"name": "3 sequences"}, 2.0), "means over the sequences"
+    assert [one["sequence"] for one in written["sequences"]] == ["ash", "birch", "cedar"]
+    assert measured == [(rows, name, 1, 1) for name in ("ash", "birch", "cedar")]
     assert ufmstar(*words, "--resume")[0] == 0
-    assert len(measured) == 1
+    assert len(measured) == 3

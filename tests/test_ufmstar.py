@@ -37,7 +37,7 @@ def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
         sparse=config.sparse,
         min_gaussian_length=config.min_gaussian_length,
         frame_max_scale=config.frame_max_scale,
-        max_depth=config.max_depth,
+        max_depth=config.depth_limit,
     )
     return oracle.Segmentation(settings, config.min_pixels, config.min_rows, config.prune)
 

@@ -89,6 +89,7 @@ class EvalOutputOptions:
         cache: folder of the networks' predictions; default: OUT/cache
         examples: number of sequences of each data set of which some frames are kept for pictures
         confident: share of a frame's pixels of which a method counts as confident
+        bins: of the calibration errors: ours (10 bins, 10 levels) or authors (100 bins, 101 levels); default: ours
         no_report: no tables and figures at the end; ufmstar report OUT makes them
     """
 
@@ -98,6 +99,7 @@ class EvalOutputOptions:
     cache: str | None = None
     examples: int = 3
     confident: float = 0.5
+    bins: str = option("ours", choices=("ours", "authors"))
     no_report: bool = False
 
 
@@ -211,6 +213,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         cache=None if output.cache is None else Path(output.cache),
         device=options.device,
         confident=output.confident,
+        bins=output.bins,
         examples=output.examples,
         samples=what.samples,
         runtime=what.runtime,

@@ -21,6 +21,7 @@ from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
+from ufmstar_torch.eval.engine.behind import Behind
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource
@@ -131,7 +132,7 @@ class Progress:
     """How far a run is.
 
     Attributes:
-        stage: "frames" or "pictures".
+        stage: "kernels" (compiling, on a machine's first run), "frames" or "pictures".
         done: of this stage, skipped frames included.
         total: of this stage.
         components: K after this frame, None if it was skipped or nothing has been done yet.
@@ -197,31 +198,49 @@ def run(
 
 def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
+    progress(Progress("kernels", 0, 1, None, 0))
+    UfMStar(job.config, device=job.device).warm_up((32, 32))
+    progress(Progress("kernels", 1, 1, None, 0))
     position = folder.checkpoint.position
     row = job.row(folder.checkpoint.module, position)
     metrics, maps = RunMetrics(UFM, folder.checkpoint.metrics), MapWriter(UFM, folder.writer)
     journal = Journal(UFM, folder, metrics.figures.state, maps, bare=not job.source.needs_image)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
-    stream.drive([metrics, maps, journal, _Reports(job, folder, progress)], stop=stop)
+    with Behind([metrics, maps, journal, _Summaries(job, folder)]) as behind:
+        stream.drive([behind, _Reports(job, folder, progress)], stop=stop)
 
 
 class _Reports(FrameSink):
-    """The progress after every frame, and now and then the summary of a run that is going on."""
+    """The progress after every frame."""
 
     def __init__(self, job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]) -> None:
-        self._job, self._folder, self._progress = job, folder, progress
+        self._job, self._progress = job, progress
         self._skipped = sum(record["state"] == "skipped" for record in folder.records)
 
     def begin(self, stream: FrameStream) -> None:
         """See ``Sink``."""
-        self._reported = perf_counter()
         self._progress(Progress("frames", stream.position, len(self._job.indices), None, self._skipped))
 
     def take(self, result: FrameResult) -> None:
         """See ``Sink``."""
         self._skipped += len(result.skipped)
-        components = self._folder.records[-1].get("components")
+        statistics = result.rows[UFM].estimate.statistics if UFM in result.rows else None
+        components = None if statistics is None else int(statistics.components[0])
         self._progress(Progress("frames", result.number + 1, len(self._job.indices), components, self._skipped))
+
+
+class _Summaries(FrameSink):
+    """Now and then the summary of a run that is going on."""
+
+    def __init__(self, job: RunJob, folder: RunFolder) -> None:
+        self._job, self._folder = job, folder
+
+    def begin(self, stream: FrameStream) -> None:
+        """See ``Sink``."""
+        self._reported = perf_counter()
+
+    def take(self, result: FrameResult) -> None:
+        """See ``Sink``."""
         if perf_counter() - self._reported > _SUMMARY_EVERY:
             _write_summary(self._job, self._folder, _GOING_ON)
             self._reported = perf_counter()

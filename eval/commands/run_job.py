@@ -46,7 +46,7 @@ def job_from(chosen: RunOptions) -> RunJob:
         sequence=sequence,
         indices=indices,
         source=source,
-        config=config,
+        config=config.within(source.max_depth),
         recalibration=_recalibration(chosen, source),
         device=torch.device(device),
         settings=options,

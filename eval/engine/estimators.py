@@ -78,8 +78,13 @@ class Estimator(Protocol):
         ...
 
 
-def make_estimator(row: Row, device: torch.device) -> Estimator:
+def make_estimator(row: Row, device: torch.device, max_depth: float | None = None) -> Estimator:
     """The estimator of a row, in its initial state.
+
+    Args:
+        row: which.
+        device: where it runs.
+        max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
 
     Raises:
         ValueError: the setting changes what UfM* does not have, or what the method does not use; or a recalibration
@@ -100,7 +105,7 @@ def make_estimator(row: Row, device: torch.device) -> Estimator:
         return Pointwise(config, device, uses_variances=method.uses_aleatoric)
     recalibration = read_recalibration(row.setting.recalibration) if row.setting.recalibration else None
     return Gaussians(
-        ufm_star_config(row),
+        ufm_star_config(row).within(max_depth),
         device,
         uses_variances=method.uses_aleatoric,
         corrected=row.setting.corrected,

@@ -76,6 +76,7 @@ def evaluate_sequence(
     limit: slice = slice(None),
     sinks: Sequence[Sink] = (),
     confident: float = 0.5,
+    bins: str = "ours",
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[RowResult]:
@@ -90,6 +91,7 @@ def evaluate_sequence(
         limit: which frames, before a setting's skip.
         sinks: take the frames after the metrics; a row's key is its slug.
         confident: of the pixels of a frame, the share of which a reference method counts as confident.
+        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
         stop: asked before every frame.
         progress: called with the frames that are done and all of them, at the start and after every one.
 
@@ -125,7 +127,7 @@ def evaluate_sequence(
         RowRunner(
             row.slug,
             sources[row.method.base, row.setting.preprocess],
-            make_estimator(row, device),
+            make_estimator(row, device, sources[row.method.base, row.setting.preprocess].max_depth),
             every=row.method.every_member,
             setting=row.setting,
             anchors=anchors.get(row),
@@ -134,7 +136,7 @@ def evaluate_sequence(
         for row in rows
     ]
     named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
-    metrics, accounts = RowMetrics(named, confident), _Accounts()
+    metrics, accounts = RowMetrics(named, confident, bins), _Accounts()
     stream = FrameStream(sequence, indices, runners, store=store, device=device, check=check)
     stream.drive([metrics, accounts, *sinks, ProgressSink(progress)], stop=stop)
     return [_result(row, accounts.rows[row.slug], metrics, sequence) for row in rows]

@@ -61,6 +61,7 @@ class MapSource:
 
     needs_image, cacheable, passes, runtime = False, False, 1, None
     networks: tuple[DepthNetwork, ...] = ()
+    max_depth: float | None = None
 
     def __init__(
         self,

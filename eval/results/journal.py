@@ -52,7 +52,7 @@ class MapWriter(FrameSink):
 
 
 class Journal(FrameSink):
-    """Commits every frame to the run's folder, with the state that the next one depends on.
+    """Commits every frame to the run's folder, with the state that the next one depends on (``FrameResult.state``).
 
     Args:
         key: of the row.
@@ -78,7 +78,6 @@ class Journal(FrameSink):
     def begin(self, stream: FrameStream) -> None:
         """The clock of this session starts."""
         self._first, self._started = stream.position, perf_counter()
-        [self._row] = [row for row in stream.rows if row.key == self._key]
 
     def take(self, result: FrameResult) -> None:
         """Commit a frame.
@@ -93,7 +92,7 @@ class Journal(FrameSink):
         }
         checkpoint = Checkpoint(
             position=result.number + 1,
-            module=saved_state(self._row.state(), bare=self._bare),
+            module=saved_state(row_part(result.state, self._key), bare=self._bare),
             metrics=self._sums(),
             sessions=[*self._earlier, session],
         )
@@ -110,6 +109,11 @@ class Journal(FrameSink):
         written = {"depth": self._maps.written.depth_saturated, "sigma": self._maps.written.sigma_saturated}
         times = {"ms": _times(result, row, self._saving)}
         return {**about, "state": "done", **_figures(row), "saturated": written, **times, **_anchor_figures(row)}
+
+
+def row_part(state: Mapping[str, Tensor], key: str) -> dict[str, Tensor]:
+    """A row's part of a stream's state (``FrameStream.state``)."""
+    return {name.removeprefix(f"{key}/"): value for name, value in state.items() if name.startswith(f"{key}/")}
 
 
 def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
@@ -148,7 +152,7 @@ def _figures(row: RowFrame) -> dict[str, Any]:
 
 def _times(result: FrameResult, row: RowFrame, saving: float) -> dict[str, float]:
     """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
-    this frame's is not known yet."""
+    this frame's is not known yet. "cycle" is the time since the frame before: stages overlap."""
     ms = result.ms
     optional = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
     return {
@@ -159,6 +163,7 @@ def _times(result: FrameResult, row: RowFrame, saving: float) -> dict[str, float
         "write": ms["write"],
         "save": saving,
         "prepare": ms["predict"] - row.ms.get("network", 0.0),
+        "cycle": ms["cycle"],
     }
 
 

@@ -176,13 +176,14 @@ def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dic
 
 
 def _time(done: Sequence[Mapping[str, Any]], sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Medians by stage; "prepare" is preprocessing, or reading the predicted map.
+    """Medians by stage; "prepare" is preprocessing, or reading the predicted map, and "frame" the time from a frame to
+    the next, which is shorter than the sum of the stages: frames are read ahead and written behind in threads.
 
     The rate is that of the median frame: the first one also loads libraries and compiled kernels.
     """
     seconds = sum(session["seconds"] for session in sessions)
     stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
-    total = median(sum(record["ms"].values()) for record in done) if done else None
+    total = median(record["ms"]["cycle"] for record in done) if done else None
     return {
         "median_ms": {stage: median(times) if times else None for stage, times in stages.items()} | {"frame": total},
         "frames_per_second": 1000 / total if total else None,

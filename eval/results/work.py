@@ -55,6 +55,7 @@ class EvalJob:
         cache: folder of predictions; None = in ``out``.
         device: "cpu", "cuda", "cuda:1".
         confident: share of a frame's pixels of which a reference method counts as confident.
+        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
         examples: of each data set, sequences of which a few frames are stored for pictures.
         samples: passes of MC-Dropout.
         runtime, precision: of the networks (``Inference``).
@@ -69,6 +70,7 @@ class EvalJob:
     cache: Path | None = None
     device: str = "cpu"
     confident: float = 0.5
+    bins: str = "ours"
     examples: int = 3
     samples: int | None = None
     runtime: str = "auto"
@@ -88,6 +90,7 @@ class EvalJob:
     def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """eval.json."""
         suite, f = self.suite, self.frames
+        bins = {} if self.bins == "ours" else {"bins": self.bins}  # as folders have it that were written before
         opening = {name: value for item in self.items for name, value in item.opening}
         return {
             "suite": suite.name,
@@ -98,7 +101,7 @@ class EvalJob:
             "datasets": sorted({item.dataset for item in self.items}),
             "sequences": [{"dataset": item.dataset, "sequence": item.sequence} for item in self.items],
             "missing_bases": list(self.missing_bases),
-            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **opening},
+            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **bins, **opening},
             "versions": versions(),
             "machine": hardware(),
         }
@@ -110,7 +113,7 @@ class EvalJob:
 
     def to_dict(self) -> dict[str, Any]:
         """The job as plain values, for another process."""
-        plain = ("missing_bases", "device", "confident", "examples", "samples", "runtime", "precision")
+        plain = ("missing_bases", "device", "confident", "bins", "examples", "samples", "runtime", "precision")
         own = {name: getattr(self, name) for name in plain}
         return own | {
             "suite": self.suite.to_dict(),
@@ -265,6 +268,7 @@ class _Worker:
             limit=job.frames,
             sinks=[ExampleWriter(Examples(self.folder.place(item)))] if job.keeps_examples(item) else [],
             confident=job.confident,
+            bins=job.bins,
             stop=self.context.stop,
             progress=lambda done, total: self.context.progress(item.label, done, total),
         )

@@ -5,36 +5,54 @@ from __future__ import annotations
 import functools
 import warnings
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
+
+_TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
+
+
+@runtime_checkable
+class LateStep(Protocol):
+    """A step that keeps something of a frame for the next one."""
+
+    def settled(self, state: UfMStarState, config: UfMStarConfig, /) -> UfMStarState:
+        """The state that it returned last, with what it keeps."""
+        ...
 
 
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device.
+    """The step for a device. That of a GPU has a memory (``step_device``): one for every state.
 
     Args:
         name: "torch": the reference on every device; it waits for the device only where the mixture may
-            have to grow. "numba": compiled for the CPU, CPU tensors only. "auto": numba on the CPU where it can be
-            imported; on an accelerator the torch reference, except that the segmentation, a long chain of
-            tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
+            have to grow. "numba": compiled for the CPU, CPU tensors only. "triton": for a GPU; of CPU tensors only in
+            Triton's interpreter (``TRITON_INTERPRET=1``). "auto": numba on the CPU, Triton on CUDA, ROCm and XPU, each
+            where it can be imported; on another accelerator the torch reference, except that the segmentation, a long
+            chain of tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
         device_type: ``torch.device.type`` of the depth.
 
     Raises:
-        ValueError: "numba" for tensors of another device.
-        ImportError: "numba" by name where it cannot be imported.
+        ValueError: "numba" or "triton" for tensors of another device.
+        ImportError: "numba" or "triton" by name where it cannot be imported.
     """
     if _compiled(name, device_type):
         from ufmstar_torch.kernels import step_cpu
 
         return step_cpu.step
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.step_device import DeviceStep
+
+        return DeviceStep(_triton())
     return functools.partial(step, kernels=select_kernels(name, device_type))
 
 
@@ -58,7 +76,9 @@ def select_merge(name: str, device_type: str) -> MergeKernels:
 
 def select_kernels(name: str, device_type: str) -> Kernels:
     """The parts of the step where it is the reference's; arguments as :func:`select_step`."""
-    if name == "torch" or device_type in ("cpu", "meta") or not _has_numba():
+    if _on_gpu(name, device_type):
+        return _triton()
+    if name == "torch" or device_type in ("cpu", "meta") or not has_numba():
         return REFERENCE
     from ufmstar_torch.kernels import segment_cpu
 
@@ -73,11 +93,48 @@ def _compiled(name: str, device_type: str) -> bool:
         import numba as numba  # an ImportError for who asked for it by name
 
         return True
-    return name == "auto" and device_type == "cpu" and _has_numba()
+    return name == "auto" and device_type == "cpu" and has_numba()
+
+
+def _on_gpu(name: str, device_type: str) -> bool:
+    """Whether the kernels are Triton's."""
+    if name == "triton":
+        from ufmstar_torch.kernels.triton.launch import interpreted
+
+        if device_type not in _TRITON_DEVICES and not (device_type == "cpu" and interpreted()):
+            raise ValueError(f"backend='triton' needs tensors of a GPU, got device type {device_type!r}")
+        return True
+    return name == "auto" and device_type in _TRITON_DEVICES and _has_triton()
 
 
 @functools.cache
-def _has_numba() -> bool:
+def _triton() -> Kernels:
+    from ufmstar_torch.kernels.triton import correspond, distribute, fuse, regress, segment
+
+    return Kernels(
+        spgf=segment.segment,
+        floor_covariance=fuse.floor_covariance,
+        correspond=correspond.correspond,
+        fuse=fuse.fuse,
+        regress_image=regress.regress_image,
+        smooth=regress.smooth,
+        distribute=distribute.distribute,
+    )
+
+
+@functools.cache
+def _has_triton() -> bool:
+    """Whether triton can be imported; one warning where it cannot."""
+    try:
+        import triton as triton
+    except ImportError as error:
+        warnings.warn(f"triton cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
+        return False
+    return True
+
+
+@functools.cache
+def has_numba() -> bool:
     """Whether numba can be imported; one warning where it cannot."""
     try:
         import numba as numba
@@ -85,6 +142,19 @@ def _has_numba() -> bool:
         warnings.warn(f"numba cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
         return False
     return True
+
+
+def compile_triangulation() -> None:
+    """Compile what triangulates tracked corners, where numba can be imported."""
+    if not has_numba():
+        return
+    import numpy as np
+
+    from ufmstar_torch.kernels.triangulate_cpu import triangulate
+
+    poses = np.stack([np.eye(4)] * 2)
+    poses[1, 0, 3] = 1.0
+    triangulate(np.array([[[0.5, 0.0], [-0.5, 0.0]]]), np.ones((1, 2), np.bool_), poses, np.eye(3))
 
 
 def _on_host(kernel: SegmentKernel) -> SegmentKernel:

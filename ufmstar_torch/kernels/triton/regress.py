@@ -1,0 +1,296 @@
+"""Gaussian mixture regression on a GPU: the exact sum with culling in two levels.
+
+The bound is that of ``kernels.regress_tiles_cpu``: a component is left out where its density is at most
+(eps / 3n) max(max_j l_j, pi_0 / 1000), l_j a lower bound of the densities there. Here the levels are the image (a
+program per stream lists the components whose silhouette meets it) and a tile of 16 x 16 pixels (a program). Of chosen
+pixels, 256 in their order take the place of a tile.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ufmstar_torch import unmeasured
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.kernels.triton.launch import launch, power_of_two
+from ufmstar_torch.kernels.triton.listing import EPSILON, PRIOR, prepare
+from ufmstar_torch.kernels.triton.matrices import lowest_bit
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import Regression
+from ufmstar_torch.regress import regress_image as reference
+
+_SIDE = 16  # pixels of a tile
+_CHUNK = 32  # components bounded at a time: the bits of a mask
+_UNMEASURED = {"paper": 0, "prior": 1, "relative": 2, "nan": 3}
+
+
+@dataclass(frozen=True)
+class FrameRegression:
+    """Step 5 and what follows it in a step.
+
+    Attributes:
+        disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid.
+        features: [B, H, W, F].
+        measured: [B, H, W], see ``unmeasured``.
+        memory: [B, H, W] of the moving average.
+    """
+
+    disagreement: Tensor
+    features: Tensor
+    measured: Tensor
+    memory: Tensor
+
+
+def regress_frame(
+    mixture: GaussianMixture,
+    to_camera: tuple[Tensor, Tensor],
+    frame: FrameInput,
+    memory: Tensor,
+    config: UfMStarConfig,
+    counts: Tensor,
+    *,
+    smooth: bool,
+) -> FrameRegression:
+    """Regression, what was not measured, and the moving average at every pixel, in two launches.
+
+    Args:
+        mixture: M_i, [B, K].
+        to_camera: R and t that take it into the camera frame.
+        frame: of B streams.
+        memory: of the moving average.
+        config: exact regression, no anchors.
+        counts: [8, B] int64 (``append``), to which valid and unmeasured pixels are added.
+        smooth: whether to average.
+    """
+    depth, average = frame.depth.contiguous(), smooth and config.ema_alpha < 1.0
+    if average and memory.shape != depth.shape:
+        memory = memory.new_full(depth.shape, torch.nan)
+    updated = torch.empty_like(memory) if average else memory
+    channels = mixture.features.shape[2]
+    maps, measured = torch.empty_like(depth), torch.empty_like(depth)
+    features = depth.new_empty(*depth.shape, channels)
+    camera = frame.intrinsics.to(torch.float64).contiguous()
+    listed = prepare(mixture, camera, frame.size, depth.dtype, config, to_camera)
+    _launch(
+        mixture, listed, depth, frame.valid, camera, depth, maps, features, config, subset=False,
+        stepped=(mixture.count, memory, updated, measured, counts), alpha=config.ema_alpha if average else 1.0,
+    )  # fmt: skip
+    return FrameRegression(maps, features, measured, updated)
+
+
+def regress_image(
+    mixture_cam: GaussianMixture,
+    depth: Tensor,
+    intrinsics: Tensor,
+    valid: Tensor,
+    config: UfMStarConfig,
+    pixels: Tensor | None = None,
+) -> Regression:
+    """As :func:`ufmstar_torch.regress.regress_image`; ``config.regression == "neighbourhood"`` runs there."""
+    if config.regression != "exact":
+        return reference(mixture_cam, depth, intrinsics, valid, config, pixels)
+    maps = depth.new_empty(depth.shape if pixels is None else pixels.shape)
+    features = depth.new_empty(*maps.shape, mixture_cam.features.shape[2])
+    camera = intrinsics.to(torch.float64).contiguous()
+    listed = prepare(mixture_cam, camera, (depth.shape[1], depth.shape[2]), depth.dtype, config)
+    chosen = depth if pixels is None else pixels.contiguous()
+    subset = pixels is not None
+    _launch(mixture_cam, listed, depth.contiguous(), valid, camera, chosen, maps, features, config, subset=subset)
+    return Regression(maps, features)
+
+
+def _launch(
+    mixture: GaussianMixture, listed: tuple[Tensor, ...], depth: Tensor, valid: Tensor, camera: Tensor, pixels: Tensor,
+    maps: Tensor, features: Tensor, config: UfMStarConfig, *, subset: bool, stepped: tuple[Tensor, ...] | None = None,
+    alpha: float = 1.0,
+) -> None:  # fmt: skip
+    b, height, width = depth.shape
+    chosen = pixels.shape[1] if subset else 0
+    channels = mixture.features.shape[2]
+    tiles = triton.cdiv(height, _SIDE) * triton.cdiv(width, _SIDE)
+    launch(
+        _regress, (triton.cdiv(chosen, _SIDE * _SIDE) if subset else tiles, b),
+        depth, valid.contiguous(), camera, pixels, *listed, mixture.disagreement.contiguous(),
+        mixture.features.contiguous(), maps, features, *(stepped or (mixture.count, *4 * [depth])),
+        height, width, chosen, mixture.capacity, b, fused=True,
+        prior=config.prior_weight, prior_total=config.prior_weight * config.prior_mean,
+        least=math.log2(PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
+        slack=16 * torch.finfo(depth.dtype).eps, channels=channels, padded=power_of_two(channels), side=_SIDE,
+        chunk=_CHUNK, subset=subset, stepped=stepped is not None, alpha=alpha, mode=_UNMEASURED[config.unmeasured],
+        stated=config.prior_mean, relative=config.unmeasured_relative, half=unmeasured.HALF,
+    )  # fmt: skip
+
+
+def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
+    """As :func:`ufmstar_torch.regress.smooth`, in one launch."""
+    before, now = previous.contiguous(), current.contiguous()
+    memory, shown = torch.empty_like(before), torch.empty_like(now)
+    launch(_smooth, (triton.cdiv(now.numel(), 1024),), before, now, memory, shown, now.numel(), alpha=alpha, chunk=1024)
+    return memory, shown
+
+
+@triton.jit
+def mixed(before, now, alpha: tl.constexpr):
+    """The new memory of the moving average; NaN is no value."""
+    both = (1 - alpha) * before + alpha * now
+    return tl.where(now != now, before, tl.where(before != before, now, both))
+
+
+@triton.jit
+def _smooth(previous, current, memory, shown, count, alpha: tl.constexpr, chunk: tl.constexpr):
+    i = tl.program_id(0) * chunk + tl.arange(0, chunk)
+    now = tl.load(current + i, mask=i < count, other=0.0).to(memory.dtype.element_ty)
+    kept = mixed(tl.load(previous + i, mask=i < count, other=0.0), now, alpha)
+    tl.store(memory + i, kept, mask=i < count)
+    tl.store(shown + i, tl.where(now != now, now, kept).to(shown.dtype.element_ty), mask=i < count)
+
+
+@triton.jit
+def _bounds(means, fields, capacity, j, there, cx, cy, cz, hx, hy, hz, slack: tl.constexpr):
+    """log2 of bounds of the densities of components j in the box centre +- half; nothing for those not ``there``."""
+    real = fields.dtype.element_ty
+    mx = tl.load(means + j, mask=there, other=0.0).to(real)
+    my = tl.load(means + capacity + j, mask=there, other=0.0).to(real)
+    mz = tl.load(means + 2 * capacity + j, mask=there, other=0.0).to(real)
+    a = tl.load(fields + j, mask=there, other=0.0)
+    b = tl.load(fields + capacity + j, mask=there, other=0.0)
+    c = tl.load(fields + 2 * capacity + j, mask=there, other=0.0)
+    d = tl.load(fields + 3 * capacity + j, mask=there, other=0.0)
+    e = tl.load(fields + 4 * capacity + j, mask=there, other=0.0)
+    f = tl.load(fields + 5 * capacity + j, mask=there, other=0.0)
+    peak = tl.load(fields + 6 * capacity + j, mask=there, other=-1e30)
+    dx, dy, dz = cx - mx, cy - my, cz - mz
+    wx, wy, wz = hx + slack * tl.abs(mx), hy + slack * tl.abs(my), hz + slack * tl.abs(mz)
+    y0, r0 = tl.abs(a * dx), a * wx
+    y1, r1 = tl.abs(b * dx + c * dy), tl.abs(b) * wx + c * wy
+    y2, r2 = tl.abs(d * dx + e * dy + f * dz), tl.abs(d) * wx + tl.abs(e) * wy + f * wz
+    p0, p1, p2 = y0 + r0, y1 + r1, y2 + r2
+    lower = peak - (p0 * p0 + p1 * p1 + p2 * p2)
+    lower = tl.where(lower > -1e30, lower, -1e30)  # infinity and NaN, from a far outlier, bound nothing
+    q0, q1, q2 = y0 - r0, y1 - r1, y2 - r2
+    q0, q1, q2 = tl.where(q0 > 0, q0, 0.0), tl.where(q1 > 0, q1, 0.0), tl.where(q2 > 0, q2, 0.0)
+    return lower, peak - (q0 * q0 + q1 * q1 + q2 * q2)
+
+
+@triton.jit
+def _regress(
+    depth, valid, camera, pixels, means, fields, index, count, m, features, out, out_f,
+    compared, before, memory, measured, counts, height, width, chosen, capacity, streams,
+    prior: tl.constexpr, prior_total: tl.constexpr, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr,
+    channels: tl.constexpr, padded: tl.constexpr, side: tl.constexpr, chunk: tl.constexpr, subset: tl.constexpr,
+    stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, stated: tl.constexpr, relative: tl.constexpr,
+    half: tl.constexpr,
+):  # fmt: skip
+    real = depth.dtype.element_ty
+    b = tl.program_id(1).to(tl.int64)
+    lane = tl.arange(0, side * side)
+    camera, index = camera + 9 * b, index + b * capacity
+    means, fields = means + 3 * b * capacity, fields + 7 * b * capacity
+    if subset:
+        place = tl.program_id(0) * (side * side) + lane
+        inside = place < chosen
+        target = b * chosen + place
+        source = tl.load(pixels + target, mask=inside, other=0).to(tl.int64)
+        v, u = source // width, source % width
+        source += b * height * width
+    else:
+        tile = tl.program_id(0)
+        across = tl.cdiv(width, side)
+        v, u = tile // across * side + lane // side, tile % across * side + lane % side
+        inside = (v < height) & (u < width)
+        source = (b * height + v) * width + u
+        target = source
+    ok = inside & (tl.load(valid + source, mask=inside, other=0) != 0)
+    z = tl.load(depth + source, mask=ok, other=0.0).to(tl.float64)
+    x = (u - tl.load(camera + 2)) / tl.load(camera) * z
+    y = (v - tl.load(camera + 5)) / tl.load(camera + 4) * z
+    some = tl.sum(ok.to(tl.int32), 0) > 0
+    n = tl.where(some, tl.load(count + b), 0)
+
+    # The box of the points, and the nearest of them as their origin.
+    inf = float("inf")
+    x_low, x_high = tl.min(tl.where(ok, x, inf), 0), tl.max(tl.where(ok, x, -inf), 0)
+    y_low, y_high = tl.min(tl.where(ok, y, inf), 0), tl.max(tl.where(ok, y, -inf), 0)
+    z_low, z_high = tl.min(tl.where(ok, z, inf), 0), tl.max(tl.where(ok, z, -inf), 0)
+    x_low, x_high = tl.where(some, x_low, 0.0), tl.where(some, x_high, 0.0)
+    y_low, y_high = tl.where(some, y_low, 0.0), tl.where(some, y_high, 0.0)
+    z_low, z_high = tl.where(some, z_low, 0.0), tl.where(some, z_high, 0.0)
+    cx, cy, cz = 0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high)
+    hx, hy, hz = 0.5 * (x_high - x_low), 0.5 * (y_high - y_low), 0.5 * (z_high - z_low)
+    hx, hy, hz = hx + slack * (hx + tl.abs(cx)), hy + slack * (hy + tl.abs(cy)), hz + slack * (hz + tl.abs(cz))
+    cx, cy, cz, hx, hy, hz = cx.to(real), cy.to(real), cz.to(real), hx.to(real), hy.to(real), hz.to(real)
+    nearest = tl.min(tl.where(ok & (z == z_low), lane, side * side), 0)
+    x_0, y_0 = tl.sum(tl.where(lane == nearest, x, 0.0), 0), tl.sum(tl.where(lane == nearest, y, 0.0), 0)
+    x, y, z = (x - x_0).to(real), (y - y_0).to(real), (z - z_low).to(real)
+
+    part = tl.arange(0, chunk)
+    greatest = tl.full([chunk], least, real)
+    for first in range(0, n, chunk):
+        lower, _ = _bounds(means, fields, capacity, first + part, first + part < n, cx, cy, cz, hx, hy, hz, slack)
+        greatest = tl.maximum(greatest, lower)
+    threshold = tl.max(greatest, 0) + share - tl.log2(tl.maximum(n, 1).to(real))
+
+    evidence = tl.full([side * side], prior, real)
+    total = tl.full([side * side], prior_total, real)
+    seen = tl.zeros([side * side], real)
+    f = tl.arange(0, padded)
+    sums = tl.zeros([side * side, padded], real)
+    for first in range(0, n, chunk):
+        there = first + part < n
+        _, upper = _bounds(means, fields, capacity, first + part, there, cx, cy, cz, hx, hy, hz, slack)
+        bits = tl.where(there & (upper > threshold), tl.full([chunk], 1, tl.int64) << part.to(tl.int64), 0)
+        left = tl.sum(bits, 0)
+        while left != 0:
+            bit, left = lowest_bit(left)
+            j = first + bit
+            dx = x - (tl.load(means + j) - x_0).to(real)
+            dy = y - (tl.load(means + capacity + j) - y_0).to(real)
+            dz = z - (tl.load(means + 2 * capacity + j) - z_low).to(real)
+            y0 = tl.load(fields + j) * dx
+            y1 = tl.load(fields + capacity + j) * dx + tl.load(fields + 2 * capacity + j) * dy
+            y2 = tl.load(fields + 3 * capacity + j) * dx + tl.load(fields + 4 * capacity + j) * dy
+            y2 += tl.load(fields + 5 * capacity + j) * dz
+            w = tl.exp2(tl.load(fields + 6 * capacity + j) - (y0 * y0 + y1 * y1 + y2 * y2))
+            k = b * capacity + tl.load(index + j)
+            evidence += w
+            own = tl.load(m + k).to(real)
+            if stepped:
+                twice = tl.load(compared + k) > 1
+                seen += tl.where(twice, w, 0.0)
+                if mode == 1:
+                    own = tl.where(twice, own, stated)
+            total += w * own
+            if channels > 0:
+                value = tl.load(features + k * channels + f, mask=f < channels, other=0.0).to(real)
+                sums += w[:, None] * value[None, :]
+    nan = float("nan")
+    value = total / evidence
+    if stepped:
+        known = seen / evidence
+        if mode == 2:
+            size = relative * tl.load(depth + source, mask=ok, other=0.0)
+            value += tl.maximum(1 - known, 0.0) * (size * size)
+        if mode == 3:
+            value = tl.where(known < half, nan, value)
+        tl.store(measured + target, tl.where(ok, known, nan), mask=inside)
+        tl.atomic_add(counts + 6 * streams + b, tl.sum(ok.to(tl.int32), 0))
+        tl.atomic_add(counts + 7 * streams + b, tl.sum((ok & (known < half)).to(tl.int32), 0))
+        value = tl.where(ok, value, nan)
+        if alpha < 1.0:
+            now = value.to(memory.dtype.element_ty)
+            kept = mixed(tl.load(before + target, mask=inside, other=0.0), now, alpha)
+            tl.store(memory + target, kept, mask=inside)
+            value = tl.where(now != now, now, kept).to(real)
+    tl.store(out + target, tl.where(ok, value, nan), mask=inside)
+    if channels > 0:
+        values = tl.where(ok[:, None], sums / evidence[:, None], nan)
+        tl.store(
+            out_f + target[:, None] * channels + f[None, :], values, mask=inside[:, None] & (f < channels)[None, :]
+        )
