@@ -156,6 +156,7 @@ class UfMStarConfig(Checked):
         anchored: use anchors, sparse measured depths (an extension)
         anchor_half_life: age after which an anchor's evidence counts half
         anchor_shrinkage: anchors that a Gaussian needs to be believed half
+        posterior: with anchors, also a corrected depth and its variance (UfMStarOutput.posterior)
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians; null = no limit
@@ -197,6 +198,7 @@ class UfMStarConfig(Checked):
     anchored: bool = False
     anchor_half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
     anchor_shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
+    posterior: bool = False
 
     # State
     features: int = number(0, "dim H - 1", "1", 0)
@@ -214,6 +216,8 @@ class UfMStarConfig(Checked):
             raise ValueError(f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}")
         if self.unmeasured == "prior" and not self.prior_mean:
             raise ValueError("UfMStarConfig.unmeasured = 'prior' needs a prior_mean above 0")
+        if self.posterior and not self.anchored:
+            raise ValueError("UfMStarConfig.posterior needs anchored = True")
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"

@@ -68,11 +68,13 @@ class UfMOptions:
             precedence
         ufm_preset: paper: the paper's own settings (UfMStarConfig.paper); --preset and single --ufm.* take precedence
         anchors: track corners of the images: their depths show the error on which all views agree (docs/anchors.md)
+        posterior: --anchors, and also a depth that they correct, with its variance (docs/results/posterior.md)
     """
 
     preset: str | None = option(None, choices=PRESETS)
     ufm_preset: str | None = option(None, choices=("paper",))
     anchors: bool = False
+    posterior: bool = False
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
 
@@ -114,7 +116,7 @@ class RunOptions:
     uncertainty: UfMOptions
 
     def __post_init__(self) -> None:
-        UfMStarConfig.from_dict(self.uncertainty.ufm)
+        UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": True})
         parse_slice(self.frames)
         parse_size(self.maps.size)
         for words, name in (
@@ -124,15 +126,18 @@ class RunOptions:
         ):
             parse_intrinsics(words, name)
         _check_depth(as_dict(self.network) | as_dict(self.maps))
-        if self.uncertainty.ufm["anchored"] and not self.uncertainty.anchors:
-            raise ValueError("--ufm.anchored needs anchors: give --anchors instead")
+        for name, flag in (("anchored", "anchors"), ("posterior", "posterior")):
+            if self.uncertainty.ufm[name] and not getattr(self.uncertainty, flag):
+                raise ValueError(f"--ufm.{name} needs anchors: give --{flag} instead")
         if self.resume and self.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
 
     @property
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
-        return UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": self.uncertainty.anchors})
+        chosen = self.uncertainty
+        tracked = {"anchored": chosen.anchors or chosen.posterior, "posterior": chosen.posterior}
+        return UfMStarConfig.from_dict(chosen.ufm | tracked)
 
     def settings(self) -> dict[str, Any]:
         """What is run, as plain values that a configuration file may hold: not how it is started."""

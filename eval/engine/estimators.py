@@ -32,6 +32,8 @@ class Estimate:
         disagreement: M of UfM* [m^2], or None.
         anchored: B of UfM* with anchors [m^2], or None.
         bias: r of UfM* with anchors, or None.
+        posterior_depth: of UfM* with anchors and a posterior [m], or None.
+        posterior_variance: likewise [m^2].
         statistics: of UfM*, [1] per count, or None.
     """
 
@@ -43,6 +45,8 @@ class Estimate:
     disagreement: Tensor | None = None
     anchored: Tensor | None = None
     bias: Tensor | None = None
+    posterior_depth: Tensor | None = None
+    posterior_variance: Tensor | None = None
     statistics: FrameStatistics | None = None
 
 
@@ -94,8 +98,9 @@ def make_estimator(row: Row, device: torch.device) -> Estimator:
         config = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(config, device, uses_variances=method.uses_aleatoric)
     return Gaussians(
-        ufm_star_config(row), device, uses_variances=method.uses_aleatoric, corrected=row.setting.corrected
-    )
+        ufm_star_config(row), device, uses_variances=method.uses_aleatoric,
+        corrected=row.setting.corrected, posterior=row.setting.posterior,
+    )  # fmt: skip
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:
@@ -110,7 +115,9 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     Raises:
         ValueError: an override has an unknown name or an impossible value; the message names it.
     """
-    values: dict[str, Any] = UfMStarConfig(on_bad_frame="skip", anchored=bool(row.setting.anchors)).to_dict()
+    values: dict[str, Any] = UfMStarConfig(
+        on_bad_frame="skip", anchored=bool(row.setting.anchors), posterior=row.setting.posterior
+    ).to_dict()
     if row.method.fixed_param:
         values["segment"]["scale_with_image"] = False
     try:
@@ -221,13 +228,20 @@ class Gaussians:
         device: of the mixture.
         uses_variances: False leaves A and E aside.
         corrected: answer with the depth corrected by the anchors' bias, and the variance that remains.
+        posterior: answer with the posterior's depth and variance.
     """
 
     def __init__(
-        self, config: UfMStarConfig, device: torch.device, *, uses_variances: bool = True, corrected: bool = False
+        self,
+        config: UfMStarConfig,
+        device: torch.device,
+        *,
+        uses_variances: bool = True,
+        corrected: bool = False,
+        posterior: bool = False,
     ) -> None:
         self.ufm = UfMStar(config, device=device)
-        self._uses_variances, self._corrected = uses_variances, corrected
+        self._uses_variances, self._corrected, self._posterior = uses_variances, corrected, posterior
         self._anchors = 0
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
@@ -237,6 +251,8 @@ class Gaussians:
         out = self.ufm(prediction.depth[None], T_world_cam[None], K, _one(a), _one(e), anchors=anchors)
         self._anchors = int(out.statistics.anchors_used[0])
         depth, variance = out.corrected() if self._corrected else (prediction.depth[None], out.variance)
+        if self._posterior:
+            depth, variance = out.posterior()
         return _estimate(
             depth=depth[0],
             variance=variance[0],
@@ -246,6 +262,8 @@ class Gaussians:
             disagreement=out.disagreement[0],
             anchored=None if out.anchored is None else out.anchored[0],
             bias=None if out.bias is None else out.bias[0],
+            posterior_depth=None if out.posterior_depth is None else out.posterior_depth[0],
+            posterior_variance=None if out.posterior_variance is None else out.posterior_variance[0],
             statistics=out.statistics,
         )
 

@@ -36,6 +36,7 @@ class Setting(Checked):
         anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
+        posterior: judge the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
 
     Raises:
         ValueError: a value is out of range, or they do not go together.
@@ -52,14 +53,17 @@ class Setting(Checked):
     anchor_count: int | None = number(None, "", "1", 0)
     track_noise: float = number(0.0, "", "px", 0.0, open_high=True)
     corrected: bool = False
+    posterior: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         count = self.anchor_count
         if count is not None and not isinstance(count, int):
             raise ValueError(f"Setting.anchor_count must be a whole number, got {count!r}")
-        if not self.anchors and (count is not None or self.corrected):
-            raise ValueError("anchor_count and corrected go with anchors")
+        if not self.anchors and (count is not None or self.corrected or self.posterior):
+            raise ValueError("anchor_count, corrected and posterior go with anchors")
+        if self.corrected and self.posterior:
+            raise ValueError("corrected and posterior contradict each other")
         if self.track_noise and self.anchors != TRACKED:
             raise ValueError('track_noise goes with anchors = "tracked"')
         if "anchored" in self.overrides:
@@ -155,7 +159,7 @@ def configured(setting: Setting) -> UfMStarConfig:
         default_of(name)
         group, _, field = name.rpartition(".")
         (nested.setdefault(group, {}) if group else nested)[field] = value
-    config = UfMStarConfig(anchored=bool(setting.anchors))
+    config = UfMStarConfig(anchored=bool(setting.anchors), posterior=setting.posterior)
     groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}
     return config.replace(**{name: value for name, value in nested.items() if not _group(value)}, **groups)
 

@@ -10,6 +10,8 @@ from typing import Any
 from torch import Tensor
 
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
+from ufmstar_torch.posterior.update import PosteriorKernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
 
@@ -43,6 +45,16 @@ def select_kernels(name: str, device_type: str) -> Kernels:
     if compiled is None or device_type == "cpu":
         return compiled or REFERENCE
     return replace(REFERENCE, spgf=_on_host(compiled.spgf))
+
+
+def select_posterior(name: str, device_type: str) -> PosteriorKernels:
+    """The posterior's kernels for a device; arguments and errors as :func:`select_kernels`. An accelerator takes the
+    reference."""
+    if device_type != "cpu" or select_kernels(name, device_type) is REFERENCE:
+        return POSTERIOR_REFERENCE
+    from ufmstar_torch.kernels import posterior_cpu
+
+    return PosteriorKernels(solve=posterior_cpu.solve, distance=posterior_cpu.distance, read=posterior_cpu.read)
 
 
 @functools.cache
