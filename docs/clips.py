@@ -63,6 +63,7 @@ def add_sources(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--root", type=Path, help="folder that holds data/ and weights/")
     source.add_argument("--tours", help="seeds FIRST:LAST, the last one left out")
     parser.add_argument("--frames", type=int, default=90, help="of a tour")
+    parser.add_argument("--fov", type=float, nargs="+", help="horizontal fields of view of the tours [deg], in turn")
 
 
 def clips(arguments: argparse.Namespace) -> Iterator[Clip]:
@@ -76,7 +77,8 @@ def clips(arguments: argparse.Namespace) -> Iterator[Clip]:
         members = [member.eval() for member in load_trained([weights])]
     first, last = (int(word) for word in arguments.tours.split(":"))
     for seed in range(first, last):
-        tour = f"tour:{seed}?style=mixed&frames={arguments.frames}"
+        fov = "" if arguments.fov is None else f"&fov={arguments.fov[(seed - first) % len(arguments.fov)]:g}"
+        tour = f"tour:{seed}?style=mixed&frames={arguments.frames}{fov}"
         yield predict(f"tour {seed}, depth only", tour, members[:1], aleatoric=False)
         yield predict(f"tour {seed}, ensemble", tour, members, aleatoric=True)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ CHANGES: dict[str, Mapping[str, Any]] = {
     "L0 = 1 m": {"segment": {"min_gaussian_length": 1.0}},
     "noise_floor = .04 m": {"segment": {"noise_floor": 0.04}},
     "noise_floor = .16 m": {"segment": {"noise_floor": 0.16}},
+    "f of the camera": {"segment": {"slope_focal": "camera"}},
+    "f = 200 px": {"segment": {"slope_focal": "reference"}},
     "alpha = 1 (no average)": {"ema_alpha": 1.0},
     "alpha = .25": {"ema_alpha": 0.25},
     "eta = .3": {"eta": 0.3},
@@ -51,15 +53,15 @@ SCALES = (0.25, 0.5, 2.0, 4.0)  # of M
 Figures = dict[str, dict[str, float]]
 
 
-def figures(clip: Clip) -> Figures:
-    """The figures of a clip by factor, "default" first."""
+def figures(clip: Clip, only: Sequence[str] | None = None) -> Figures:
+    """The figures of a clip by factor, "default" first; ``only`` names the factors that are tried, None = all."""
     default = estimate(clip, UfMStar())
     found = {"default": judge(clip, default, STRIDE)}
     own = np.zeros_like(default) if clip.aleatoric is None else clip.aleatoric
     for scale in SCALES:
         scaled = np.maximum(own + np.float32(scale) * (default - own), 0)
         found[f"M times {scale:g}"] = judge(clip, scaled, STRIDE)
-    for name, change in CHANGES.items():
+    for name, change in CHANGES.items() if only is None else ((name, CHANGES[name]) for name in only):
         found[name] = judge(clip, estimate(clip, UfMStar(UfMStarConfig.from_dict(change))), STRIDE)
     return found
 
@@ -79,11 +81,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_sources(parser)
     parser.add_argument("--save", type=Path, help="file for the figures of every clip, as JSON")
+    parser.add_argument("--only", nargs="+", choices=CHANGES, help="factors that are tried; default: all")
     arguments = parser.parse_args()
     groups: dict[str, list[Figures]] = {}
     for clip in clips(arguments):
         title = "Depth only" if clip.aleatoric is None else "Ensemble"
-        groups.setdefault(title, []).append(figures(clip))
+        groups.setdefault(title, []).append(figures(clip, arguments.only))
     for title, found in groups.items():
         table(title, found)
     if arguments.save is not None:

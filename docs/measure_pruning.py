@@ -55,7 +55,7 @@ def row(frames: list[tuple[Tensor, Tensor]], config: SPGFConfig) -> str:
     counts, shares = [], []
     for depth, K in frames:
         mixture, labels = segment(SegmentInput.checked(depth, K, config))
-        usable = (depth > 0) & (depth <= config.max_depth)
+        usable = (depth > 0) & (depth <= config.depth_limit)
         counts.append(int(mixture.components[0]))
         shares.append(100 * float((labels >= 0).sum() / usable.sum().clamp_min(1)))
     return f"{np.median(counts):.0f} ({min(counts)}), {np.median(shares):.0f} % ({min(shares):.0f} %)"

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.camera import relative_pose
+from ufmstar_torch.correspond import correspond
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.gaussian import wasserstein_squared
-from ufmstar_torch.kernels.select import select_kernels
 
 Array = NDArray[np.float64]
 EVERY = 8  # [px] between the surface points of a frame; every second frame has some
@@ -101,14 +101,14 @@ def share(clip: Clip) -> None:
 def pairs(depth: Map, clip: Clip) -> Iterator[tuple[Array, Array]]:
     """Of every frame after the first: the matched pairs' W2^2 along the ray, across it, of the shapes [3, M] [m^2]; and
     their pixels [M]."""
-    ufm, backend, K = UfMStar(), select_kernels("auto", "cpu"), torch.from_numpy(clip.K)[None]
+    ufm, K = UfMStar(), torch.from_numpy(clip.K)[None]
     for i, d in enumerate(depth):
         pose, before = torch.from_numpy(clip.pose[i])[None], ufm.mixture
         current = ufm(torch.from_numpy(d)[None], pose, K).current_cam
         if i == 0:
             continue
         previous = before.to(torch.float64).rigid(*relative_pose(ufm.T_world_first, pose))
-        match = backend.correspond(previous, current, K, d.shape, ufm.config).match[0]
+        match = correspond(previous, current, K, d.shape, ufm.config).match[0]
         c, k = match.nonzero(as_tuple=True)
         mean_c, mean_k = current.mean[0, c], previous.mean[0, k]
         apart = mean_c - mean_k

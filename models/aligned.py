@@ -32,6 +32,11 @@ class AlignedNetwork(DepthNetwork):
         """Whether the relative network does."""
         return takes_intrinsics(self.network)
 
+    @property
+    def max_depth(self) -> float | None:
+        """[m] Of the alignment: what is farther is no prediction."""
+        return self.alignment.max_depth
+
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; 0 (no prediction) where
         the alignment is not possible.

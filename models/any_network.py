@@ -43,6 +43,11 @@ class WrappedNetwork(DepthNetwork):
         """Whether the network does, or the unit of its depth depends on the focal length."""
         return self.outputs.focal is not None or self._passes_intrinsics
 
+    @property
+    def max_depth(self) -> float | None:
+        """[m] As declared."""
+        return self.outputs.max_depth
+
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
 
@@ -71,6 +76,7 @@ def wrap_network(
     epistemic_kind: str = "variance",
     resize: bool = False,
     focal: float | None = None,
+    max_depth: float | None = None,
     takes_intrinsics: bool = False,
     preprocess: Preprocess | None = None,
 ) -> WrappedNetwork:
@@ -82,7 +88,7 @@ def wrap_network(
         output: which of several outputs is depth: a name, or a position in a tuple.
         scale: [m] length of one unit of depth.
         inverse: declares inverse or relative depth, which is refused.
-        aleatoric, aleatoric_kind, epistemic, epistemic_kind, resize, focal: as in :class:`OutputSpec`.
+        aleatoric, aleatoric_kind, epistemic, epistemic_kind, resize, focal, max_depth: as in :class:`OutputSpec`.
         takes_intrinsics: whether it is called as ``network(x, K)``, K [B, 3, 3] [px] of ``x``; an attribute
             ``takes_intrinsics = True`` of ``network`` does the same.
         preprocess: what its input needs; None: images in [0, 1] at their own size.
@@ -103,6 +109,7 @@ def wrap_network(
         epistemic_kind=epistemic_kind,
         resize=resize,
         focal=focal,
+        max_depth=max_depth,
     )
     return WrappedNetwork(network, spec, preprocess or Preprocess(), takes_intrinsics)
 

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 
@@ -247,16 +249,16 @@ class FastDepth(Backbone):
         """The network with the weights of an ONNX export, in eval mode.
 
         The widths are read from the file, every weight in it must be used and every parameter filled, and on one
-        random image the network must agree with ONNX Runtime. Batch norms stay batch norms (with their counters), so
-        fine-tuning goes on as if from a checkpoint after ``.train()``; a file that has them folded gives a network
-        without norm layers (``norm=False``).
+        random image the network must agree with ONNX Runtime; without that package, a warning says that this was not
+        tested. Batch norms stay batch norms (with their counters), so fine-tuning goes on as if from a checkpoint after
+        ``.train()``; a file that has them folded gives a network without norm layers (``norm=False``).
 
         Args:
             path: the ONNX file.
             dropout, size: as in the class.
 
         Raises:
-            ModuleNotFoundError: ``onnx`` or ``onnxruntime`` is not installed (extra ``models``).
+            ModuleNotFoundError: ``onnx`` is not installed (extra ``models``).
             FileNotFoundError: there is no such file.
             ValueError: the file is broken or holds another network.
         """
@@ -335,6 +337,13 @@ def _require_same_function(network: FastDepth, path: str | Path) -> None:
     from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
     from ufmstar_torch.models.outputs import METRIC, OutputSpec
 
+    if find_spec("onnxruntime") is None:
+        warnings.warn(
+            f"without onnxruntime, {path} runs in torch, more slowly, and is not compared with its graph: "
+            "pip install 'ufmstar-torch[models]'",
+            stacklevel=3,
+        )
+        return
     graph = OnnxNetwork(path, OnnxSpec(OutputSpec(METRIC)), threads=1)
     size = [side or 2 * MULTIPLE for side in graph.size]
     image = 8 * torch.rand(graph.batch or 1, 3, *size, generator=torch.Generator().manual_seed(0)) - 4

@@ -52,7 +52,14 @@ class HuggingFaceDepth(DepthNetwork):
     """
 
     def __init__(
-        self, raw: RawDepth, preprocess: Preprocess, kind: str, *, scale: float = 1.0, source: str = ""
+        self,
+        raw: RawDepth,
+        preprocess: Preprocess,
+        kind: str,
+        *,
+        scale: float = 1.0,
+        source: str = "",
+        max_depth: float | None = None,
     ) -> None:
         super().__init__()
         if kind not in (METRIC, *KINDS):
@@ -66,6 +73,12 @@ class HuggingFaceDepth(DepthNetwork):
         self.kind = kind
         self.scale = scale
         self.source = source
+        self._max_depth = max_depth
+
+    @property
+    def max_depth(self) -> float | None:
+        """[m] The ``max_depth`` of a metric checkpoint, of which its output is a share."""
+        return self._max_depth
 
     @classmethod
     def of_checkpoint(
@@ -84,7 +97,9 @@ class HuggingFaceDepth(DepthNetwork):
         if reading is PaddedDepth and not checkpoint.processor.get("do_pad", True):
             reading = RawDepth
         raw = reading(model, patch_size(checkpoint))
-        return cls(raw, preprocess, kind, scale=scale, source=checkpoint.name).eval()
+        shares = checkpoint.config.get("depth_estimation_type") == METRIC
+        reach = scale * float(checkpoint.config["max_depth"]) if shares else None
+        return cls(raw, preprocess, kind, scale=scale, source=checkpoint.name, max_depth=reach).eval()
 
     @property
     def is_metric(self) -> bool:
@@ -290,7 +305,7 @@ def _kind(checkpoint: Checkpoint, kind: str | None) -> str:
     own = METRIC if model_type in _METRIC else _DECLARED.get(str(stated))
     if own is not None and kind not in (None, own):
         said = f"depth_estimation_type {stated!r}" if stated else f"the architecture {model_type}"
-        raise ValueError(f"kind={kind!r}, but {name} says {said}, which is {own!r}")
+        raise ValueError(f"kind={kind!r}, but {name} states {said}, which is {own!r}")
     if stated == METRIC and "max_depth" not in config:
-        raise ValueError(f"{name} says metric, but not the max_depth [m] that its output is a share of")
+        raise ValueError(f"{name} states metric depth, but not the max_depth [m] that its output is a share of")
     return own or str(kind)

@@ -24,6 +24,11 @@ class DepthNetwork(nn.Module, ABC):
         """Whether it is called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
         return False
 
+    @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that it can predict; None where it is not bounded, or not known."""
+        return None
+
     @abstractmethod
     def forward(self, image: Tensor) -> DepthPrediction:
         """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it; a second argument, the image's

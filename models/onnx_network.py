@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,7 +68,7 @@ class OnnxNetwork(DepthNetwork):
     Args:
         path: the .onnx file.
         spec: what the file does not state.
-        threads: CPU threads of one run; 0 leaves it to ONNX Runtime.
+        threads: CPU threads of one run; 0 leaves it to ONNX Runtime. They do not spin between two runs.
         providers: ONNX Runtime's execution providers in order of preference.
 
     Raises:
@@ -147,6 +148,11 @@ class OnnxNetwork(DepthNetwork):
         """Whether the graph does, or the unit of its depth depends on the focal length."""
         return self.K_input is not None or self.spec.outputs.focal is not None
 
+    @property
+    def max_depth(self) -> float | None:
+        """[m] As declared."""
+        return self.spec.outputs.max_depth
+
     def _fitted_preprocess(self, preprocess: Preprocess) -> Preprocess:
         height, width = self.size
         if height is None or width is None:
@@ -223,19 +229,17 @@ class OnnxNetwork(DepthNetwork):
 
 
 def _session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSession:
-    try:
-        import onnxruntime as ort
-        from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "running an ONNX network needs the package onnxruntime: pip install 'ufmstar-torch[models]'"
-        ) from error
+    ort = _onnxruntime()
+    from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
+
     if not Path(path).is_file():
         raise FileNotFoundError(f"no ONNX file {path}")
     if absent := [p for p in providers if p not in ort.get_available_providers()]:
         raise ValueError(f"providers {absent} are not available; this ONNX Runtime has {ort.get_available_providers()}")
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
+    # Threads that wait by spinning would take the cores from what comes between two runs.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = _ERRORS_ONLY
     refusals = (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.InvalidArgument)
     failures = (ort_errors.Fail, ort_errors.NotImplemented)
@@ -243,6 +247,28 @@ def _session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSe
         return ort.InferenceSession(path, options, providers=list(providers))
     except (*refusals, *failures) as error:
         raise ValueError(f"{path} is not an ONNX file that ONNX Runtime can run: {error}") from error
+
+
+def providers_for(device: torch.device) -> tuple[str, ...]:
+    """ONNX Runtime's execution providers on a device, the preferred one first; the processor's where it has no other.
+
+    Raises:
+        ModuleNotFoundError: ``onnxruntime`` is not installed (extra ``models``).
+    """
+    here, cpu = _onnxruntime().get_available_providers(), "CPUExecutionProvider"
+    gpu = {"cuda": "CUDAExecutionProvider"}.get(device.type)
+    return (gpu, cpu) if gpu in here and gpu is not None else (cpu,)
+
+
+def _onnxruntime() -> ModuleType:
+    try:
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "running an ONNX network needs the package onnxruntime: pip install 'ufmstar-torch[models]'"
+        ) from error
+    module: ModuleType = onnxruntime
+    return module
 
 
 def load_onnx(

@@ -41,6 +41,8 @@ class OutputSpec(Checked):
         aleatoric_kind, epistemic_kind: "variance", "std", "log_variance" or "log_std" (natural logarithms), in the
             units of the depth output; or "relative_std", a standard deviation per depth (to first order that of the
             logarithm of depth). A "confidence" has no such meaning and is refused.
+        max_depth: [m] largest depth that the network can predict: ``UncertainDepth`` and the commands use no pixel
+            beyond it; None where it is not known.
         resize: whether outputs of another resolution than the input are brought to it by repeating or
             dropping pixels; otherwise such outputs are an error.
 
@@ -57,6 +59,7 @@ class OutputSpec(Checked):
     epistemic_kind: str = choice(*SPREADS)
     resize: bool = False
     focal: float | None = number(None, "f", "px", 0.0, open_low=True, open_high=True)
+    max_depth: float | None = number(None, "d_max", "m", 0.0, open_low=True, open_high=True)
 
     def __post_init__(self) -> None:
         if self.kind in NOT_METRIC:

@@ -96,6 +96,16 @@ class Preprocess(Checked):
         228 x 304, then ``size``. Portrait images are resized to width 304 instead."""
         return replace(cls(resize_height=250, crop=(228, 304), size=size), **changes)
 
+    def of_whole_frame(self) -> Preprocess:
+        """The same input from the whole frame, each axis resized by its own factor: nothing is cut off."""
+        return replace(self, resize_height=None, crop=None, size=self.size or self.crop, aspect_multiple=None)
+
+    def of_nyu_crop(self) -> Preprocess:
+        """The same input from the centre that NYU's validation takes (:meth:`nyu`)."""
+        nyu = Preprocess.nyu()
+        size = self.size or self.crop or nyu.crop
+        return replace(self, resize_height=nyu.resize_height, crop=nyu.crop, size=size, aspect_multiple=None)
+
     def geometry(self, height: int, width: int) -> Geometry:
         """The sizes of every step for an image of height x width [px].
 

@@ -21,7 +21,7 @@ from ufmstar_torch import UfMStar, UfMStarConfig
 for dtype in (torch.float32, torch.float64):
     depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
     K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
-    ufm = UfMStar(UfMStarConfig(backend="numba"))
+    ufm = UfMStar(UfMStarConfig(backend="numba", merge=1.0, merge_every=1))
     for _ in range(2):
         ufm(depth, pose, K)
 """
@@ -54,12 +54,12 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is marked slow, unless files or tests are named or ``-m`` selects by marker."""
+    """Leave out what is marked slow or needs a device, unless files or tests are named or ``-m`` selects by marker."""
     if config.option.markexpr or _names_files(config):
         return
-    slow = [item for item in items if item.get_closest_marker("slow")]
-    config.hook.pytest_deselected(items=slow)
-    items[:] = [item for item in items if not item.get_closest_marker("slow")]
+    left_out = [item for item in items if any(map(item.get_closest_marker, ("slow", "interpreter", "gpu")))]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in set(left_out)]
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -249,6 +249,20 @@ def compared_share(mixture_cam, depth, valid, K, **prior):
     return out
 
 
+def aleatoric_in_h(mixture_cam, depth, valid, K, aleatoric, *, prior_weight):
+    """The aleatoric variance kept as the first feature, read back at every valid pixel; the pixel's own counts as far
+    as the prior explains the point: (sum_k p_k a_k + pi_0 A) / (sum_k p_k + pi_0), exact sum."""
+    out = np.full(depth.shape, np.nan)
+    mixture = prepared(mixture_cam)
+    for v, u in np.argwhere(valid):
+        d = depth[v, u]
+        x = np.array([(u - K[0, 2]) / K[0, 0] * d, (v - K[1, 2]) / K[1, 1] * d, d])
+        parts = [(g["weight"] * density(x, g), g["features"][0]) for g in mixture]
+        parts.append((prior_weight, aleatoric[v, u]))
+        out[v, u] = sum(p * a for p, a in parts) / sum(p for p, _ in parts)
+    return out
+
+
 class Oracle:
     """The whole algorithm for one stream."""
 
@@ -291,7 +305,7 @@ class Oracle:
             remembered=[g["mean"][2] > self.near for g in current],
             distances=distances,
         )
-        mixture_cam = [transform(g, *to_cam) for g in self.mixture]
+        mixture_cam = self.mixture_cam = [transform(g, *to_cam) for g in self.mixture]
         self.share = compared_share(mixture_cam, depth, valid, K, **self.prior)
         if self.unmeasured == "prior":
             mixture_cam = [g if g["count"] > 1 else {**g, "m": self.prior["prior_mean"]} for g in mixture_cam]

@@ -95,7 +95,7 @@ def run_oracle(
         sparse=c.sparse,
         min_gaussian_length=c.min_gaussian_length,
         frame_max_scale=c.frame_max_scale,
-        max_depth=c.max_depth,
+        max_depth=c.depth_limit,
     )
     return oracle_spgf.segment(depth.numpy(), oracle_spgf.Camera(fx, fy, cx, cy), limits, **options)
 

@@ -13,6 +13,7 @@ from ufmstar_torch.segment import spgf
 PUBLIC = {
     "DepthPrediction",
     "GaussianMixture",
+    "Recalibration",
     "SPGFConfig",
     "UfMStar",
     "UfMStarConfig",
@@ -37,12 +38,13 @@ def test_public_names():
 
 def test_signatures():
     observation = ["depth", "pose", "intrinsics", "aleatoric", "epistemic", "valid", "features", "anchors"]
-    assert names(UfMStar.__init__) == ["config", "dtype", "device"]
+    assert names(UfMStar.__init__) == ["config", "recalibration", "dtype", "device"]
     assert names(UfMStar.forward) == observation
     assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average"]
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
-    assert names(UncertainDepth.__init__) == ["networks", "config", "mode", "samples", "preprocess"]
+    made_of = ["networks", "config", "mode", "samples", "preprocess", "anchors", "recalibration"]
+    assert names(UncertainDepth.__init__) == made_of
     images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
     assert names(UncertainDepth.forward) == images
     assert names(UncertainDepth.mean_uncertainty) == [*images, "pixels", "fraction", "seed", "average"]

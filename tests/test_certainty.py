@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,17 @@ from test_ufmstar import SPGF, oracle_settings
 
 import oracle
 import scenes
-from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.eval.engine.estimators import make_estimator
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.models import Ensemble, wrap_network
+from ufmstar_torch.models.aligned import AlignedNetwork
+from ufmstar_torch.models.alignment import Alignment
+from ufmstar_torch.pipeline import NetworksInTurn
+from ufmstar_torch.prediction import DepthPrediction
 
 pytestmark = pytest.mark.numerics
 
@@ -73,6 +83,53 @@ def test_beyond_the_networks_range_nothing_is_certain():
     out = UfMStar(reaching)(depth, torch.eye(4), K)
     assert bool(out.valid.all())
     assert int(out.statistics.beyond[0]) == 0
+
+
+class Ranged(torch.nn.Module):
+    """A network that predicts 3 m, but 60 m at the left, and states that it reaches ``max_depth``."""
+
+    def __init__(self, max_depth):
+        super().__init__()
+        self.max_depth = max_depth
+
+    def forward(self, x):
+        depth = torch.full((len(x), *x.shape[-2:]), 3.0)
+        depth[:, :, : W // 2] = 60.0
+        return DepthPrediction(depth)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "own", "expected"),
+    [
+        ([80.0], None, 80.0),
+        ([None], None, None),
+        ([80.0], 20.0, 20.0),  # the user's own word
+        ([10.0, 80.0], None, 80.0),
+        ([80.0, None], None, None),
+        (["80"], None, None),
+        ([-1.0], None, None),
+    ],
+)
+def test_the_pipeline_follows_the_networks_stated_range(ranges, own, expected):
+    model = UncertainDepth([Ranged(r) for r in ranges], UfMStarConfig(segment=replace(SPGF, max_depth=own)))
+    assert model.ufm.config.segment.max_depth == expected
+    out = model(torch.rand(1, 3, H, W), torch.eye(4), K)
+    left = out.ufm.valid[..., : W // 2]
+    assert bool(left.all()) is (expected == 80.0)
+    assert int(out.ufm.statistics.beyond[0]) == int((~left).sum())
+
+
+def test_declared_ranges_reach_the_pipeline_and_the_evaluation():
+    network = wrap_network(lambda x: x[:, :1], max_depth=7.0)
+    assert UncertainDepth(network).ufm.config.segment.depth_limit == 7.0
+    assert Ensemble([network, wrap_network(lambda x: x[:, :1], max_depth=9.0)]).max_depth == 9.0
+    assert AlignedNetwork(network, Alignment("inverse", 1.0, 0.0, max_depth=5.0)).max_depth == 5.0
+    assert UfMStarConfig().within(7.0).segment == SPGFConfig(max_depth=7.0)
+    assert UfMStarConfig().segment.depth_limit == 20.0
+    source = NetworkSource(NetworksInTurn(network), torch.device("cpu"), {}, seeding=None)
+    assert source.max_depth == 7.0
+    made = make_estimator(Row(Method.parse("UfM*-DepthOnly")), torch.device("cpu"), source.max_depth)
+    assert made.ufm.config.segment.max_depth == 7.0
 
 
 @pytest.mark.parametrize(
@@ -167,6 +224,9 @@ def test_the_papers_configuration():
     assert (paper.segment.min_pixels, paper.segment.min_rows, paper.segment.prune) == (2000, 32, "either")
     assert (paper.regression, paper.near_radius, paper.far_radius) == ("neighbourhood", 0.1, 0.5)
     assert paper.unmeasured == "paper"
+    # SPGF's own t = a z^2 / f at the paper's 224 x 224, whatever the camera; the same in metres at 518 x 518.
+    assert paper.segment.scaled_to(224, 224).slope(123.0) == pytest.approx(2.4 / 123)
+    assert paper.segment.scaled_to(518, 518).slope(123.0 * 518 / 224) == pytest.approx(2.4 / 123)
     changed = {"segment", "regression"}
     ours, theirs = UfMStarConfig().to_dict(), paper.to_dict()
     assert {name for name in ours if ours[name] != theirs[name]} == changed

@@ -351,7 +351,7 @@ def test_a_hub_name_without_a_connection_says_what_to_do(tmp_path, monkeypatch):
 
 def test_metric_without_a_maximum_is_refused(broken):
     edit_config(broken, max_depth="drop")
-    with pytest.raises(ValueError, match="says metric, but not the max_depth"):
+    with pytest.raises(ValueError, match="states metric depth, but not the max_depth"):
         DepthAnything.from_pretrained(broken)
     edit_config(broken, depth_estimation_type="drop")
     assert DepthAnything.from_pretrained(broken).kind == "inverse"  # what transformers makes of it

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from efficiency_cases import network
+from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch.eval.bench.memory import NetworkMemory, overhead_percent, weight_bytes
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, depth_alone, timed_networks
@@ -19,6 +20,8 @@ from ufmstar_torch.models.dropout import MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.fastdepth import FastDepth
 from ufmstar_torch.models.heads import with_head
+from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec
+from ufmstar_torch.models.outputs import OutputSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -113,6 +116,15 @@ def test_mc_dropout_adds_a_head_and_depth_alone_does_not_sample():
     assert not torch.equal(one.predict(ONCE, x, K).depth, one.predict(ONCE, x, K).depth)
     assert one.predict(EVERY, x, K).epistemic_variance.max() > 0
     assert one.passes == 3
+
+
+def test_a_graph_of_onnx_runtime_is_depth_alone_and_weighs_what_its_file_does(tmp_path):
+    path = write_fastdepth(tmp_path / "net.onnx", small_network())
+    network = OnnxNetwork(path, OnnxSpec(OutputSpec("metric")), threads=1)
+    timed = TimedNetwork("depth_only", [network], "FastDepth")
+    assert timed.depth is network
+    assert timed.why_whole is None
+    assert timed.memory() == NetworkMemory(path.stat().st_size, 0)
 
 
 def test_depth_alone_is_the_same_depth_from_a_copy():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 import threading
 import warnings
@@ -15,11 +16,12 @@ from random_gaussians import covariances, mixture
 from test_fuse import random_pairs
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig, gaussian
-from ufmstar_torch.correspond import correspond
+from ufmstar_torch import UfMStar, UfMStarConfig, frame, gaussian
+from ufmstar_torch.correspond import Correspondence, correspond
 from ufmstar_torch.fuse import fuse
-from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu, select
-from ufmstar_torch.step import REFERENCE
+from ufmstar_torch.kernels import check_cpu, correspond_cpu, fuse_cpu, regress_cpu, select, step_cpu
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.step import REFERENCE, step
 
 pytestmark = pytest.mark.numerics
 
@@ -27,15 +29,52 @@ SIZE = (48, 64)
 K = torch.tensor(scenes.intrinsics(*SIZE))
 
 
-@given(st.integers(0, 10**6), st.floats(0.05, 0.6), st.floats(0.05, 0.9))
+def pairs_of(previous, current, config, stream: int):
+    """The compiled list of one stream's pairs: c, k and beta."""
+    fields = [v[stream].numpy() for m in (previous, current) for v in (m.mean, m.covariance, m.weight)]
+    thresholds = (config.eta, config.eta_occlusion, config.near_plane, gaussian.PIXEL_VARIANCE)
+    return map(torch.from_numpy, correspond_cpu.matches(*fields, K.numpy(), *SIZE, *thresholds))
+
+
+@given(st.integers(0, 10**6), st.floats(0.05, 1.0), st.floats(0.05, 1.0))
 @settings(max_examples=30)
 def test_correspond(seed, eta, eta_occl):
     previous, current = mixture(2, 14, seed), mixture(2, 8, seed + 50)
     config = UfMStarConfig(eta=eta, eta_occlusion=eta_occl)
     reference = correspond(previous, current, K.expand(2, 3, 3), SIZE, config)
-    fast = correspond_cpu.correspond(previous, current, K.expand(2, 3, 3), SIZE, config)
-    torch.testing.assert_close(fast.overlap, reference.overlap, rtol=1e-11, atol=1e-100)
-    assert torch.equal(fast.match, reference.match)
+    for b in range(2):
+        c, k, overlap = pairs_of(previous, current, config, b)
+        assert torch.equal(torch.stack([c, k], 1), reference.match[b].nonzero()), "in increasing c and then k"
+        torch.testing.assert_close(overlap, reference.overlap[b, c, k], rtol=1e-11, atol=0)
+
+
+def test_correspond_lists_any_number_of_pairs():
+    many = mixture(1, 120, 3, empty=0)
+    many = many.replace(
+        mean=many.mean * 0.01 + torch.tensor([0.0, 0.0, 3.0]), covariance=many.covariance[:, :1] + 0 * many.covariance
+    )
+    config = UfMStarConfig(eta=0.01, eta_occlusion=1.0)
+    c, k, _ = pairs_of(many, many, config, 0)
+    match = correspond(many, many, K[None], SIZE, config).match[0]
+    assert len(c) > 64
+    assert torch.equal(torch.stack([c, k], 1), match.nonzero())
+
+
+def fused(previous, current, pairs, config):
+    """The compiled fusion of a mixture, stream by stream, and the components it names as changed."""
+    out = GaussianMixture(*(value.clone() for value in previous.tensors().values()))
+    changed = torch.zeros(out.weight.shape, dtype=torch.bool)
+    epsilon = torch.finfo(previous.covariance.dtype).eps
+    for b in range(len(changed)):
+        c, k = pairs.match[b].nonzero(as_tuple=True)
+        distance = torch.empty(0).double() if pairs.distance is None else pairs.distance[b, c, k]
+        new = (v[b].numpy() for v in (current.mean, current.covariance, current.weight, current.features))
+        fuse_cpu.fuse_pairs(
+            *(value[b].numpy() for value in out.tensors().values()), *new,
+            *(value.numpy() for value in (c, k, pairs.overlap[b, c, k], distance)),
+            config.overlap_weighted, epsilon, changed[b].numpy(),
+        )  # fmt: skip
+    return out, changed
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -45,62 +84,105 @@ def test_fuse(weighted, seed):
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, features=2)
     pairs = random_pairs(2, previous, current, seed)
     config = UfMStarConfig(overlap_weighted=weighted)
-    before = previous.mean.clone()
-    reference, fast = fuse(previous, current, pairs, config), fuse_cpu.fuse(previous, current, pairs, config)
+    reference, (fast, changed) = fuse(previous, current, pairs, config), fused(previous, current, pairs, config)
+    assert torch.equal(changed, pairs.match.any(1))
     for name, value in reference.tensors().items():
         torch.testing.assert_close(getattr(fast, name), value, rtol=1e-10, atol=1e-12)
-    assert torch.equal(previous.mean, before)
-    single = fuse_cpu.fuse(previous.to(torch.float32), current, pairs, config)
+    single, _ = fused(previous.to(torch.float32), current, pairs, config)
     for name, value in fuse(previous.to(torch.float32), current, pairs, config).tensors().items():
         torch.testing.assert_close(getattr(single, name), value, rtol=1e-5, atol=1e-7)
+
+
+def floored(cov, floor):
+    out = cov.clone()
+    fuse_cpu.floor_covariance(out.view(-1, 3, 3).numpy(), floor.expand(cov.shape[:-2]).contiguous().view(-1).numpy())
+    return out
 
 
 def test_floor_covariance():
     cov = covariances(60, 4, decades=6).view(3, 20, 3, 3)
     floor = torch.linspace(1e-8, 1e-2, 20, dtype=torch.float64).expand(3, 20)
-    torch.testing.assert_close(
-        fuse_cpu.floor_covariance(cov, floor), gaussian.floor_covariance(cov, floor), rtol=0, atol=1e-15
-    )
+    torch.testing.assert_close(floored(cov, floor), gaussian.floor_covariance(cov, floor), rtol=0, atol=1e-15)
     least = torch.linalg.eigvalsh(cov)[..., 0]
     for share in (0.5, 1 - 1e-6, 1 + 1e-6, 2.0):  # unchanged to the last bit below the least eigenvalue, and only there
-        lifted = fuse_cpu.floor_covariance(cov, share * least)
+        lifted = floored(cov, share * least)
         assert (lifted == cov).all(-1).all(-1).eq(share < 1).all()
-    zero = torch.zeros(1, 3, 3, dtype=torch.float64)
-    lifted = fuse_cpu.floor_covariance(zero, torch.tensor([1e-6], dtype=torch.float64))
+    lifted = floored(torch.zeros(1, 3, 3, dtype=torch.float64), torch.tensor([1e-6], dtype=torch.float64))
     torch.testing.assert_close(lifted[0], 1e-6 * torch.eye(3, dtype=torch.float64), rtol=1e-12, atol=0)
 
 
+def test_thin_wide_plates_survive_a_thousand_fusions_in_float32():
+    """A plate 2000 times wider than thick: rounding to float32 alone would make it indefinite."""
+    generator = torch.Generator().manual_seed(0)
+
+    def plate():
+        tilt = torch.linalg.matrix_exp(0.3 * torch.randn(1, generator=generator) * torch.tensor(
+            [[0.0, -0.5, 0.3], [0.5, 0.0, -0.8], [-0.3, 0.8, 0.0]]
+        )).double()  # fmt: skip
+        cov = tilt @ torch.diag(torch.tensor([1.0, 1.0, 0.25e-6], dtype=torch.float64)) @ tilt.T
+        one = torch.ones(1, 1, dtype=torch.float64)
+        return GaussianMixture(
+            torch.zeros(1, 1, 3).double(), cov[None, None], one, 0 * one, one.long(), one[..., None][..., :0]
+        )
+
+    def run(step, rounds: int):
+        m = plate().to(torch.float32)
+        pairs = Correspondence(torch.ones(1, 1, 1, dtype=torch.bool), torch.ones(1, 1, 1, dtype=torch.float64))
+        for _ in range(rounds):
+            m = step(m, plate(), pairs, UfMStarConfig())
+            assert torch.linalg.eigvalsh(m.covariance.double())[0, 0, 0] > 0
+        assert m.disagreement.isfinite().all()
+
+    run(lambda *given: fused(*given)[0], 1000)
+    run(functools.partial(fuse, rounds=1), 200)
+
+
 def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
-    for name in [
-        n for n in sys.modules if (n.startswith("ufmstar_torch.kernels.") and n.endswith("_cpu")) or n == "numba"
-    ]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delattr("ufmstar_torch.kernels.regress_cpu")
-    select._numba.cache_clear()
-    for name in ("correspond_cpu", "fuse_cpu", "segment_cpu", "segment_image_cpu"):
-        monkeypatch.delattr(f"ufmstar_torch.kernels.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)
-    select._numba_or_none.cache_clear()
+    select._has_numba.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba cannot be imported .* torch reference serves") as caught:
-            chosen = [select.select_kernels("auto", "cpu") for _ in range(2)]
+            chosen = [select.select_step("auto", "cpu") for _ in range(2)]
+        assert select.select_check("auto", "cpu") is frame.check_values
         assert len(caught) == 1
-        assert chosen == [REFERENCE] * 2
+        assert all(one.func is step and one.keywords == {"kernels": REFERENCE} for one in chosen)
         with pytest.raises(ImportError):
-            select.select_kernels("numba", "cpu")
+            select.select_step("numba", "cpu")
     finally:
-        select._numba_or_none.cache_clear()
+        select._has_numba.cache_clear()
 
 
 def test_seam():
-    compiled = select.select_kernels("numba", "cpu")
-    assert select.select_kernels("auto", "cpu") is compiled is not REFERENCE
-    assert select.select_kernels("torch", "cpu") is select.select_kernels("torch", "cuda") is REFERENCE
-    mixed = select.select_kernels("auto", "cuda")
+    compiled = select.select_step("numba", "cpu")
+    assert select.select_step("auto", "cpu") is compiled is step_cpu.step
+    assert select.select_check("auto", "cpu") is check_cpu.check_values
+    for device in ("cpu", "cuda"):
+        assert select.select_kernels("torch", device) is select.select_step("torch", device).keywords["kernels"]
+        assert select.select_kernels("torch", device) is REFERENCE
+        assert select.select_check("torch", device) is frame.check_values
+    mixed = select.select_kernels("auto", "mps")
     assert mixed.spgf is not REFERENCE.spgf, "on the host"
     assert replace(mixed, spgf=REFERENCE.spgf) == REFERENCE
     with pytest.raises(ValueError, match="needs CPU tensors"):
-        select.select_kernels("numba", "cuda")
+        select.select_step("numba", "cuda")
+
+
+def test_seam_of_the_gpu_kernels(monkeypatch):
+    pytest.importorskip("triton", reason="needs triton, which torch brings along on Linux")
+    compiled = select.select_kernels("triton", "cuda")
+    assert select.select_kernels("auto", "cuda") is select.select_kernels("auto", "xpu") is compiled is not REFERENCE
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    with pytest.raises(ValueError, match="'triton' needs tensors of a GPU, got device type 'cpu'"):
+        select.select_step("triton", "cpu")
+    monkeypatch.setitem(sys.modules, "triton", None)
+    select._has_triton.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match="triton cannot be imported .* torch reference serves") as caught:
+            chosen = [select.select_kernels("auto", "cuda") for _ in range(2)]
+        assert len(caught) == 1
+        assert all(kernels.fuse is REFERENCE.fuse for kernels in chosen)
+    finally:
+        select._has_triton.cache_clear()
 
 
 def test_whole_sequence_fast_and_slow():

@@ -36,6 +36,7 @@ from ufmstar_torch.eval.metrics.sequence import over_sequences
 RANKING = [Sparsification, SpearmanCorrelation, NLLByError]
 ALL = [Delta1, AbsRel, RMSE, NLL, ECEDelta, ECEQuantile, EntropyHistogram, *RANKING]
 UNCERTAIN = ALL[3:]
+JUDGED = [kind for kind in ALL if kind is not EntropyHistogram]  # on pixels with ground truth alone
 
 
 def maps(*shape: int, seed: int = 0, scale: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
@@ -131,6 +132,39 @@ class TestAgainstIndependentImplementations:
         counts = np.histogram(oracle, edges)[0]
         assert counts.min() > 0  # under and over the range too
         np.testing.assert_array_equal(got["entropy_counts"].numpy(), counts)
+
+    def test_the_authors_bins(self) -> None:
+        """100 bins of the confidence; 101 levels, of which 0 and 1 are right by definition."""
+        d, v, g = maps(30, 40, scale=1.7)
+        metrics = SequenceMetrics(bins="authors", ranking=False)
+        metrics.update(d, v, g)
+        got, curves = metrics.compute(), metrics.curves()
+        dn, vn, gn = (x.numpy().ravel() for x in (d, v, g))
+        levels = np.linspace(0, 1, 101)
+        observed = [np.mean(gn <= stats.norm.ppf(q, dn, np.sqrt(vn))) for q in levels]
+        np.testing.assert_allclose(curves["ece_q_levels"], levels, atol=1e-15)
+        np.testing.assert_allclose(curves["ece_q_observed"], observed, atol=1e-15)
+        assert curves["ece_q_observed"][0] == 0.0
+        assert curves["ece_q_observed"][-1] == 1.0
+        assert got["ece_q"] == pytest.approx(np.mean(np.abs(np.array(observed) - levels)), rel=1e-12)
+        assert float(figures(ECEDelta(bins=100), d, v, g)["ece_delta"]) == got["ece_delta"]
+        with pytest.raises(ValueError, match="bins must be one of ours, authors"):
+            SequenceMetrics(bins="100")
+
+    def test_entropy_is_of_all_predicted_pixels(self) -> None:
+        d, v, g = maps(20, 20)
+        g[:10] = 0  # no ground truth
+        d[0, 0], v[0, 1], v[0, 2] = math.nan, math.inf, -1.0  # no prediction
+        used = torch.ones(20, 20, dtype=torch.bool)
+        used[5] = False
+        metrics = SequenceMetrics()
+        metrics.update(d, v, g, used)
+        kept = used.clone()
+        kept[0, :3] = False
+        oracle = stats.norm(0, np.sqrt(v[kept].numpy())).entropy()
+        assert metrics.compute()["entropy"] == pytest.approx(oracle.mean())
+        assert sum(metrics.curves()["entropy_counts"]) == int(kept.sum())
+        assert metrics.compute()["pixels"] == 200
 
 
 class TestMeaning:
@@ -306,7 +340,7 @@ class TestMasks:
         for name, value in figures(kind(), poisoned, v, g, valid).items():
             torch.testing.assert_close(value, kept[name], rtol=0, atol=0, equal_nan=True)
 
-    @pytest.mark.parametrize("kind", ALL)
+    @pytest.mark.parametrize("kind", JUDGED)
     @pytest.mark.parametrize("nothing", [0.0, -1.0, math.nan, math.inf])
     def test_no_ground_truth_is_left_out_by_itself(self, kind: type[SumMetric], nothing: float) -> None:
         d, v, g = maps(20, 30)
@@ -335,7 +369,9 @@ class TestMasks:
         d, v, g = maps(4, 5)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            empty = [kind().compute(), figures(kind(), d, v, torch.zeros_like(g))]
+            empty = [kind().compute()]
+            if kind in JUDGED:
+                empty.append(figures(kind(), d, v, torch.zeros_like(g)))
             empty.append(figures(kind(), d, v, g, torch.zeros_like(g, dtype=torch.bool)))
         headline = {"delta1", "abs_rel", "rmse", "nll", "ece_delta", "ece_q", "entropy"}
         headline |= {"ause_rmse", "aurg_abs_rel", "spearman", "nll_by_error"}

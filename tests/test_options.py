@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from ufmstar_torch import cli
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.options import as_dict, fields_of, option, parse, positional
 
@@ -159,3 +160,13 @@ def test_help_has_the_attributes_texts(capsys):
         "v_min [m^2], [0, inf]",
     ):
         assert expected in text
+
+
+def test_the_help_of_a_flag_names_no_default(capsys):
+    """--no-register would have "(default: True)", that of the field that it switches off."""
+    with pytest.raises(SystemExit):
+        cli.main(["run", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "--no-register leave 7-Scenes' depth in its own camera --T-color-depth" in told
+    assert "(default: True)" not in told
+    assert "leave preview.mp4 out --no-sheet" in told

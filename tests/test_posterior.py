@@ -21,7 +21,7 @@ from ufmstar_torch.posterior.update import REFERENCE, PosteriorKernels, update
 
 COMPILED = PosteriorKernels(posterior_cpu.solve, posterior_cpu.distance, posterior_cpu.read)
 CONFIG = UfMStarConfig(anchored=True, posterior=True)
-K = torch.tensor([[40.0, 0, 24], [0, 40, 18], [0, 0, 1]])
+K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
 
 
 def scene(seed, size=(36, 48), n=60):
@@ -30,7 +30,7 @@ def scene(seed, size=(36, 48), n=60):
     v, u = np.mgrid[: size[0], : size[1]] / np.array(size)[:, None, None]
     depth = np.where((u > 0.4) & (v < 0.7), 1.2, 3.0) + 0.3 * v
     factor = np.exp(0.3 + 0.2 * u - 0.1 * np.cos(5 * v) + np.where(depth < 2, 0.2, 0))
-    depth[3:6, 5:9] = 0
+    depth[3:6, 5:7] = 0
     rows, cols = np.nonzero(depth)
     chosen = rng.permutation(len(rows))[:n]
     rows, cols = rows[chosen], cols[chosen]
@@ -51,7 +51,7 @@ def checked(depth, pixel, g, variance):
 def test_values_against_the_oracle_over_frames(kernels):
     state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
     for seed in range(2):
-        depth, _, claimed, *anchors = scene(seed)
+        depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
         state, expected, variance = oracle.update(state, depth, claimed, *anchors)
         packed, out = update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], kernels)
         np.testing.assert_allclose(out.depth[0], expected, rtol=1e-8)

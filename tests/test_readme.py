@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 import scenes
 from ufmstar_torch.camera import resize_intrinsics
@@ -25,9 +26,14 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
     depths, poses, K = scenes.sequence(3, 48, 64, 0.05)
     pictures = [np.repeat(np.nan_to_num(d * 40).clip(0, 255).astype(np.uint8)[..., None], 3, 2) for d in depths]
     monkeypatch.chdir(tmp_path)
-    scope = {"video": list(zip(pictures, poses, [K] * 3, strict=True)), "my_network": lambda x: x[:, :1] * 255 / 40}
+    # A pose every 50 ms, a picture at each and one 2 s later.
+    lines = [[0.05 * i, *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()] for i, T in enumerate(poses)]
+    np.savetxt("poses.txt", lines, fmt="%.9f")
+    video = [(0.05 * i, picture) for i, picture in enumerate(pictures)] + [(2.1, pictures[-1])]
+    calibrated = resize_intrinsics(torch.tensor(K), (48, 64), (480, 640)).numpy()
+    scope = {"video": video, "K_calibrated": calibrated, "my_network": lambda x: x[:, :1] * 255 / 40}
     exec(compile(code, "README.md", "exec"), scope)
-    assert scope["trust"].shape == (1, 224, 224)
+    assert scope["out"].std.shape == (1, 224, 224)
     torch.testing.assert_close(scope["out"].intrinsics[0], resize_intrinsics(torch.tensor(K), (48, 64), (224, 224)))
     assert len(capsys.readouterr().out.splitlines()) == 3
     assert (tmp_path / "state.pt").exists()

@@ -18,22 +18,15 @@ from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
-from ufmstar_torch.eval.report.figures import (
+from ufmstar_torch.eval.report.figures import write_figures
+from ufmstar_torch.eval.report.figures_calibration import (
     MOST_SEQUENCES,
-    ONE_METRE,
-    STAGES,
     chosen_sequences,
-    density,
     draw_calibration,
-    draw_entropy,
-    draw_error,
-    draw_latency,
     draw_sequence_calibration,
-    draw_stages,
-    draw_tradeoff,
-    entropy_range,
-    write_figures,
 )
+from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
+from ufmstar_torch.eval.report.figures_error import ONE_METRE, density, draw_entropy, draw_error, entropy_range
 from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.style import (

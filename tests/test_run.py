@@ -6,6 +6,7 @@ import errno
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from layouts import truncate, write_depth_png, write_generic, write_scannet
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
 from scenes import render
-from ufmstar_torch import UfMStar, UncertainDepth
+from ufmstar_torch import UfMStar, UncertainDepth, cli
 from ufmstar_torch.eval.commands.run import Progress, run
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.metrics import SequenceMetrics
@@ -293,7 +294,7 @@ def test_maps_that_were_cropped_need_their_intrinsics(path, tmp_path):
     for name in range(7, 13):
         write_depth_png(tmp_path / "maps" / f"{name}.png", np.ones((48, 48)), 1000, scale_text="0.001")
     sequence = open_sequence(path)
-    with pytest.raises(ValueError, match=r"7\.png: the map is 48x48, the images are 64x48: it does not show the whole"):
+    with pytest.raises(ValueError, match=r"7\.png: the map is 48x48, the images are 64x48: .*give .* --map-intrinsics"):
         folder_source(sequence, tmp_path / "maps")
     # Only a later one: that frame is left out.
     for name in (7, 8, 9):
@@ -311,10 +312,46 @@ def test_the_depth_of_a_run_as_maps_of_another_gives_the_same(path, tmp_path):
     K = first["prediction"]["intrinsics"]
     source = folder_source(sequence, tmp_path / "first" / "frames", intrinsics=K)
     second = run(job_of(sequence, source), tmp_path / "second")
-    assert second["metrics"] == first["metrics"]
+    third = run(job_of(sequence, folder_source(sequence, tmp_path / "first")), tmp_path / "third")
+    assert second["metrics"] == third["metrics"] == first["metrics"]
     for name in range(7, 13):
-        a, b = (read_frame(tmp_path / out / "frames" / f"{name}.npz") for out in ("first", "second"))
-        assert all(a[key].tobytes() == b[key].tobytes() for key in a)
+        a, *others = (read_frame(tmp_path / out / "frames" / f"{name}.npz") for out in ("first", "second", "third"))
+        assert all(a[key].tobytes() == b[key].tobytes() for key in a for b in others)
+
+
+def test_a_run_reads_back_what_another_left_and_skips_what_it_skipped(path, tmp_path):
+    sequence, preprocess = open_sequence(path), Preprocess(resize_height=40, crop=(30, 40), size=(24, 36))
+    broken = replace(sequence.entries[2], load_image=lambda: np.zeros((5, 5, 3), np.uint8))
+    spoiled = replace(sequence, entries=(*sequence.entries[:2], broken, *sequence.entries[3:]))
+    run(job_of(spoiled, networks(Brightness(), preprocess=preprocess), frames=slice(1, 5)), tmp_path / "first")
+    for folder in ("first", "first/depth"):
+        source = folder_source(sequence, tmp_path / folder, indices=range(1, 5))
+        summary = run(job_of(sequence, source, frames=slice(1, 5)), tmp_path / "second", overwrite=True)
+        assert summary["frames"]["done"] == 3
+        assert "skipped in" in next(iter(summary["frames"]["skipped"]))
+    with pytest.raises(ValueError, match="no map for 2 of 5 frames"):
+        folder_source(sequence, tmp_path / "first")
+    (tmp_path / "first" / "frames.jsonl").write_text("{}\n")
+    with pytest.raises(ValueError, match=r"frames.jsonl, line 1 is not the record of a frame: \{\}"):
+        folder_source(sequence, tmp_path / "first")
+
+
+def test_a_journal_of_other_lines_is_refused_in_one_line(path, tmp_path):
+    job = own_depth_job(path, frames=slice(0, 2))
+    run(job, tmp_path / "out")
+    journal = tmp_path / "out" / "frames.jsonl"
+    journal.write_bytes(b"{}\n" * (len(journal.read_bytes()) // 3 + 1))
+    with pytest.raises(FolderError, match=r"cannot be read \(.*frames.jsonl, line 1 is not the record of a frame"):
+        run(job, tmp_path / "out", resume=True)
+
+
+def test_maps_of_some_frames_are_enough_where_only_those_are_run(path, tmp_path):
+    words = ["run", str(path), "--depth", str(tmp_path / "maps"), "--no-video", "--no-sheet", "--out"]
+    for name, value in (("first", 1.0), ("second", 2.0)):  # in order: nothing in common with the frames' names
+        write_depth_png(tmp_path / "maps" / f"{name}.png", np.full((48, 64), value), 1000, scale_text="0.001")
+    assert cli.main([*words, str(tmp_path / "out"), "--frames", "2:4"]) == 0
+    assert [read_frame(tmp_path / "out" / "frames" / f"{n}.npz")["depth"].max() for n in (9, 10)] == [1, 2]
+    assert cli.main([*words, str(tmp_path / "other")]) == 2
 
 
 def test_an_ensemble_alternates(path, tmp_path):
@@ -467,16 +504,20 @@ run(network_job(Path(sys.argv[1]), *networks), sys.argv[2])
 
 
 @pytest.mark.slow
-def test_sigkill_loses_the_frame_in_hand_only(path, tmp_path, uninterrupted):
+def test_sigkill_loses_the_frames_in_hand_only(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(out)], cwd=TESTS, check=False)
     assert ended.returncode == -9
     summary = read_summary(out)
     assert summary["state"] == "interrupted"
     assert "killed" in summary["reason"]
-    assert len(list((out / "frames").iterdir())) == 3
+    written = len(list((out / "frames").iterdir()))
+    assert written <= 3  # those behind the loop are lost
     resumed = run(network_job(path, *pair()), out, resume=True)
-    assert [(s["first"], s["frames"]) for s in resumed["time"]["sessions"]] == [(0, 3), (3, 3)]
+    sessions = [(s["first"], s["frames"]) for s in resumed["time"]["sessions"]]
+    first = sessions[-1][0]
+    assert sessions == ([(0, first), (first, 6 - first)] if first else [(0, 6)])
+    assert first in (written - 1, written)
     assert outputs(out) == uninterrupted
 
 

@@ -186,7 +186,7 @@ def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
     ],
 )
 def test_why_a_frame_has_none(counts, why):
-    assert why in why_none(*counts)
+    assert why in why_none(*counts, "no parallax")
 
 
 def test_a_frame_with_a_bad_pose_does_not_spoil_the_tracks(tour, tmp_path):

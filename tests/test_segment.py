@@ -232,6 +232,14 @@ def test_slope_keeps_metric_thresholds():
     assert scaled.slope(525.0) == pytest.approx(2.4 / 525)
     assert scaled.slope(100.0) == pytest.approx(2.4 / 525)
     assert fixed.slope(100.0) == pytest.approx(2.4 / 100)
+    # The camera's own focal length: an image of half the size has half of it, and the same threshold in metres.
+    own = replace(scaled, slope_focal="camera")
+    assert own.scaled_to(480, 640).slope(320.0) == pytest.approx(2.4 / 320)
+    assert own.scaled_to(240, 320).slope(160.0) == pytest.approx(2.4 / 320)
+    assert own.scaled_to(240, 320).scaled_to(480, 640).slope(320.0) == pytest.approx(2.4 / 320)
+    # The centre of a 640 x 480 image, enlarged to its width: f is larger, and so is the resolution.
+    assert own.scaled_to(240, 640).slope(320.0) == pytest.approx(2.4 / 320)
+    assert replace(own, scale_with_image=False).scaled_to(240, 320).slope(160.0) == pytest.approx(2.4 / 160)
 
 
 def test_float32_with_centred_moments():

@@ -51,6 +51,15 @@ def words_for(rooms, out, *more, suite="depth-only"):
     return ["eval", "--suite", suite, "--network", TRUTH, "--root", f"rooms={rooms}", "--out", out, *more]
 
 
+def test_one_preset_for_all_rows(rooms, tmp_path):
+    words = [str(word) for word in words_for(rooms, tmp_path / "out")[1:]]
+    settings = {preset: job_from(read([*words, "--ufm-preset", preset])).suite.rows[3].setting.to_dict()
+                for preset in ("paper", "default")}  # fmt: skip
+    assert settings == {"paper": {"ufm_preset": "paper"}, "default": {}}
+    with pytest.raises(ValueError, match="ufm-preset"):
+        read([*words, "--ufm-preset", "papers"])
+
+
 def test_list_names_every_suite(ufmstar):
     code, out, _ = ufmstar("eval", "--list")
     assert code == 0
@@ -175,8 +184,8 @@ def test_a_dry_run_counts_and_writes_nothing(ufmstar, rooms, tmp_path):
     words = words_for(rooms, tmp_path / "out", "--dry-run", "--frames", "1:", "--shard", "1/2")
     code, text, _ = ufmstar(*words)
     assert code == 0
-    assert "4 rows:" in text
-    assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 8 records" in text
+    assert "5 rows:" in text
+    assert "2 of 3:\n  rooms/ash: 3 frames\n  rooms/cedar: 3 frames\n6 frames, 10 records" in text
     assert "cache of predictions: up to 0.0 MB" in text  # ground truth is not kept
     assert not (tmp_path / "out").exists()
 

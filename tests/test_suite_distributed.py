@@ -282,7 +282,7 @@ def test_what_slurm_is_told():
         (["jobs=0"], "at least 1"),
         (["jobs=many"], "at least 1"),
         (["cluster=moon"], "slurm, local or debug"),
-        (["nodes=2"], "jobs=N says how many"),
+        (["nodes=2"], "jobs=N sets their number"),
     ):
         with pytest.raises(ValueError, match=told):
             Slurm.parse(words)

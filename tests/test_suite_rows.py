@@ -12,14 +12,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
+from test_ufmstar import SPGF, oracle_settings
 from tiny_suite import CPU, base_network, row, write_network, write_networks
 
+import oracle
+import scenes
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.engine.estimators import make_estimator, ufm_star_config
+from ufmstar_torch.eval.engine.estimators import Gaussians, make_estimator, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.perturb import perturbed, rotation, selects
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.methods.suite import check_row
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.models import Preprocess
 
+PICTURE = np.random.default_rng(3).integers(0, 256, (72, 96, 3), dtype=np.uint8)
 POSE = np.block([[Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix(), np.array([[1.0], [2], [3]])], [np.eye(4)[3:]]])
 
 
@@ -58,8 +66,8 @@ def test_overrides_by_dotted_name():
     [
         ("segment.min_pixel", 3, "segment.min_pixels"),
         ("alpha", 1.0, "ema_alpha"),
-        ("segment", {}, "no setting 'segment'"),
-        ("xyz", 3, "eta_occlusion"),
+        ("segment", {}, "setting 'segment' is a group"),
+        ("xyz", 3, "no setting is called 'xyz': expected ufm_preset"),
         ("ema_alpha", 1.5, "must lie in"),
         ("eta", "much", "must be a number"),
     ],
@@ -292,3 +300,67 @@ def test_what_was_run_is_told_in_plain_values(loaded):
 def test_files_that_are_not_there(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         base_network(f"aleatoric=trained:{tmp_path / 'nowhere.safetensors'}")
+
+
+# ---- the aleatoric variance in H ----
+
+
+def test_a_in_h_agrees_with_the_oracle():
+    config = UfMStarConfig(segment=SPGF, features=2, add_aleatoric=False, backend="torch")
+    estimator = Gaussians(config, CPU, aleatoric_in_h=True)
+    judge = oracle.Oracle(oracle_settings(SPGF))
+    depths, poses, K = scenes.sequence(3, 30, 40, 0.05)
+    for i, (depth, T) in enumerate(zip(depths, poses, strict=True)):
+        a = 0.01 * (1 + i) * depth**2
+        given = Prediction(torch.tensor(depth), torch.tensor(a), None, torch.tensor(K))
+        estimate = estimator.update(given, torch.tensor(T))
+        _, M = judge.step(depth, T, K, features=a[None])
+        A = oracle.aleatoric_in_h(judge.mixture_cam, depth, depth > 0, K, a, prior_weight=1.0)
+        np.testing.assert_allclose(estimate.aleatoric.numpy(), A, rtol=1e-5)
+        np.testing.assert_allclose(estimate.variance.numpy(), M + A, rtol=1e-3, atol=1e-5)
+    assert np.nanmax(np.abs(A - a)) > 0.01, "the mixture's average is not the pixel's own"
+    with pytest.raises(ValueError, match="needs a network that predicts an aleatoric variance"):
+        estimator.update(Prediction(given.depth, None, None, given.intrinsics), torch.tensor(T))
+
+
+def test_a_in_h_is_a_row_of_its_own():
+    one = row("UfM*-Aleatoric", aleatoric_in_h=True)
+    config = ufm_star_config(one)
+    assert (config.features, config.add_aleatoric) == (2, False)
+    assert one.label == "UfM*-Aleatoric (aleatoric_in_h True)"
+    with pytest.raises(ValueError, match="goes without anchors, features"):
+        Setting(aleatoric_in_h=True, anchors="tracked")
+    with pytest.raises(ValueError, match="row Aleatoric: aleatoric_in_h is of UfM"):
+        check_row(row("Aleatoric", aleatoric_in_h=True))
+    with pytest.raises(ValueError, match="needs a network that predicts an aleatoric variance"):
+        check_row(row("UfM*-DepthOnly", aleatoric_in_h=True))
+
+
+# ---- how images come to the networks ----
+
+
+def test_a_row_prepares_its_images_as_it_says(tmp_path):
+    source = base_network(write_networks(tmp_path)["aleatoric"])
+    own = source.networks[0].preprocess
+    assert source.prepared("network") is source
+    assert source.prepared("resize") is source, "the tiny networks resize the whole frame anyway"
+    cropped = source.prepared("crop")
+    assert cropped.networks == source.networks
+    assert len({cropped.digest, source.digest, ""}) == 3
+    frame = Frame(0, "0", PICTURE, None, np.eye(4), np.array([[60.0, 0, 47], [0, 60, 35], [0, 0, 1]]))
+    image, K = torch.from_numpy(PICTURE).permute(2, 0, 1)[None], torch.from_numpy(frame.intrinsics)[None]
+    for one, preprocess in ((source, own), (cropped, Preprocess.nyu(own.size))):
+        x, K_x = preprocess(image, K)
+        with torch.no_grad():
+            expected = source.networks[0](x)
+        made = one.one(frame, 0)
+        assert torch.equal(made.depth, expected.depth[0])
+        assert torch.equal(made.intrinsics, K_x[0])
+    assert Preprocess.nyu().of_whole_frame() == Preprocess(size=(224, 224))
+    vit = Preprocess(size=(518, 518), aspect_multiple=14, cubic=True)
+    assert vit.of_whole_frame() == Preprocess(size=(518, 518), cubic=True)
+    assert vit.of_nyu_crop() == Preprocess.nyu((518, 518), cubic=True)
+    maps = NetworkChoice.parse("depth_only=ground-truth:32x64").load(CPU)
+    assert maps.prepared("resize") is maps
+    with pytest.raises(ValueError, match="goes with networks: maps exist already"):
+        maps.prepared("crop")

@@ -177,8 +177,8 @@ def test_poses_of_another_program(tmp_path):
     job = job_from(read([*words, "--trajectory", "slam.txt"]))
     go(job)
     write_rooms(tmp_path / "plain", ["ash", "birch"], frames=3)
-    go(job_on(tmp_path / "plain", tmp_path / "expected"))
-    assert len(kept(job.out)) == 8
+    go(job_on(tmp_path / "plain", tmp_path / "expected", suite=job.suite))
+    assert len(kept(job.out)) == 10
     assert kept(job.out) == kept(tmp_path / "expected")
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):

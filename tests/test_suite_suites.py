@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.methods.method import BASES, MANY
+from ufmstar_torch.eval.engine.estimators import ufm_star_config
+from ufmstar_torch.eval.methods.method import BASES, MANY, UFM_STAR
+from ufmstar_torch.eval.methods.row import plain_rows
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from, value_of
 from ufmstar_torch.eval.methods.suite import Suite, names, rows_of, suite_named
+from ufmstar_torch.eval.report.names import row_labels, shared_words
 
 # The rows of the paper's tables, written off.
 TABLE_1 = """
@@ -30,18 +34,64 @@ def methods(name, base=None):
 @pytest.mark.parametrize(("number", "rows"), [(1, TABLE_1), (2, TABLE_2), (3, TABLE_3)])
 def test_tables_have_the_papers_rows_in_its_order(number, rows):
     suite = suite_named(f"paper-table-{number}")
-    assert [row.method.name for row in suite.rows] == rows.split()
-    assert all(row.setting == DEFAULT for row in suite.rows)
+    assert [row.method.name for row in plain_rows(suite.rows)] == rows.split()
+    assert {row.setting.preprocess for row in suite.rows} == {"resize"}
     assert suite.sequences == 100
     assert suite.efficiency == (number == 2)
 
 
 def test_table_4_has_the_full_rows_and_the_alternating_ones_beside_them():
-    found = methods("paper-table-4")
+    found = list(dict.fromkeys(methods("paper-table-4")))
     assert [name for name in found if "Full" in name] == [
         "UfM*-FullEnsemble", "UfM*-FullMCD", "UfM*-FullBatchEnsemble"
     ]  # fmt: skip
     assert [name.replace("Full", "") for name in found[::2]] == found[1::2]
+
+
+@pytest.mark.parametrize("name", [n for n in names() if n.startswith("paper-")])
+def test_the_papers_suites_run_the_papers_settings_with_ours_beside_them(name):
+    rows = [row for row in suite_named(name).rows if row.method.fusion == UFM_STAR]
+    papers, ours = rows_with(rows, "paper"), rows_with(rows, "default")
+    assert [(row.method, row.setting.skip, row.setting.pose_noise) for row in papers] == [
+        (row.method, row.setting.skip, row.setting.pose_noise) for row in ours
+    ]
+    assert {row.setting.preprocess for row in suite_named(name).rows} == {"resize"}
+    for row, expected in [*zip(papers, [UfMStarConfig.paper()] * len(rows), strict=False), (ours[0], UfMStarConfig())]:
+        scaled = not row.method.fixed_param
+        segment = replace(expected.segment, scale_with_image=scaled)
+        assert ufm_star_config(row) == expected.replace(segment=segment, on_bad_frame="skip")
+
+
+def rows_with(rows, preset):
+    return [row for row in rows if row.setting.ufm_preset == preset]
+
+
+def test_one_preset_for_all_rows():
+    for preset in ("paper", "default"):
+        suite = suite_named("paper-table-1", preset=preset)
+        assert [row.method.name for row in suite.rows] == TABLE_1.split()
+        assert all(row.setting.ufm_preset == preset for row in suite.rows if row.method.fusion == UFM_STAR)
+    # What the preset says anyway is no change; what an ablation varies stays.
+    rows = suite_named("ablation-segmentation", preset="paper").rows
+    own = {value_of(row.setting.to_dict(), "segment.min_pixels") for row in rows[1:] if row.setting.plain}
+    assert own == {2000}
+    assert {"none", "both", "either"} == {configured(r.setting).segment.prune for r in rows[1:]}
+    tried = {configured(r.setting).regression for r in suite_named("ablation-regression", preset="paper").rows[1:]}
+    assert tried == {"exact", "neighbourhood"}
+    with pytest.raises(ValueError, match="ufm_preset must be"):
+        suite_named("paper-table-1", preset="papers")
+
+
+def test_labels_say_what_differs_between_the_rows_of_a_table():
+    rows = suite_named("paper-table-2").with_bases(["aleatoric"]).rows
+    assert list(row_labels(rows).values()) == [
+        "Aleatoric", "UfM-Aleatoric", "UfM-Aleatoric-100K", "UfM*-Aleatoric, paper's settings",
+        "UfM*-Aleatoric, our defaults",
+    ]  # fmt: skip
+    assert shared_words(rows) == "whole frame"
+    mixed = suite_named("ablation-preprocess").rows
+    assert row_labels(mixed)[mixed[0]] == "DepthOnly, NYU's crop"
+    assert shared_words(mixed) == ""
 
 
 def test_every_suite_can_be_made_for_every_base():
@@ -68,14 +118,14 @@ def test_no_such_suite_and_no_such_base():
 
 def test_figures_vary_what_the_paper_varies():
     noise = suite_named("paper-figure-pose-noise")
-    assert [row.method.name for row in noise.rows] == ["Ensemble"] + ["UfM*-Ensemble"] * 11
-    assert [r.setting.rotation_noise for r in noise.rows[1:7]] == [0.0, 0.5, 1.0, 2.0, 5.0, 10.0]
-    assert [r.setting.translation_noise for r in noise.rows[7:]] == [0.01, 0.02, 0.05, 0.1, 0.2]
+    assert [row.method.name for row in noise.rows] == ["Ensemble"] + ["UfM*-Ensemble"] * 22
+    assert [r.setting.rotation_noise for r in noise.rows[1:13]] == [0.0, 0.5, 1.0, 2.0, 5.0, 10.0] * 2
+    assert [r.setting.translation_noise for r in noise.rows[13:]] == [0.01, 0.02, 0.05, 0.1, 0.2] * 2
     assert noise.sweep == ("rotation_noise", "translation_noise")
     overlap = suite_named("paper-figure-overlap")
     # Both are judged on the same frames: the figure shows their difference.
     assert [(r.setting.skip, r.method.name) for r in overlap.rows] == [
-        (skip, name) for skip in (0, 1, 2, 4, 8, 16, 32) for name in ("Aleatoric", "UfM*-Aleatoric")
+        (skip, name) for name in ("Aleatoric", *["UfM*-Aleatoric"] * 2) for skip in (0, 1, 2, 4, 8, 16, 32)
     ]
     assert suite_named("paper-figure-entropy").datasets == ("scannet", "tartanair", "kitti360")
 
@@ -155,7 +205,7 @@ def test_impossible_suites():
 def test_rows_without_a_network_are_left_out():
     left = suite_named("paper-table-1").with_bases(["aleatoric", "depth_only"])
     assert left.bases == ("aleatoric",)
-    assert len(left.rows) == 4
+    assert len(left.rows) == 5
     with pytest.raises(ValueError, match="there are networks of depth_only only"):
         suite_named("paper-table-1").with_bases(["depth_only"])
 

@@ -393,8 +393,55 @@ def test_saved_state_continues_bit_for_bit():
     for i in range(6, 12):
         second(*frame(i, maps[i]))
     assert unchanged(second, whole.state_dict())
-    with pytest.warns(UserWarning, match="max_points differ"):
+    with pytest.warns(UserWarning, match=f"max_points was {CAP}, is 100000"):
         UfM().load_state_dict(second.state_dict())
+    restored = UfM.from_state_dict(second.state_dict())
+    assert restored.config == second.config
+    assert unchanged(restored, whole.state_dict())
+
+
+def put(index, value):
+    def edit(tensor):
+        tensor[index] = value
+        return tensor
+
+    return edit
+
+
+SPOILT = {
+    "rows": ("moments", lambda v: v[:-1]),
+    "a number": ("moments", lambda v: v[0, 0]),
+    "columns": ("moments", lambda v: v[:, :8]),
+    "NaN": ("moments", put((0, 4), torch.nan)),
+    "no variance": ("moments", put((0, 3), -1.0)),
+    "no covariance": ("moments", put((0, 4), 9.0)),
+    "streams": ("T_world_first", lambda v: v.repeat(2, 1, 1)),
+    "not rigid": ("T_world_first", lambda v: 2 * v),
+    "no observation": ("count", put(0, 0)),
+    "sum": ("points", lambda v: v + 1),
+    "negative": ("frames", lambda v: v - 100),
+    "floats": ("count", lambda v: v.float()),
+    "no tensor": ("started", lambda _: [True]),
+    "config": ("_extra_state", lambda v: v[:-1]),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_bad_state_is_refused_before_anything_is_replaced(name):
+    whole, ufm = UfM(), UfM()
+    for i in range(3):
+        whole(*frame(i, variances()[i]))
+    ufm(*frame(3))
+    before = {key: value.clone() for key, value in ufm.state_dict().items()}
+    key, edit = SPOILT[name]
+    with pytest.raises(RuntimeError, match=rf"UfM keeps its state: .*({key.strip('_')}|count must have shape)"):
+        ufm.load_state_dict(whole.state_dict() | {key: edit(whole.state_dict()[key].clone())})
+    assert unchanged(ufm, before)
+    small = UfM(UfMConfig(max_points=5))
+    with pytest.raises(RuntimeError, match="exceed max_points = 5"):
+        small.load_state_dict(whole.state_dict())
+    ufm.load_state_dict(whole.state_dict())
+    assert unchanged(ufm, whole.state_dict())
 
 
 def test_reset_of_all_and_of_some_streams():

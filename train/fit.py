@@ -48,7 +48,7 @@ def fit(
     """
     began = time.monotonic()
     end = began + 60 * job.settings.max_minutes if job.settings.max_minutes else None
-    # A trainer knows the rank of this process, whatever started it.
+    # The trainer has the rank of this process, whichever launcher set it.
     with quiet_lightning():
         trainer = make_trainer(job, 0)
     first = trainer.is_global_zero

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from ufmstar_torch.mixture import GaussianMixture as GaussianMixture
     from ufmstar_torch.pipeline import UncertainDepth as UncertainDepth
     from ufmstar_torch.prediction import DepthPrediction as DepthPrediction
+    from ufmstar_torch.recalibrate import Recalibration as Recalibration
     from ufmstar_torch.ufmstar import UfMStar as UfMStar
     from ufmstar_torch.ufmstar import UfMStarOutput as UfMStarOutput
 else:
@@ -19,6 +20,7 @@ __version__ = "0.1.0"
 __all__ = [
     "DepthPrediction",
     "GaussianMixture",
+    "Recalibration",
     "SPGFConfig",
     "UfMStar",
     "UfMStarConfig",

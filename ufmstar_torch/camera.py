@@ -13,7 +13,7 @@ from ufmstar_torch.fixed_order import apply, congruence, product
 
 # Newton-Schulz contracts a deviation e of R^T R from I to about 0.75 e^2: from the tolerated 0.1 five
 # steps reach float64 rounding with two to spare.
-_POLAR_STEPS = 6
+POLAR_STEPS = 6
 
 
 def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ def nearest_rotation(R: Tensor) -> Tensor:
     it converges to the polar factor when |R^T R - I| is well below 1, which the callers check.
     """
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    for _ in range(_POLAR_STEPS):
+    for _ in range(POLAR_STEPS):
         R = product(R, 1.5 * eye - 0.5 * product(R.mT, R))
     return R
 

@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("eval.commands.report_command", "tables, figures and a page from the results of eval"),
     "bench": ("eval.commands.bench_command", "time per stage and memory, beside the depth network's own"),
     "train": ("train.command", "a network with an uncertainty head, or an ensemble of them"),
+    "recalibrate": ("eval.commands.recalibrate_command", "a map of the variance, fitted where the truth is known"),
     "data": ("eval.commands.data_command", "check: whether a sequence's poses, depth and images fit together"),
 }
 _HELP = """usage: ufmstar COMMAND ...

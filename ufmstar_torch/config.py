@@ -8,6 +8,9 @@ from typing import Any
 
 from ufmstar_torch.checked import Checked, choice, number
 
+# [m] Largest depth of a network that states none; SPGF's own.
+UNSTATED_RANGE = 20.0
+
 
 @dataclass(frozen=True)
 class SPGFConfig(Checked):
@@ -16,9 +19,9 @@ class SPGFConfig(Checked):
     Upstream's constants (:meth:`preset` has all of its configurations), stated as the paper applies them:
     to images of 224 x 224 with the focal length of its NYU preprocessing, about 200 px.
 
-    Lengths are metres. Thresholds in pixels, and ``adaptive_thresh_scale``, which multiplies 1/f,
-    are stated for an image of ``reference_size`` seen with ``reference_focal``; with
-    ``scale_with_image`` they follow the image they are applied to (see :meth:`scaled_to`).
+    Lengths are metres. Thresholds in pixels, and ``adaptive_thresh_scale``, which multiplies 1/f, are stated for an
+    image of ``reference_height`` x ``reference_width``; with ``scale_with_image`` they follow the image they are
+    applied to (see :meth:`scaled_to`).
 
     Attributes:
         adaptive_thresh_scale: quadratic growth of the thresholds with depth, t = a z^2 / f
@@ -32,12 +35,15 @@ class SPGFConfig(Checked):
         sparse: segments of at most so many pixels are dropped
         min_gaussian_length: length of the first depth bin, the longest that a near segment may be
         frame_max_scale: largest length of a segment, in multiples of min_gaussian_length
-        max_depth: largest depth that the network can predict; pixels beyond it are counted and not valid
+        max_depth: largest depth that the network can predict; pixels beyond it are counted and not valid. null: what
+            the network states (``UncertainDepth`` and the commands take it from there), 20 m where it states nothing
         min_pixels: pixels below which a Gaussian is too small
         min_rows: segments below which a Gaussian is too small
         prune: drop a Gaussian if it is too small in both respects, in either of them, or none
-        scale_with_image: whether the thresholds follow the image's size and focal length
-        reference_focal: focal length for which the thresholds are stated
+        scale_with_image: whether the thresholds follow the image's size
+        slope_focal: whose f the thresholds t = a z^2 / f have: the camera's own, from which only the resize from the
+            reference size is taken out (camera), or reference_focal whatever the camera (reference)
+        reference_focal: focal length for which the thresholds are stated, of slope_focal = reference
         reference_height: image height for which the thresholds are stated
         reference_width: image width for which the thresholds are stated
     """
@@ -53,13 +59,14 @@ class SPGFConfig(Checked):
     sparse: int = number(5, "sparse", "px", 0)
     min_gaussian_length: float = number(0.5, "L0", "m", 0.0, open_low=True)
     frame_max_scale: float = number(4.0, "frame_max_scale", "1", 1.0)
-    max_depth: float = number(20.0, "max_depth", "m", 0.0, open_low=True)
+    max_depth: float | None = number(None, "max_depth", "m", 0.0, open_low=True)
 
     min_pixels: int = number(200, "min_pixels", "px", 1)
     min_rows: int = number(16, "min_rows", "segments", 1)
     prune: str = choice("both", "either", "none")
 
     scale_with_image: bool = True
+    slope_focal: str = choice("reference", "camera")
     reference_focal: float = number(200.0, "f_ref", "px", 0.0, open_low=True)
     reference_height: int = number(224, "H_ref", "px", 1)
     reference_width: int = number(224, "W_ref", "px", 1)
@@ -96,17 +103,26 @@ class SPGFConfig(Checked):
         }  # fmt: skip
         return cls(**{**upstream, **presets[name]})
 
+    @property
+    def depth_limit(self) -> float:
+        """[m] ``max_depth``, or SPGF's 20 m where it is None."""
+        return UNSTATED_RANGE if self.max_depth is None else self.max_depth
+
     def scaled_to(self, height: int, width: int) -> SPGFConfig:
         """The same thresholds for an image of height x width: counts of pixels along a row follow the
         width, rows the height, areas the area. Off (``scale_with_image=False``): returned as it is.
 
-        ``adaptive_thresh_scale`` is not touched here, it follows the focal length (:meth:`slope`).
+        ``adaptive_thresh_scale`` multiplies 1/f. With ``slope_focal == "camera"`` it follows the resize, by the larger
+        of the two factors, since f is the smaller focal length: a camera with square pixels keeps its thresholds in
+        metres when its image is resized.
         """
         if not self.scale_with_image:
             return self
         across, down = width / self.reference_width, height / self.reference_height
+        resized = max(across, down) if self.slope_focal == "camera" else 1.0
         return replace(
             self,
+            adaptive_thresh_scale=self.adaptive_thresh_scale * resized,
             occlusion_gap=max(1, round(self.occlusion_gap * across)),
             n_check=max(1, round(self.n_check * across)),
             sparse=round(self.sparse * across),
@@ -117,12 +133,14 @@ class SPGFConfig(Checked):
         )
 
     def slope(self, focal: Any) -> Any:
-        """a/f [1/m], the factor of z^2 in t = a z^2 / f, for f = min(fx, fy) [px] (a number or a tensor).
+        """a/f [1/m], the factor of z^2 in t = a z^2 / f, of a config for this image (:meth:`scaled_to`).
 
-        Scaling a by f/f_ref keeps the metric thresholds when an image is resized, so the quotient
-        is then a/f_ref whatever the image.
+        Args:
+            focal: min(fx, fy) of the image [px], a number or a tensor. With ``scale_with_image`` and ``slope_focal ==
+                "reference"`` the quotient is a/f_ref whatever it is.
         """
-        scale = focal / self.reference_focal if self.scale_with_image else 1.0
+        fixed = self.scale_with_image and self.slope_focal == "reference"
+        scale = focal / self.reference_focal if fixed else 1.0
         return self.adaptive_thresh_scale * scale / focal
 
 
@@ -157,6 +175,9 @@ class UfMStarConfig(Checked):
         anchor_half_life: age after which an anchor's evidence counts half
         anchor_shrinkage: anchors that a Gaussian needs to be believed half
         posterior: with anchors, also a corrected depth and its variance (UfMStarOutput.posterior)
+        merge: loss per pixel up to which two Gaussians are joined; 0 = Gaussians are never merged
+        merge_share: share in its own points below which a Gaussian is dissolved in the others
+        merge_every: frames of a stream from one merging to the next
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians; null = no limit
@@ -183,7 +204,7 @@ class UfMStarConfig(Checked):
     prior_weight: float = number(1.0, "pi_0", "px/m^3", 0.0, open_low=True)
     prior_mean: float = number(0.0, "mu_0", "m^2", 0.0)
     unmeasured: str = choice("paper", "prior", "relative", "nan")
-    unmeasured_relative: float = number(0.1, "rho", "1", 0.0, open_low=True)
+    unmeasured_relative: float = number(0.2, "rho", "1", 0.0, open_low=True)
     # The paper's neighbourhood approximates the exact sum to save time, which our kernel does not need.
     regression: str = choice("exact", "neighbourhood")
     near_radius: float = number(0.1, "r", "m", 0.0, open_low=True)
@@ -200,6 +221,11 @@ class UfMStarConfig(Checked):
     anchor_shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
     posterior: bool = False
 
+    # Merging (an extension, not in the paper: ``merge``)
+    merge: float = number(0.0, "l_max", "nat", 0.0, 10.0)
+    merge_share: float = number(0.05, "s_min", "1", 0.0, 0.5)
+    merge_every: int = number(50, "n", "frames", 1)
+
     # State
     features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
@@ -208,7 +234,7 @@ class UfMStarConfig(Checked):
     # Input checks and speed
     rotation_tolerance: float = number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
     on_bad_frame: str = choice("raise", "skip")
-    backend: str = choice("auto", "torch", "numba")
+    backend: str = choice("auto", "torch", "numba", "triton")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -227,14 +253,17 @@ class UfMStarConfig(Checked):
     def paper(cls) -> UfMStarConfig:
         """The paper's own settings, for its images of 224 x 224; thresholds in pixels follow other sizes.
 
-        The default differs in two respects. Here a Gaussian below 2,000 pixels or below 32 rows is dropped; by default
-        only one that is below 200 pixels and below 16 rows. Measured on four sequences at 224 x 224, that is 4 to 6
-        Gaussians over 55 to 85 % of the usable pixels here, and 12 to 24 over 92 to 99 % by default
-        (docs/results/segmentation.md). And the regression sums here over the Gaussians within .1 m, or .5 m where
-        there are none; by default over all, the sum that this approximates to save time, which was the better
-        calibrated one (docs/results/analysis.md).
+        The default differs in three respects. Here a Gaussian below 2,000 pixels or below 32 rows is dropped; by
+        default only one that is below 200 pixels and below 16 rows. Measured on four sequences at 224 x 224, that is
+        4 to 6 Gaussians over 55 to 85 % of the usable pixels here, and 12 to 24 over 92 to 99 % by default
+        (docs/results/segmentation.md); ECE_delta of FastDepth's depth alone, whole frame, is .556 here and .485 by
+        default, mean over the four (docs/results/real_video.md). The regression sums here over the Gaussians within
+        .1 m, or .5 m where there are none; by default over all, the sum that this approximates to save time, which was
+        the better calibrated one (docs/results/analysis.md). And SPGF's thresholds have the camera's own focal length
+        here, the reference's by default, which made no difference on tours (docs/results/segmentation.md).
         """
-        return cls(segment=SPGFConfig(min_pixels=2000, min_rows=32, prune="either"), regression="neighbourhood")
+        segment = SPGFConfig(min_pixels=2000, min_rows=32, prune="either", slope_focal="camera")
+        return cls(segment=segment, regression="neighbourhood")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> UfMStarConfig:
@@ -243,6 +272,12 @@ class UfMStarConfig(Checked):
         if isinstance(plain.get("segment"), Mapping):
             plain["segment"] = SPGFConfig(**plain["segment"])
         return cls(**plain)
+
+    def within(self, stated: float | None) -> UfMStarConfig:
+        """The settings for a network that states its largest depth [m]: ``segment.max_depth``, where that is None."""
+        if stated is None or self.segment.max_depth is not None:
+            return self
+        return self.replace(segment=replace(self.segment, max_depth=stated))
 
     def replace(self, **changes: Any) -> UfMStarConfig:
         """A copy with some fields changed, checked again."""

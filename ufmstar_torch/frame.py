@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.arguments import require_float, require_mask
+from ufmstar_torch.camera import POLAR_STEPS as POLAR_STEPS
 from ufmstar_torch.camera import focal_and_centre, nearest_rotation, rotation_deviation
 
 # Index = code. Each text finishes the sentence "stream b: ...".
@@ -73,6 +75,67 @@ class FrameInput:
         return self.depth.shape[-2], self.depth.shape[-1]
 
 
+@dataclass(frozen=True)
+class FrameMaps:
+    """Maps of B streams of one shape, dtype and device, whose values are not checked yet.
+
+    Attributes:
+        depth: [B, H, W] [m], detached, float32 or float64.
+        aleatoric, epistemic: [B, H, W] [m^2] or None.
+        features: [B, F, H, W] or None.
+        mask: [B, H, W] bool, True = use, or None.
+    """
+
+    depth: Tensor
+    aleatoric: Tensor | None
+    epistemic: Tensor | None
+    features: Tensor | None
+    mask: Tensor | None
+
+
+class CheckKernel(Protocol):
+    """The check of values; see :func:`check_values`."""
+
+    def __call__(
+        self, maps: FrameMaps, pose: Tensor, intrinsics: Tensor, /, *, rotation_tolerance: float, max_depth: float
+    ) -> FrameInput: ...
+
+
+def check_values(
+    maps: FrameMaps, pose: Tensor, intrinsics: Tensor, *, rotation_tolerance: float, max_depth: float
+) -> FrameInput:
+    """Check a frame's values, where shapes and dtypes are right.
+
+    Args:
+        maps: of B streams.
+        pose: [B, 4, 4] float64, on any device.
+        intrinsics: [B, 3, 3] float64 [px], on any device.
+        rotation_tolerance, max_depth: as :func:`check_frame`.
+    """
+    plain, device = maps.depth, maps.depth.device
+    deviation = rotation_deviation(pose[..., :3, :3])
+    faults = _pose_fault(pose, deviation, rotation_tolerance), _intrinsics_fault(intrinsics, plain.shape[-2:])
+    fault = _first(*faults, device)
+    fine = fault == 0
+    given = (plain > 0) & (plain < torch.inf) & fine[:, None, None]  # NaN is neither
+    if maps.mask is not None:
+        given = given & maps.mask
+    beyond = given & (plain > max_depth)
+    near = given & ~beyond
+    use = near & (plain >= DEPTH_RANGE[0]) & (plain <= DEPTH_RANGE[1])
+    for variance in (maps.aleatoric, maps.epistemic):
+        if variance is not None:
+            use = use & (variance.detach() >= 0) & (variance.detach() <= LARGEST)
+    if maps.features is not None:
+        use = use & (maps.features.abs() <= LARGEST).all(1)
+    T_safe, K_safe = _harmless(_moved(pose, device), _moved(intrinsics, device), fine)
+    safe_depth = torch.where(use, plain, torch.zeros_like(plain))
+    return FrameInput(
+        safe_depth, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, use, fault,
+        _moved(deviation, device), beyond.sum((1, 2)), (near & ~use).sum((1, 2)),
+    )  # fmt: skip
+
+
 def check_frame(
     depth: Tensor,
     pose: Tensor,
@@ -85,6 +148,7 @@ def check_frame(
     feature_count: int,
     rotation_tolerance: float,
     max_depth: float = DEPTH_RANGE[1],
+    kernel: CheckKernel = check_values,
 ) -> FrameInput:
     """Check and normalise one frame (shapes as in :meth:`ufmstar_torch.UfMStar.forward`).
 
@@ -92,6 +156,7 @@ def check_frame(
         feature_count: F.
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix.
         max_depth: farther pixels are not valid [m].
+        kernel: an implementation of :func:`check_values`.
 
     Raises:
         TypeError: an argument is no tensor or has the wrong kind of dtype.
@@ -113,28 +178,12 @@ def check_frame(
 
     T = _matrix("pose", pose, 4, plain)
     K = _matrix("intrinsics", intrinsics, 3, plain)
-    deviation = rotation_deviation(T[..., :3, :3])
-    fault = _first(_pose_fault(T, deviation, rotation_tolerance), _intrinsics_fault(K, shape[-2:]), plain.device)
-    fine = fault == 0
-
-    given = (plain > 0) & (plain < torch.inf) & fine[:, None, None]  # NaN is neither
+    mask = None
     if valid is not None:
         either = [*shapes, (shape[0], 1, *shape[-2:])]
-        given = given & require_mask("valid", valid, either, depth).reshape(plain.shape)
-    beyond = given & (plain > max_depth)
-    near = given & ~beyond
-    use = near & (plain >= DEPTH_RANGE[0]) & (plain <= DEPTH_RANGE[1])
-    for variance in (a, e):
-        if variance is not None:
-            use = use & (variance.detach() >= 0) & (variance.detach() <= LARGEST)
-    if extra is not None:
-        use = use & (extra.abs() <= LARGEST).all(1)
-    T_safe, K_safe = _harmless(_moved(T, plain.device), _moved(K, plain.device), fine)
-    safe_depth = torch.where(use, plain, torch.zeros_like(plain))
-    return FrameInput(
-        safe_depth, T_safe, K_safe, a, e, extra, use, fault, _moved(deviation, plain.device),
-        beyond.sum((1, 2)), (near & ~use).sum((1, 2)),
-    )  # fmt: skip
+        mask = require_mask("valid", valid, either, depth).reshape(plain.shape)
+    maps = FrameMaps(plain, a, e, extra, mask)
+    return kernel(maps, T, K, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
 
 
 def raise_faults(faults: Sequence[int]) -> None:

@@ -6,7 +6,8 @@ stochastic network, or by a single one; or, for comparison, by all of them at on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -14,9 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.output import MeanUncertainty
-from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.output import FrameStatistics, MeanUncertainty
+from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
@@ -93,6 +96,11 @@ class NetworksInTurn(nn.Module):
         self.preprocess = preprocess
 
     @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that the networks can predict, where each of them states one."""
+        return stated_range(self.networks)
+
+    @property
     def passes(self) -> int:
         """Inferences that :meth:`every` takes."""
         return len(self.networks) if self.samples is None else self.samples
@@ -137,7 +145,8 @@ class UncertainDepth(NetworksInTurn):
         networks: one network or a sequence of them (an ensemble's members; BatchEnsemble members as
             separate callables). Each maps an image [B, 3, H, W] to a :class:`DepthPrediction`; one with an
             attribute ``takes_intrinsics = True`` is called as ``network(x, K)`` with K [B, 3, 3] [px] of ``x``.
-        config: of UfM*. With ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
+        config: of UfM*; where ``segment.max_depth`` is None, it becomes the networks' (:attr:`max_depth`). With
+            ``features=1`` the network's aleatoric variance is averaged per Gaussian and regressed
             as the second entry of H (``ufm.features``), unless other features are given.
         mode: "alternate" runs member n = i mod N (counted from 0) on image i; with one network this is the
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
@@ -148,21 +157,24 @@ class UncertainDepth(NetworksInTurn):
         samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
             network must sample by itself in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the network's input; None passes both through.
+        anchors: what yields the anchors of every image, with ``config.anchored``: "corners" (tracked in the image),
+            "dense" (searched in earlier images), a file of landmarks, or a
+            :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
+            each. Saved and reset with the state. None: those given with an image, if any.
+        recalibration: of the variance, as :class:`UfMStar` takes it (``Recalibration.from_json(FILE)``).
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself
     to sample in eval mode, as decoder dropout at test time does.
 
     Raises:
         TypeError: something that is no ``nn.Module``: a function needs ``ufmstar_torch.models.wrap_network``.
-        ValueError: no network, an unknown mode, or ``samples`` that fit neither.
+        ValueError: no network, an unknown mode, ``samples`` that fit neither, or anchors without ``config.anchored``.
 
     Example::
 
-        model, tracker = UncertainDepth(network, UfMStarConfig(anchored=True)), LandmarkTracker()
-        for picture, T_world_cam, K in video:  # picture [H, W, 3] uint8
-            landmarks = tracker.update(picture, T_world_cam, K)
-            image, pose, intrinsics = ...  # of the same frame, as tensors
-            out = model(image, pose, intrinsics, anchors=landmarks.anchors(K, intrinsics))
+        model = UncertainDepth(network, UfMStarConfig(anchored=True), anchors="corners")
+        for image, pose, intrinsics in video:  # [1, 3, H, W] uint8, [4, 4], [3, 3]
+            out = model(image, pose, intrinsics)
             out.variance  # M + A + E + B
     """
 
@@ -177,6 +189,8 @@ class UncertainDepth(NetworksInTurn):
         posterior: bool = False,
         samples: int | None = None,
         preprocess: Preprocess | None = None,
+        anchors: Given | list[Given] | tuple[Given, ...] | None = None,
+        recalibration: Recalibration | None = None,
     ) -> None:
         single = len(_modules(networks)) == 1
         if mode not in ("alternate", "full"):
@@ -188,7 +202,10 @@ class UncertainDepth(NetworksInTurn):
         super().__init__(networks, samples=samples, preprocess=preprocess)
         if posterior:
             config = (config or UfMStarConfig()).replace(anchored=True, posterior=True)
-        self.ufm = UfMStar(config)
+        self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth), recalibration=recalibration)
+        if anchors is not None and not self.ufm.config.anchored:
+            raise ValueError("anchors go with UfMStarConfig(anchored=True)")
+        self.landmarks = None if anchors is None else StreamLandmarks(anchors)
         self.mode = mode
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0
@@ -212,15 +229,17 @@ class UncertainDepth(NetworksInTurn):
             valid: [B, h, w] bool at the depth map's size, True = use.
             features: [B, F, h, w] likewise, F = ``config.features``; None with F = 1: the aleatoric variance [m^2].
             anchors: sparse depths of this frame, [B, N] padded and masked, with ``config.anchored``; their pixels are
-                those of ``image`` and ``intrinsics``, whatever the preprocessing makes of them. None = none.
+                those of ``image`` and ``intrinsics``, whatever the preprocessing makes of them. None = those of the
+                constructor's source, or none.
 
         Raises:
-            ValueError, TypeError: as :meth:`UfMStar.forward`; the alternation has not advanced then.
+            ValueError, TypeError: as :meth:`UfMStar.forward`; neither alternation nor landmarks have advanced then.
         """
-        prediction, K, member, optional = self._predicted(image, intrinsics, features, anchors)
-        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-        ufm = self.ufm(prediction.depth, pose, K, a, e, valid, **optional)
-        self._count(self._next + 1)
+        prediction, K, member, optional = self._predicted(image, intrinsics, features)
+        with self._anchored(image, pose, intrinsics, K, anchors) as own:
+            a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+            ufm = self.ufm(prediction.depth, pose, K, a, e, valid, anchors=own, **optional)
+        self._done(ufm.statistics)
         return UncertainPrediction(prediction, ufm, K, member)
 
     def mean_uncertainty(
@@ -244,38 +263,68 @@ class UncertainDepth(NetworksInTurn):
             pixels, fraction, seed, average: as in :meth:`UfMStar.mean_uncertainty`.
 
         Raises:
-            ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; the alternation has not advanced then.
+            ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; neither alternation nor landmarks have advanced
+                then.
         """
-        prediction, K, _, optional = self._predicted(image, intrinsics, features, anchors)
-        a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+        prediction, K, _, optional = self._predicted(image, intrinsics, features)
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
-        mean = self.ufm.mean_uncertainty(prediction.depth, pose, K, a, e, valid, **optional, **sample)
-        self._count(self._next + 1)
+        with self._anchored(image, pose, intrinsics, K, anchors) as own:
+            a, e = prediction.aleatoric_variance, prediction.epistemic_variance
+            mean = self.ufm.mean_uncertainty(prediction.depth, pose, K, a, e, valid, anchors=own, **optional, **sample)
+        self._done(mean.statistics)
         return mean
 
+    @contextmanager
+    def _anchored(
+        self, image: Tensor, pose: Tensor, intrinsics: Tensor, K: Tensor, anchors: Anchors | None
+    ) -> Iterator[Anchors | None]:
+        """The image's anchors, given or from the source, in the pixels of K [B, 3, 3]; an error inside undoes them.
+
+        Raises:
+            ValueError: both, or as :meth:`StreamLandmarks.update`.
+        """
+        if self.landmarks is not None:
+            if anchors is not None:
+                raise ValueError("anchors come from the source that UncertainDepth was made with: give none")
+            anchors = self.landmarks.update(image, pose, intrinsics)
+        try:
+            yield anchors if anchors is None or self.preprocess is None else anchors.moved(intrinsics, K)
+        except BaseException:
+            if self.landmarks is not None:
+                self.landmarks.undo()
+            raise
+
+    def _done(self, statistics: FrameStatistics) -> None:
+        """Count an image; of streams that skipped it, the landmarks forget it."""
+        if self.landmarks is not None:
+            self.landmarks.undo(statistics.fault.nonzero().flatten().tolist())
+        self._count(self._next + 1)
+
     def _predicted(
-        self, image: Tensor, intrinsics: Tensor, features: Tensor | None, anchors: Anchors | None
+        self, image: Tensor, intrinsics: Tensor, features: Tensor | None
     ) -> tuple[DepthPrediction, Tensor, int | None, dict[str, Any]]:
-        """The prediction for the next image, its intrinsics, the member, and UfM*'s features and anchors."""
+        """The prediction for the next image, its intrinsics, the member, and UfM*'s features."""
         if image.dim() != 4 or image.shape[1] != 3:
             raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
         member = None if self.mode == "full" else self.turn(self._next)
         with torch.no_grad():
             x, K = self.prepare(image, intrinsics.expand(image.shape[0], 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
-        if anchors is not None and self.preprocess is not None:
-            anchors = anchors.moved(intrinsics, K)
         if features is None and self.ufm.config.features == 1:
             if prediction.aleatoric_variance is None:
                 raise ValueError(
                     "config.features=1 regresses the aleatoric variance, but the network predicts none: give features"
                 )
             features = prediction.aleatoric_variance[:, None]
-        return prediction, K, member, {"features": features, "anchors": anchors}
+        return prediction, K, member, {"features": features}
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
         self.ufm.reset(streams, keep_evidence=keep_evidence)
+        if self.landmarks is not None:
+            b = self.ufm.mean.shape[0]
+            mask = None if streams is None else self.ufm._chosen(streams, b).nonzero().flatten().tolist()
+            self.landmarks.reset(mask)
         if streams is None:
             self._count(0)
 
@@ -285,7 +334,20 @@ class UncertainDepth(NetworksInTurn):
         with torch.inference_mode(False):  # the buffer must outlive the caller's inference mode
             self.image_index = torch.full_like(self.image_index, images)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: object) -> None:
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self.landmarks is not None:
+            destination.update({f"{prefix}landmarks.{n}": value for n, value in self.landmarks.state().items()})
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        own = f"{prefix}landmarks."
+        if self.landmarks is not None:
+            state = {key[len(own) :]: state_dict.pop(key) for key in list(state_dict) if key.startswith(own)}
+            try:
+                self.landmarks.load_state(state)
+            except ValueError as error:
+                args[-1].append(str(error))
+                return
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._next = int(self.image_index)
 

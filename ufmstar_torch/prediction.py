@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,6 +51,14 @@ class DepthPrediction:
 def takes_intrinsics(network: Callable[..., Any]) -> bool:
     """Whether a network declares that it is called as ``network(x, K)``: an attribute ``takes_intrinsics = True``."""
     return bool(getattr(network, "takes_intrinsics", False))
+
+
+def stated_range(networks: Iterable[Callable[..., Any]]) -> float | None:
+    """[m] The largest depth that any of the networks can predict, by their attribute ``max_depth``; None unless each of
+    them states one, a positive number."""
+    stated = [getattr(network, "max_depth", None) for network in networks]
+    known = [float(value) for value in stated if isinstance(value, int | float) and value > 0]
+    return max(known) if known and len(known) == len(stated) else None
 
 
 def infer(network: Callable[..., Any], image: Tensor, intrinsics: Tensor | None, *, takes: bool | None = None) -> Any:

@@ -98,15 +98,15 @@ class SegmentInput:
     @property
     def depth_bins(self) -> int:
         """Enough depth bins to reach max_depth whatever the camera: none is shorter than L0."""
-        return math.ceil(self.config.max_depth / self.config.min_gaussian_length) + 2
+        return math.ceil(self.config.depth_limit / self.config.min_gaussian_length) + 2
 
 
 @functools.lru_cache(maxsize=16)  # a frame's worth of checks, for a value that never changes
 def _scaled(config: SPGFConfig, height: int, width: int) -> SPGFConfig:
-    if config.max_depth > MAX_DEPTH_BINS * config.min_gaussian_length:
+    if config.depth_limit > MAX_DEPTH_BINS * config.min_gaussian_length:
         raise ValueError(
             f"config.min_gaussian_length = {config.min_gaussian_length} m would cut config.max_depth = "
-            f"{config.max_depth} m into more than {MAX_DEPTH_BINS} bins; are both in metres?"
+            f"{config.depth_limit} m into more than {MAX_DEPTH_BINS} bins; are both in metres?"
         )
     return config.scaled_to(height, width)
 

@@ -56,7 +56,7 @@ class Frame:
         b, height, width = given.depth.shape
         limits = given.config
         z = given.depth.to(dtype)
-        use = (z > 0) & (z <= limits.max_depth)
+        use = (z > 0) & (z <= limits.depth_limit)
         s2 = None
         if given.variance is not None:
             s2 = given.variance.to(dtype)

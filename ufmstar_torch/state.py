@@ -72,9 +72,7 @@ class UfMStarState:
             smoothed=torch.zeros(streams, 0, 0, dtype=dtype, device=device),
             evidence=torch.zeros(streams, rows, EVIDENCE_SUMS, dtype=dtype, device=device),
             overall_evidence=torch.zeros(streams, EVIDENCE_SUMS, dtype=dtype, device=device),
-            posterior=torch.zeros(
-                streams, POSTERIOR_SIZE if config.posterior else 0, dtype=torch.float64, device=device
-            ),
+            posterior=torch.zeros(streams, learnt, dtype=torch.float64, device=device),
         )
 
     @property

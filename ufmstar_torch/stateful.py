@@ -19,6 +19,11 @@ class Config(Protocol):
         """Nested plain values."""
         ...
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The config of :meth:`to_dict`; an unknown name is a TypeError or ValueError."""
+        ...
+
 
 class StatefulModule(nn.Module):
     """A module whose state is a fixed set of buffers.
@@ -29,10 +34,12 @@ class StatefulModule(nn.Module):
     Attributes:
         STATE: the buffers' names.
         ALWAYS_FLOAT64: those of them that keep float64 under ``.float()``: a world coordinate of kilometres needs it.
+        CONFIG: class of the config.
         config: of the module.
     """
 
     STATE: ClassVar[tuple[str, ...]]
+    CONFIG: ClassVar[type[Config]]
     ALWAYS_FLOAT64: ClassVar[tuple[str, ...]] = ("T_world_first",)
     config: Config
 
@@ -77,11 +84,37 @@ class StatefulModule(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
-        saved = _config_of(state)
-        ours = self.config.to_dict()
+        # A setting younger than the state had its default.
+        saved = _flat(type(self.config)().to_dict()) | _flat(_config_of(state))
+        ours = _flat(self.config.to_dict())
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
-            warnings.warn(f"the loaded state was made with another config: {', '.join(changed)} differ", stacklevel=2)
+            each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)
+            warnings.warn(f"the loaded state was made with another config: {each}", stacklevel=2)
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Any], **options: Any) -> Self:
+        """A module with the configuration, the dtype and the content of a saved state.
+
+        Args:
+            state: what ``state_dict`` returned (of an ``UncertainDepth``: its ``.ufm``'s).
+            options: further arguments of the constructor, as ``device``.
+
+        Raises:
+            ValueError: the state does not say with which configuration it was made, or with one that is not known here.
+            RuntimeError: the state is incomplete or impossible.
+        """
+        if "_extra_state" not in state:
+            raise ValueError(f"state must be that of a {cls.__name__}, with '_extra_state', got {sorted(state)[:5]}")
+        try:
+            config = cls.CONFIG.from_dict(_config_of(state["_extra_state"]))
+        except TypeError as error:
+            raise ValueError(f"state: its configuration is of another version: {error}") from error
+        first = state.get(cls.STATE[0])
+        dtype = first.dtype if isinstance(first, Tensor) and first.is_floating_point() else torch.float32
+        module = cls(config, dtype=dtype, **options)
+        module.load_state_dict(state)
+        return module
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         """Check a state that is about to be loaded, in the buffers' dtypes; a class states its own rules.
@@ -148,6 +181,14 @@ def _config_of(state: object) -> dict[str, Any]:
     if not isinstance(config, dict):
         raise ValueError(f"_extra_state must hold a JSON object, got {type(config).__name__}")
     return config
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values by dotted name, as segment.min_pixels."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return flat
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[object]:

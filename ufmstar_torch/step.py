@@ -47,7 +47,10 @@ class StepObserver(Protocol):
         ...
 
     def kernel(self, name: str) -> AbstractContextManager[object]:
-        """Around one call of the kernel of this name (a field of :class:`Kernels`)."""
+        """Around the kernel of this name, a field of :class:`Kernels`.
+
+        A compiled step names spgf, correspond, fuse (which appends as well) and regress_image.
+        """
         ...
 
 
@@ -299,6 +302,7 @@ def _segment(
     z = mixture.mean[..., 2].clamp_min(config.near_plane)
     floor = pixel_footprint(z, torch.minimum(fx, fy)[:, None])
     floor = torch.maximum(floor, storage_floor(mixture.covariance, stored))
+    floor = torch.where(mixture.valid, floor, torch.zeros_like(floor))  # an empty slot holds zeros
     return mixture.replace(covariance=kernels.floor_covariance(mixture.covariance, floor)), labels
 
 

@@ -12,16 +12,19 @@ from torch import Tensor
 
 from ufmstar_torch import unmeasured
 from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, check_anchors
+from ufmstar_torch.arguments import require_float
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import select_posterior, select_step
+from ufmstar_torch.kernels.select import select_check, select_merge, select_posterior, select_step
+from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior, update
+from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
@@ -39,6 +42,7 @@ class UfMStar(StatefulModule):
 
     Args:
         config: see :class:`UfMStarConfig`; None = the paper's.
+        recalibration: maps V, after everything else; its parts M, A, E and B stay as they are. None = V as it is.
         dtype: of the state, torch.float32 or torch.float64.
         device: of the state until ``.to()``; it follows the first frame otherwise.
 
@@ -55,14 +59,17 @@ class UfMStar(StatefulModule):
 
     STATE = UfMStarState.names()
     ALWAYS_FLOAT64 = ("T_world_first", "posterior")
+    CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
+    recalibration: Recalibration | None
     _warned: bool = False
 
     def __init__(
         self,
         config: UfMStarConfig | None = None,
         *,
+        recalibration: Recalibration | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
@@ -72,6 +79,9 @@ class UfMStar(StatefulModule):
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.config = config if config is not None else UfMStarConfig()
+        if recalibration is not None:
+            recalibration.require(self.config)
+        self.recalibration = recalibration
         for name, value in UfMStarState.initial(0, self.config, dtype, device or "cpu").tensors().items():
             self.register_buffer(name, value)
 
@@ -229,9 +239,9 @@ class UfMStar(StatefulModule):
 
         Args:
             streams: indices, or a bool mask [B]; None = all, after which another batch size may follow.
-            keep_evidence: keep what anchors taught of a stream as a whole, what this network has been getting wrong
-                lately: a robot that starts in the same place again is not blind at its first frames. What was learnt
-                of single components goes with them. The batch size stays.
+            keep_evidence: keep the sums over anchors of a stream as a whole, the recent error of this network: a robot
+                that starts in the same place again has an estimate at its first frames. The sums of single components
+                go with the components. The batch size stays.
 
         Raises:
             IndexError: an index is out of range.
@@ -276,10 +286,11 @@ class UfMStar(StatefulModule):
 
     def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
+        require_float("depth", depth)
         return check_frame(
             depth, pose, intrinsics, aleatoric, epistemic, valid, features,
             feature_count=self.config.features, rotation_tolerance=self.config.rotation_tolerance,
-            max_depth=self.config.segment.max_depth,
+            max_depth=self.config.segment.depth_limit, kernel=select_check(self.config.backend, depth.device.type),
         )  # fmt: skip
 
     def _observe(
@@ -311,6 +322,9 @@ class UfMStar(StatefulModule):
                 observer=self.observer,
             )  # fmt: skip
             state, out, posterior = self._with_posterior(state, out, frame, checked_anchors, dense=pixels is None)
+            if self.config.merge:
+                kernels = select_merge(self.config.backend, frame.depth.device.type)
+                state = merged(state, frame.fault == 0, self.config, kernels)
             self._store(state.tensors())
             self._warn_without_segments(frame, out)
 
@@ -326,6 +340,8 @@ class UfMStar(StatefulModule):
             variance = variance + chosen(own)
         if self.config.variance_floor:
             variance = variance.clamp_min(self.config.variance_floor)
+        if self.recalibration is not None:
+            variance = self.recalibration(variance)
         return out, variance, anchored, posterior
 
     def _with_posterior(
@@ -338,6 +354,8 @@ class UfMStar(StatefulModule):
         for own in self._own(frame):
             claimed = claimed + own.detach()
         claimed = claimed.clamp_min(self.config.variance_floor)
+        if self.recalibration is not None:
+            claimed = self.recalibration(claimed)
         kernels = select_posterior(self.config.backend, frame.depth.device.type)
         learnt, posterior = update(state.posterior, frame, anchors, claimed, kernels)
         posterior = replace(posterior, variance=posterior.variance.clamp_min(self.config.variance_floor))
@@ -348,7 +366,7 @@ class UfMStar(StatefulModule):
         """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
         if self._warned or frame.depth.device.type != "cpu":
             return
-        given = frame.valid.sum((1, 2)) + frame.beyond + frame.out_of_range
+        given = out.statistics.valid_pixels + frame.beyond + frame.out_of_range
         empty = (given > 0) & (out.statistics.segments == 0)
         if not bool(empty.any()):
             return
@@ -356,7 +374,7 @@ class UfMStar(StatefulModule):
         b = int(empty.nonzero()[0])
         warnings.warn(
             f"stream {b}: a frame has no segment, so nothing is compared between views: of {int(given[b])} pixels "
-            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.max_depth} m and "
+            f"{int(frame.beyond[b])} lie beyond segment.max_depth = {self.config.segment.depth_limit} m and "
             f"{int(frame.out_of_range[b])} outside the accepted ranges. Is the depth in metres, smooth, and the "
             "intrinsics the depth map's? (said once)",
             stacklevel=5,

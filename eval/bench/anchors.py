@@ -175,7 +175,9 @@ class _TimedTracker(LandmarkTracker):
         self.times = CallTimes()
         self.refilled: list[bool] = []
 
-    def update(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]) -> Landmarks:
+    def update(
+        self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
         landmarks: Landmarks = self.times.time("rest", super().update, image, T_world_cam, K)
         for clock in (self.times.wall, self.times.cpu):
             for name in PARTS[:-1]:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from torch import Tensor, nn
 
 from ufmstar_torch import UfMStar
+from ufmstar_torch.models.onnx_network import OnnxNetwork
 
 
 def tensor_bytes(tensors: Iterable[Tensor]) -> int:
@@ -19,8 +21,11 @@ def tensor_bytes(tensors: Iterable[Tensor]) -> int:
 
 
 def weight_bytes(*modules: nn.Module) -> int:
-    """Bytes of the parameters and buffers of modules; what several of them share counts once."""
-    return tensor_bytes(t for module in modules for t in (*module.parameters(), *module.buffers()))
+    """Bytes of the parameters and buffers of modules, and of files that ONNX Runtime runs; what several share counts
+    once."""
+    graphs = {m.path for module in modules for m in module.modules() if isinstance(m, OnnxNetwork)}
+    tensors = (t for module in modules for t in (*module.parameters(), *module.buffers()))
+    return tensor_bytes(tensors) + sum(Path(path).stat().st_size for path in graphs)
 
 
 def state_memory(ufm: UfMStar) -> dict[str, int]:

@@ -16,6 +16,7 @@ from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDrop
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
 from ufmstar_torch.models.heads import DepthOnlyNetwork, UncertaintyNetwork
 from ufmstar_torch.models.network import Backbone, DepthNetwork
+from ufmstar_torch.models.onnx_network import OnnxNetwork
 from ufmstar_torch.pipeline import NetworksInTurn
 from ufmstar_torch.prediction import DepthPrediction, infer
 
@@ -83,7 +84,7 @@ class TimedNetwork:
             return self._turns.member(x, intrinsics, turn)
 
     def memory(self) -> NetworkMemory | None:
-        """Of depth alone and of the rest, or None where the weights are not torch's tensors (ONNX Runtime's)."""
+        """Of depth alone and of the rest, or None where weights are not known (a wrapped function's)."""
         if not weight_bytes(*self.members):
             return None
         return NetworkMemory.of([self.depth] if self.base == "depth_only" else self.members, self.depth)
@@ -95,7 +96,8 @@ def timed_networks(sources: Mapping[str, DepthSource]) -> dict[str, TimedNetwork
 
 
 def depth_alone(network: DepthNetwork) -> DepthNetwork:
-    """A copy of a network without what uncertainty adds: heads, sampling, factors of a BatchEnsemble.
+    """A copy of a network without what uncertainty adds: heads, sampling, factors of a BatchEnsemble. A graph of ONNX
+    Runtime that declares nothing but depth is returned as it is.
 
     Raises:
         Inseparable: its kind has no known division.
@@ -106,6 +108,8 @@ def depth_alone(network: DepthNetwork) -> DepthNetwork:
         return depth_alone(network.ensemble.folded(network.n))
     if isinstance(network, UncertaintyNetwork):
         return depth_alone(network.backbone)
+    if isinstance(network, OnnxNetwork) and len(network.fetched) == 1:
+        return network
     if not isinstance(network, Backbone):
         raise Inseparable(f"a {type(network).__name__} predicts all that it predicts in one")
     backbone = copy.deepcopy(network)

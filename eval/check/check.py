@@ -20,7 +20,7 @@ _READINGS = {convention.description: convention.convert for convention in CONVEN
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
 # Share of a frame's points that must land on valid depth, of those that would if all fell into the image, or a pair
-# tells nothing; a laser's map has values at few pixels only.
+# means nothing; a laser's map has values at few pixels only.
 _MIN_OVERLAP = 0.3
 _GAPS = (5, 3, 2, 1)
 # A reading is no better than another within this factor and this relative error (depth's own noise).
@@ -35,7 +35,7 @@ _MIN_EDGES, _MIN_CONTRAST = 500, 0.03  # contrast observed: .04 to .25
 
 @dataclass(frozen=True)
 class SequenceCheck:
-    """What :func:`check_sequence` found.
+    """Outcome of :func:`check_sequence`.
 
     Attributes:
         pairs: pairs of frames compared, ``gap`` frames apart.
@@ -69,7 +69,7 @@ class SequenceCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether no problem was found (something may still be undecided)."""
+        """Whether no problem was detected (something may still be undecided)."""
         return not self.problems
 
 
@@ -149,23 +149,23 @@ def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> floa
     row = np.rint(pair.K_b[1, 1] * y / z_safe + pair.K_b[1, 2])
     height, width = pair.depth_b.shape
     inside = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    found = pair.depth_b[row[inside].astype(int), column[inside].astype(int)]
-    valid = found > 0
+    depth_there = pair.depth_b[row[inside].astype(int), column[inside].astype(int)]
+    valid = depth_there > 0
     filled = np.count_nonzero(pair.depth_b > 0) / pair.depth_b.size
     if valid.sum() < max(1, _MIN_OVERLAP * filled * pair.points.shape[1]):
         return float("inf")
-    return float(np.median(np.abs(np.log(z[inside][valid] / found[valid]))))
+    return float(np.median(np.abs(np.log(z[inside][valid] / depth_there[valid]))))
 
 
 def _load_pairs(sequence: FrameSequence, gap: int, count: int, unreadable: list[str]) -> list[_Pair]:
     if len(sequence) <= gap:
         return []
-    found = []
+    pairs = []
     for i in np.unique(np.linspace(0, len(sequence) - 1 - gap, count).astype(int)):
         first, second = _read(sequence, int(i), unreadable), _read(sequence, int(i) + gap, unreadable)
         if first is not None and second is not None:
-            found.append(_pair(*first, *second))
-    return found
+            pairs.append(_pair(*first, *second))
+    return pairs
 
 
 def _read(sequence: FrameSequence, index: int, unreadable: list[str]) -> tuple[Frame, np.ndarray] | None:
@@ -198,8 +198,8 @@ def _registration(sequence: FrameSequence, unreadable: list[str]) -> DepthImageF
     if sequence.depth_intrinsics is not None:
         return None
     indices = np.unique(np.linspace(0, len(sequence) - 1, _REGISTRATION_FRAMES).astype(int))
-    found = [_read(sequence, int(i), unreadable) for i in indices]
-    both = [(one[0].image, one[1]) for one in found if one is not None and one[0].image is not None]
+    frames = [_read(sequence, int(i), unreadable) for i in indices]
+    both = [(one[0].image, one[1]) for one in frames if one is not None and one[0].image is not None]
     return depth_image_fit(both) if both else None
 
 

@@ -19,7 +19,7 @@ from ufmstar_torch.eval.tour.open import open_sequence
 _SAMPLED = 12  # frames whose depth is looked at for its range
 _DECODED = 500  # frames that are read to see that they can be; of more, as many evenly spaced ones: seconds
 _QUANTILES = (0.01, 0.99)
-# Scales that are customary [m per unit]; one within the check's own tolerance of what was found is meant.
+# Scales that are customary [m per unit]; one within the check's own tolerance of the measured one is meant.
 _CUSTOMARY = (1.0, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1 / 5000, 1 / 256, 1 / 4000, 1 / 1024)
 _CUSTOMARY_WITHIN = 1.1
 _FEW = 0.5  # share of the frames on disk that must be usable, or the trajectory is another recording's
@@ -27,7 +27,7 @@ _FEW = 0.5  # share of the frames on disk that must be usable, or the trajectory
 
 @dataclass(frozen=True)
 class DataReport:
-    """What was found out about a sequence; lengths in metres, sizes (H, W).
+    """Outcome of a check; lengths in metres, sizes (H, W).
 
     Attributes:
         name: of the sequence.
@@ -72,7 +72,7 @@ class DataReport:
 
     @property
     def ok(self) -> bool:
-        """Whether no problem was found."""
+        """Whether no problem was detected."""
         return not self.problems
 
     def to_dict(self) -> dict[str, Any]:
@@ -138,31 +138,31 @@ def _verdict(
         problems.append(f"only {len(sequence)} of {len(sequence.names_on_disk)} frames are usable")
         remedies.append("see why frames are skipped above; if it is poses: --time-offset, --fps, --max-pose-gap")
     try:
-        found = check_sequence(sequence, pairs)
+        outcome = check_sequence(sequence, pairs)
     except ValueError as error:
         return problems, remedies, [f"nothing was compared: {error}"], {}
     read, broken = _read_frames(sequence)
     if broken:
         problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
         remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
-    problems += found.problems
-    remedies += _remedies(found, sequence, path, options)
-    return problems, remedies, list(found.undecided), {**_measured(found), "read": read, "unreadable": broken}
+    problems += outcome.problems
+    remedies += _remedies(outcome, sequence, path, options)
+    return problems, remedies, list(outcome.undecided), {**_measured(outcome), "read": read, "unreadable": broken}
 
 
-def _remedies(found: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
+def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
     remedies = []
-    if found.convention != OURS:
+    if check.convention != OURS:
         given = options.get("poses", OURS)
-        remedies.append(f"--poses {found.convention}" if given == OURS else f"leave --poses {given} out")
-    if any("depth looks too" in problem for problem in found.problems):
-        remedies.append(_scale_remedy(found.scale, sequence, path, options))
-    if any("disagree" in problem or "no two frames overlap" in problem for problem in found.problems):
+        remedies.append(f"--poses {check.convention}" if given == OURS else f"leave --poses {given} out")
+    if any("depth looks too" in problem for problem in check.problems):
+        remedies.append(_scale_remedy(check.scale, sequence, path, options))
+    if any("disagree" in problem or "no two frames overlap" in problem for problem in check.problems):
         remedies.append(
             "the trajectory may be another recording's, or shifted in time: --trajectory, --time-offset; or the "
             "intrinsics belong to other images: --intrinsics"
         )
-    if any("not registered" in problem for problem in found.problems):
+    if any("not registered" in problem for problem in check.problems):
         remedies.append(
             "if the depth camera is another one, say so: --depth-intrinsics; if it stands beside the colour camera, "
             "warp its maps into that first (7-Scenes: --T-color-depth)"
@@ -205,15 +205,15 @@ def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping
     return None
 
 
-def _measured(found: SequenceCheck) -> dict[str, Any]:
-    lies = found.registration
+def _measured(check: SequenceCheck) -> dict[str, Any]:
+    lies = check.registration
     return {
-        "pairs": found.pairs,
-        "gap": found.gap,
-        "error": found.error,
-        "poses": found.convention,
-        "scale": found.scale,
-        "best_error": found.best_error,
+        "pairs": check.pairs,
+        "gap": check.gap,
+        "error": check.error,
+        "poses": check.convention,
+        "scale": check.scale,
+        "best_error": check.best_error,
         "registration": None if lies is None else asdict(lies),
     }
 
@@ -245,10 +245,10 @@ def _depth_statistics(sequence: FrameSequence) -> tuple[tuple[float, ...] | None
         if depth is not None:
             values.append(depth[depth > 0])
             pixels += depth.size
-    found = np.concatenate(values) if values else np.zeros(0)
-    if found.size == 0:
+    depths = np.concatenate(values) if values else np.zeros(0)
+    if depths.size == 0:
         return None, 0.0
-    return tuple(float(q) for q in np.quantile(found, _QUANTILES)), found.size / pixels
+    return tuple(float(q) for q in np.quantile(depths, _QUANTILES)), depths.size / pixels
 
 
 def _walked(sequence: FrameSequence) -> float:

@@ -127,8 +127,8 @@ def surface_kinds(tour: Tour, frame: Frame) -> NDArray[np.int64]:
     points = unproject(torch.from_numpy(frame.depth).double()[None], K)[0] @ T[:3, :3].T + T[:3, 3]
     names = list(KINDS)
     of_room = torch.tensor([names.index(style) for style in tour.room_styles])
-    found: NDArray[np.int64] = of_room[tour.room_at(points)].numpy()
-    return found
+    numbers: NDArray[np.int64] = of_room[tour.room_at(points)].numpy()
+    return numbers
 
 
 def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:

@@ -49,11 +49,12 @@ def dry_run(job: EvalJob, networks: Mapping[str, DepthSource], shard: Shard) -> 
 
 def predictions(rows: Iterable[Row], network: DepthSource, frames: int) -> int:
     """How many predictions of a network the rows need on so many frames, all members on an image counting as one."""
-    needed: set[tuple[int, int | None]] = set()
+    needed: set[tuple[str, int, int | None]] = set()
     for row in rows:
         every = row.method.every_member and network.passes > 1
         taken = [number for number in range(frames) if selects(row.setting, number)]
-        needed |= {(number, None if every else network.turn(place)) for place, number in enumerate(taken)}
+        how = row.setting.preprocess
+        needed |= {(how, number, None if every else network.turn(place)) for place, number in enumerate(taken)}
     return len(needed)
 
 

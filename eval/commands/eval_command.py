@@ -12,7 +12,10 @@ from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
+PRESETS = ("paper", "default")
+
 if TYPE_CHECKING:
+    from ufmstar_torch.eval.methods.suite import Suite
     from ufmstar_torch.eval.results.launch import EvalOutcome, LaunchOptions
     from ufmstar_torch.eval.results.work import EvalJob
 
@@ -24,15 +27,24 @@ class SuiteOptions:
     Attributes:
         suite: name of a suite (see --list), or a TOML file of your own
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
+        ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
         network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
         samples: passes of MC-Dropout where a row asks for all; default: 10
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        precision: of the networks; bf16: torch's autocast
+        recalibration: file of `ufmstar recalibrate`: its row is judged under it as well, as a row of its own, on
+            sequences other than those that it was fitted to; repeatable
         list: show the suites and stop
     """
 
     suite: str | None = None
     base: str | None = None
+    ufm_preset: str | None = option(None, choices=PRESETS)
     network: tuple[str, ...] = option((), repeat=True)
     samples: int | None = None
+    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
+    precision: str = option("float32", choices=("float32", "bf16"))
+    recalibration: tuple[str, ...] = option((), repeat=True)
     list: bool = False
 
 
@@ -77,6 +89,7 @@ class EvalOutputOptions:
         cache: folder of the networks' predictions; default: OUT/cache
         examples: number of sequences of each data set of which some frames are kept for pictures
         confident: share of a frame's pixels of which a method counts as confident
+        bins: of the calibration errors: ours (10 bins, 10 levels) or authors (100 bins, 101 levels); default: ours
         no_report: no tables and figures at the end; ufmstar report OUT makes them
     """
 
@@ -86,6 +99,7 @@ class EvalOutputOptions:
     cache: str | None = None
     examples: int = 3
     confident: float = 0.5
+    bins: str = option("ours", choices=("ours", "authors"))
     no_report: bool = False
 
 
@@ -180,7 +194,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     from ufmstar_torch.eval.sequences.options import Options
 
     what, data, output = options.what, options.data, options.output
-    suite = suite_named(str(what.suite), what.base)
+    suite = _recalibrated(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
     choices = [NetworkChoice.parse(text) for text in what.network]
     networks = {choice.base: choice for choice in choices}
     if len(networks) < len(choices):
@@ -199,9 +213,33 @@ def job_from(options: EvalOptions) -> EvalJob:
         cache=None if output.cache is None else Path(output.cache),
         device=options.device,
         confident=output.confident,
+        bins=output.bins,
         examples=output.examples,
         samples=what.samples,
+        runtime=what.runtime,
+        precision=what.precision,
     )
+
+
+def _recalibrated(suite: Suite, files: Sequence[str]) -> Suite:
+    """The suite with the rows of recalibrations right behind those to which they were fitted.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: a file is no recalibration, or was fitted to a row that the suite does not have.
+    """
+    from ufmstar_torch.recalibrate import named, read_recalibration
+
+    for file in files:
+        name = named(file)
+        fitted = read_recalibration(name).row
+        own = next((row for row in suite.rows if row.label == fitted), None)
+        if own is None:
+            raise ValueError(f"--recalibration {file} was fitted to the row {fitted!r}, which the suite does not have")
+        mapped = replace(own, setting=replace(own.setting, recalibration=name))
+        at = suite.rows.index(own) + 1
+        suite = replace(suite, rows=(*suite.rows[:at], mapped, *suite.rows[at:]))
+    return suite
 
 
 def launch_from(options: EvalOptions) -> LaunchOptions:

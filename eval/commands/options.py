@@ -31,6 +31,7 @@ values are refused.
 from __future__ import annotations
 
 import types
+from argparse import Action
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from functools import cache, reduce
@@ -127,11 +128,20 @@ def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[s
 
 def parser_of(options: type, prog: str) -> ArgumentParser:
     """The parser for a dataclass of options; it raises ``ArgumentError`` instead of ending the program."""
-    from jsonargparse import ActionConfigFile, ArgumentParser
+    from jsonargparse import ActionConfigFile, ArgumentParser, DefaultHelpFormatter
+
+    class Formatter(DefaultHelpFormatter):
+        """Of a flag, the default would be the field's: --no-register has (default: True) otherwise."""
+
+        def _get_help_string(self, action: Action) -> str:
+            text: str = action.help or "" if isinstance(action.const, bool) else super()._get_help_string(action)
+            return text
 
     description, _ = _documentation(options)
     usage = getattr(options, "USAGE", None)
-    parser = ArgumentParser(prog=prog, usage=usage, description=description, exit_on_error=False)
+    parser = ArgumentParser(
+        prog=prog, usage=usage, description=description, exit_on_error=False, formatter_class=Formatter
+    )
     parser.add_argument("--config", action=ActionConfigFile, help="JSON or YAML file with any of these options")
     _add_options(parser, parser, options)
     return parser

@@ -17,8 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import LandmarkSource
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks
+from ufmstar_torch.eval.engine.behind import Behind
 from ufmstar_torch.eval.engine.estimators import Gaussians
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource
@@ -31,6 +34,7 @@ from ufmstar_torch.eval.results.journal import Journal, MapWriter, row_state
 from ufmstar_torch.eval.results.run_folder import RunFolder
 from ufmstar_torch.eval.results.summary import FAILED, FINISHED, INTERRUPTED, Ending, summarise
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.recalibrate import Recalibration, read_recalibration, split_name
 from ufmstar_torch.ufmstar import UfMStar
 
 # [s] between two updates of the summary of a run that is going on.
@@ -49,9 +53,11 @@ class RunJob:
         config: of UfM*.
         device: of UfM*.
         settings: everything the user chose, as plain values, for the summary.
+        recalibration: FILE@DIGEST of a map of the variance; "" = none.
         every: all members predict on every image, instead of one in turn.
         video: whether to make preview.mp4.
         sheet: whether to make contact_sheet.png.
+        landmarks: makes the source of the anchors, in its initial state; for ``config.anchored``.
     """
 
     sequence: FrameSequence
@@ -60,18 +66,20 @@ class RunJob:
     config: UfMStarConfig
     device: torch.device
     settings: Mapping[str, Any]
+    recalibration: str = ""
     every: bool = False
     video: bool = True
     sheet: bool = True
+    landmarks: Callable[[], LandmarkSource] = LandmarkTracker
 
     def row(self, module: Mapping[str, Tensor], position: int) -> RowRunner:
         """UfM* on the source after ``position`` frames, in the state that a checkpoint holds; {} at the start."""
         row = RowRunner(
             UFM,
             self.source,
-            Gaussians(self.config, self.device),
+            Gaussians(self.config, self.device, recalibration=self._map()),
             every=self.every,
-            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks()) if self.config.anchored else None,
+            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks())) if self.config.anchored else None,
             skips_faults=True,
             device=self.device,
         )
@@ -79,10 +87,13 @@ class RunJob:
             row.load_state(row_state(module, bare=not self.source.needs_image, images=torch.tensor(position)))
         return row
 
+    def _map(self) -> Recalibration | None:
+        return read_recalibration(self.recalibration) if self.recalibration else None
+
     @property
     def source_identity(self) -> dict[str, Any]:
         """Plain values on which depth and anchors depend."""
-        return {**self.source.identity, **(Tracks().identity if self.config.anchored else {})}
+        return {**self.source.identity, **(self.landmarks().identity if self.config.anchored else {})}
 
     def identity(self) -> dict[str, Any]:
         """Plain values on which the results depend: a run can only go on with the same ones."""
@@ -103,6 +114,7 @@ class RunJob:
             "ufm": self.config.to_dict(),
             "source": self.source_identity,
             "device": self.device.type,
+            **({"recalibration": split_name(self.recalibration)[1]} if self.recalibration else {}),
         }
 
     def _first_frame(self) -> str | None:
@@ -191,26 +203,41 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     metrics, maps = RunMetrics(UFM, folder.checkpoint.metrics), MapWriter(UFM, folder.writer)
     journal = Journal(UFM, folder, metrics.figures.state, maps, bare=not job.source.needs_image)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
-    stream.drive([metrics, maps, journal, _Reports(job, folder, progress)], stop=stop)
+    with Behind([metrics, maps, journal, _Summaries(job, folder)]) as behind:
+        stream.drive([behind, _Reports(job, folder, progress)], stop=stop)
 
 
 class _Reports(FrameSink):
-    """The progress after every frame, and now and then the summary of a run that is going on."""
+    """The progress after every frame."""
 
     def __init__(self, job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]) -> None:
-        self._job, self._folder, self._progress = job, folder, progress
+        self._job, self._progress = job, progress
         self._skipped = sum(record["state"] == "skipped" for record in folder.records)
 
     def begin(self, stream: FrameStream) -> None:
         """See ``Sink``."""
-        self._reported = perf_counter()
         self._progress(Progress("frames", stream.position, len(self._job.indices), None, self._skipped))
 
     def take(self, result: FrameResult) -> None:
         """See ``Sink``."""
         self._skipped += len(result.skipped)
-        components = self._folder.records[-1].get("components")
+        statistics = result.rows[UFM].estimate.statistics if UFM in result.rows else None
+        components = None if statistics is None else int(statistics.components[0])
         self._progress(Progress("frames", result.number + 1, len(self._job.indices), components, self._skipped))
+
+
+class _Summaries(FrameSink):
+    """Now and then the summary of a run that is going on."""
+
+    def __init__(self, job: RunJob, folder: RunFolder) -> None:
+        self._job, self._folder = job, folder
+
+    def begin(self, stream: FrameStream) -> None:
+        """See ``Sink``."""
+        self._reported = perf_counter()
+
+    def take(self, result: FrameResult) -> None:
+        """See ``Sink``."""
         if perf_counter() - self._reported > _SUMMARY_EVERY:
             _write_summary(self._job, self._folder, _GOING_ON)
             self._reported = perf_counter()
@@ -270,6 +297,7 @@ def _write_summary(
         sequence=job.sequence,
         selected=len(job.indices),
         source=job.source_identity,
+        runtime=job.source.runtime,
         records=folder.records,
         sessions=folder.checkpoint.sessions,
         mixture=_ufm(job, folder).mixture,

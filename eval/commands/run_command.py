@@ -30,6 +30,8 @@ class NetworkOptions:
         samples: passes per image of an mc_dropout network in mode full; default: 10
         offload: trained: keep the weights in host memory, only the member in turn on the device
         spec: JSON file that declares what the weights do not say: inputs, outputs, an alignment
+        runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
+        precision: of the networks; bf16: torch's autocast
     """
 
     model: str | None = None
@@ -38,6 +40,8 @@ class NetworkOptions:
     samples: int | None = None
     offload: bool = False
     spec: str | None = None
+    runtime: str = option("auto", choices=("auto", "torch", "onnx"))
+    precision: str = option("float32", choices=("float32", "bf16"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +49,8 @@ class MapOptions:
     """Depth from files, instead of a network.
 
     Attributes:
-        depth: folder of predicted maps (16-bit PNG, EXR, npy); 'self': the sequence's own depth
+        depth: folder of predicted maps (16-bit PNG, EXR, npy), or an earlier run's output; 'self': the sequence's own
+            depth
         variance: folder of variance maps [m^2] that belong to them
         depth_scale: metres per unit of the maps in the folder
         map_intrinsics: of the maps, if they do not show the whole image: a file, or fx fy cx cy [px]
@@ -66,15 +71,21 @@ class UfMOptions:
     Attributes:
         preset: segmentation thresholds of the authors' code for a kind of recording; single --ufm.segment.* take
             precedence
-        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper); --preset and single --ufm.* take precedence
-        anchors: track corners of the images: their depths show the error on which all views agree (docs/anchors.md)
-        posterior: --anchors, and also a depth that they correct, with its variance (docs/results/posterior.md)
+        ufm_preset: paper: the paper's own settings (UfMStarConfig.paper), default: ours; --preset and single --ufm.*
+            take precedence
+        anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
+            corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
+            landmarks, a line x y z sigma [m] each, in the world of the poses
+        posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors says which
+            anchors, default: dense
+        recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 
     preset: str | None = option(None, choices=PRESETS)
-    ufm_preset: str | None = option(None, choices=("paper",))
-    anchors: bool = False
+    ufm_preset: str | None = option(None, choices=("paper", "default"))
+    anchors: bool | str = option(False, const=True)
     posterior: bool = False
+    recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
 
@@ -136,7 +147,7 @@ class RunOptions:
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
         chosen = self.uncertainty
-        tracked = {"anchored": chosen.anchors or chosen.posterior, "posterior": chosen.posterior}
+        tracked = {"anchored": bool(chosen.anchors) or chosen.posterior, "posterior": chosen.posterior}
         return UfMStarConfig.from_dict(chosen.ufm | tracked)
 
     def settings(self) -> dict[str, Any]:
@@ -156,7 +167,7 @@ def read(words: Sequence[str]) -> RunOptions:
     prog = "ufmstar run"
     options = parse(RunOptions, words, prog)
     defaults: dict[str, Any] = {}
-    if options.uncertainty.ufm_preset is not None:
+    if options.uncertainty.ufm_preset == "paper":
         paper = UfMStarConfig.paper()
         changed = {**vars(paper), "on_bad_frame": "skip"}
         defaults = {f"ufm.{name}": value for name, value in changed.items() if name != "segment"}

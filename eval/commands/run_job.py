@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from ufmstar_torch.anchors.landmarks import DENSE, LandmarkSource
+from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.commands.run import RunJob
 from ufmstar_torch.eval.commands.run_command import OWN_DEPTH, RunOptions
+from ufmstar_torch.eval.engine.anchors import landmarks_of
 from ufmstar_torch.eval.engine.load import network_source
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.predictions import DepthSource
@@ -18,6 +22,8 @@ from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.frame import parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.recalibrate import beside, named, read_recalibration
 
 
 def job_from(chosen: RunOptions) -> RunJob:
@@ -31,22 +37,43 @@ def job_from(chosen: RunOptions) -> RunJob:
     options, config = chosen.settings(), chosen.config
     device = require_device(options["device"])
     sequence = _sequence(chosen)
-    if config.anchored:
-        _require_images(sequence)
+    landmarks = _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchored else LandmarkTracker
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")
+    source = _source(options, sequence, indices, device)
     return RunJob(
         sequence=sequence,
         indices=indices,
-        source=_source(options, sequence, device),
-        config=config,
+        source=source,
+        config=config.within(source.max_depth),
+        recalibration=_recalibration(chosen, source),
         device=torch.device(device),
         settings=options,
         every=options["model"] is not None and options["mode"] == "full",
         video=not options["no_video"],
         sheet=not options["no_sheet"],
+        landmarks=landmarks,
     )
+
+
+def _recalibration(chosen: RunOptions, source: DepthSource) -> str:
+    """FILE@DIGEST of the map that is named or lies beside the weights; "" = none.
+
+    Raises:
+        FileNotFoundError: the named file does not exist.
+        ValueError: it is no recalibration, or was fitted under other settings or to another network.
+    """
+    name, weights = chosen.uncertainty.recalibration, chosen.network.weights
+    if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
+        return ""
+    file = beside(weights[0]) if name is None else Path(name)
+    try:
+        files = source.identity.get("weights", ())
+        read_recalibration(str(file)).require(chosen.config, [one["sha256"] for one in files])
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
+    return named(file)
 
 
 def _sequence(chosen: RunOptions) -> FrameSequence:
@@ -56,20 +83,24 @@ def _sequence(chosen: RunOptions) -> FrameSequence:
     return sequence
 
 
-def _require_images(sequence: FrameSequence) -> None:
-    """What tracking needs.
+def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], LandmarkSource]:
+    """Makes the source of anchors in its initial state.
 
     Raises:
-        ValueError: the sequence has no images.
+        FileNotFoundError: no such file.
+        ValueError: an unknown source, or the sequence has no images to track in.
         ModuleNotFoundError: OpenCV is not installed.
     """
-    if all(entry.load_image is None for entry in sequence.entries):
+    source = landmarks_of(value, sequence.folder)
+    if source.needs_image and all(entry.load_image is None for entry in sequence.entries):
         raise ValueError(f"--anchors tracks corners of images, of which the sequence {sequence.name!r} has none")
-    if find_spec("cv2") is None:
+    if source.needs_image and find_spec("cv2") is None:
         raise ModuleNotFoundError("--anchors needs OpenCV: pip install 'ufmstar-torch[eval]'")
+    # A map of landmarks remembers no image, and is read once.
+    return (lambda: landmarks_of(value, sequence.folder)) if source.needs_image else (lambda: source)
 
 
-def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) -> DepthSource:
+def _source(options: Mapping[str, Any], sequence: FrameSequence, indices: range, device: str) -> DepthSource:
     size = parse_size(options["size"])
     if options["model"] is not None:
         return network_source(
@@ -79,7 +110,7 @@ def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) ->
             mode=options["mode"],
             samples=options["samples"],
             offload=options["offload"],
-            threads=options["threads"],
+            inference=Inference(options["runtime"], options["precision"], options["threads"]),
             device=device,
         )
     if options["depth"] in OWN_DEPTH:
@@ -93,4 +124,5 @@ def _source(options: Mapping[str, Any], sequence: FrameSequence, device: str) ->
         scale=options["depth_scale"],
         intrinsics=parse_intrinsics(options["map_intrinsics"], "--map-intrinsics"),
         size=size,
+        indices=indices,
     )

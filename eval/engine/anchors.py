@@ -1,9 +1,12 @@
-"""Anchors of a row: corners tracked in the sequence's own images, or ground truth as the upper bound."""
+"""Anchors of a row: corners tracked in the sequence's own images, landmarks of a file, or ground truth as the upper
+bound.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -13,11 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.given import Anchors
-from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker
+from ufmstar_torch.anchors.landmarks import CORNERS, DENSE, FILE_TYPES, LandmarkSource, landmark_source
+from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, Setting
 from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.options import resolve
 
 # Anchors of ground truth in a frame, about as many as a tracker finds, and their standard deviation as a share of the
 # depth: a range sensor's. Their depths are exact.
@@ -35,37 +40,38 @@ class FrameAnchors:
         tracked: corners that were followed from the frame before; 0 of ground truth.
         triangulated: those of them with a depth; of ground truth, all.
         ms: of the tracker [ms]; None of ground truth.
+        none: why there is none, where something was tracked and nothing triangulated.
     """
 
     anchors: Anchors | None
     tracked: int = 0
     triangulated: int = 0
     ms: float | None = None
+    none: str = ""
 
 
 class Tracks:
-    """A tracker of rows that see the same images at the same poses: each image is tracked once."""
+    """Landmarks of rows that see the same images at the same poses: each image is taken in once.
 
-    def __init__(self) -> None:
-        self._tracker = LandmarkTracker()
+    Args:
+        source: in its initial state; None = a tracker of corners.
+    """
+
+    def __init__(self, source: LandmarkSource | None = None) -> None:
+        self._tracker = LandmarkTracker() if source is None else source
         self._before: dict[str, Tensor] = {}
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     @property
     def identity(self) -> dict[str, Any]:
         """Plain values on which the landmarks depend."""
-        return {"anchors": TRACKED, "tracker": self._tracker.config.to_dict()}
-
-    @property
-    def pixel_noise(self) -> float:
-        """Standard deviation of a position that the tracker's variances assume [px]."""
-        return self._tracker.config.pixel_noise
+        return self._tracker.identity
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
         """Landmarks of a frame, which follows those that were asked for before, and the time that they took [ms].
 
         Args:
-            frame: without an image there are none, and the tracker stays as it is.
+            frame: without an image that the source needs, there are none, and the source stays as it is.
             T_world_cam: [4, 4], noise included [m].
 
         Raises:
@@ -75,7 +81,7 @@ class Tracks:
         if self._last is not None and self._last[0] is frame:
             return self._last[1:]
         self._before = self._tracker.state()
-        if frame.image is None:
+        if frame.image is None and self._tracker.needs_image:
             return None
         started = perf_counter()
         landmarks = self._tracker.update(frame.image, T_world_cam, frame.intrinsics)
@@ -110,7 +116,7 @@ class AnchorSource:
 
     Args:
         setting: of the row, with anchors.
-        tracks: where they are tracked; None = ground truth at random pixels.
+        tracks: where they come from; None = ground truth at random pixels.
     """
 
     def __init__(self, setting: Setting, tracks: Tracks | None) -> None:
@@ -141,7 +147,7 @@ class AnchorSource:
             return FrameAnchors(None)
         landmarks, ms = self._thinned(self._disturbed(tracked[0], frame.index), frame.index), tracked[1]
         anchors = landmarks.anchors(frame.intrinsics, prediction.intrinsics).to(device)
-        return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms)
+        return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms, landmarks.none)
 
     def undo(self) -> None:
         """Forget the last frame (:meth:`Tracks.undo`)."""
@@ -171,7 +177,7 @@ class AnchorSource:
         if not size or self.tracks is None:
             return landmarks
         drawn = size * self._drawn(index, _NOISE).standard_normal((len(landmarks.depth), 3))
-        of_one_pixel = np.sqrt(landmarks.variance) / self.tracks.pixel_noise
+        of_one_pixel = np.sqrt(landmarks.variance) / TrackerConfig.pixel_noise
         return replace(
             landmarks, pixel=landmarks.pixel + drawn[:, :2], depth=landmarks.depth + of_one_pixel * drawn[:, 2]
         )
@@ -181,21 +187,56 @@ class AnchorSource:
         if count is None or len(landmarks.depth) <= count:
             return landmarks
         taken = self._drawn(index, _TAKEN).permutation(len(landmarks.depth))[:count]
+        confirmed = None if landmarks.confirmed is None else landmarks.confirmed[taken]
         parts = {name: getattr(landmarks, name)[taken] for name in ("pixel", "depth", "variance")}
-        return replace(landmarks, **parts)
+        return replace(landmarks, **parts, confirmed=confirmed)
 
     def _drawn(self, index: int, what: int) -> np.random.Generator:
         return np.random.default_rng([self._setting.seed, index, what])
 
 
-def anchor_sources(rows: Iterable[Row]) -> dict[Row, AnchorSource]:
-    """The source of every row with anchors; rows of the same images and poses share a tracker."""
+def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
+    """What yields the landmarks of a sequence: the one place where an option or a setting becomes a source.
+
+    Args:
+        value: True, "corners" or "tracked": tracked corners; else as ``landmark_source`` takes it.
+        folder: of the sequence; a file of landmarks lies in it, or else in the working folder.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no source of that name, or no file of landmarks.
+    """
+    word = CORNERS if value in (True, TRACKED) else str(value)
+    is_file = Path(word).suffix.lower() in FILE_TYPES
+    return landmark_source(resolve(folder or Path(), word) if is_file else word)
+
+
+def landmark_digests(rows: Iterable[Row], folder: Path | None) -> dict[str, str]:
+    """Digests of the landmarks of those rows that have them from a file, by the rows' slugs.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`landmarks_of`.
+    """
+    files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
+    known = {file: landmarks_of(file, folder).identity for file in set(files.values())}
+    return {slug: known[file]["landmarks"] for slug, file in files.items() if "landmarks" in known[file]}
+
+
+def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row, AnchorSource]:
+    """The source of every row with anchors; rows of the same images and poses share a tracker.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`landmarks_of`.
+    """
     tracks: dict[tuple[object, ...], Tracks] = {}
     sources = {}
     for row in rows:
         setting = row.setting
         if setting.anchors == TRUTH:
             sources[row] = AnchorSource(setting, None)
-        elif setting.anchors == TRACKED:
-            sources[row] = AnchorSource(setting, tracks.setdefault((setting.skip, setting.pose_noise), Tracks()))
+        elif setting.anchors:
+            key = (setting.anchors, setting.skip, setting.pose_noise)
+            if key not in tracks:
+                tracks[key] = Tracks(landmarks_of(setting.anchors, folder))
+            sources[row] = AnchorSource(setting, tracks[key])
     return sources

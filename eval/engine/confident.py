@@ -25,11 +25,11 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     alone = [other for other in same if other.method.fusion == ALONE and other.method.uses_aleatoric]
     pointwise = [other for other in same if other.method.fusion == UFM and not other.method.full]
     fewest = min((_points(other) for other in pointwise), default=0)
-    found = []
+    chosen = []
     for kind in (alone, [other for other in pointwise if _points(other) == fewest]):
         if kind:
-            found.append(min(kind, key=lambda other: (_noise(other) != _noise(row), other.setting.slug)))
-    return found
+            chosen.append(min(kind, key=lambda other: (_noise(other) != _noise(row), other.setting.slug)))
+    return chosen
 
 
 def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
@@ -49,9 +49,9 @@ def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
     return judged & (torch.where(judged, estimate.variance, torch.inf) <= threshold)
 
 
-def _frames(row: Row) -> int:
-    """What decides which frames a row sees."""
-    return row.setting.skip
+def _frames(row: Row) -> tuple[int, str]:
+    """What decides which frames a row sees, and which part of them."""
+    return row.setting.skip, row.setting.preprocess
 
 
 def _noise(row: Row) -> tuple[float, ...]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from difflib import get_close_matches
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -15,8 +14,10 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.output import FrameStatistics
+from ufmstar_torch.recalibrate import Recalibration, read_recalibration
 from ufmstar_torch.ufmstar import UfMStar
 
 
@@ -81,26 +82,41 @@ class Estimator(Protocol):
         ...
 
 
-def make_estimator(row: Row, device: torch.device) -> Estimator:
+def make_estimator(row: Row, device: torch.device, max_depth: float | None = None) -> Estimator:
     """The estimator of a row, in its initial state.
 
+    Args:
+        row: which.
+        device: where it runs.
+        max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
+
     Raises:
-        ValueError: the setting changes what UfM* does not have, or what the method does not use.
+        ValueError: the setting changes what UfM* does not have, or what the method does not use; or a recalibration
+            that was fitted under other settings.
+        FileNotFoundError: the setting's recalibration does not exist.
     """
     method = row.method
-    if row.setting.overrides and method.fusion in (ALONE, UFM):
+    if row.setting.of_ufm_star and method.fusion in (ALONE, UFM):
         raise ValueError(f"{row.label}: settings of UfM* go with UfM* only")
     if row.setting.anchors and method.fusion != UFM_STAR:
         raise ValueError(f"{row.label}: anchors go with UfM* only")
+    if row.setting.recalibration and method.fusion != UFM_STAR:
+        raise ValueError(f"{row.label}: a recalibration goes with UfM* only")
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         config = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(config, device, uses_variances=method.uses_aleatoric)
+    recalibration = read_recalibration(row.setting.recalibration) if row.setting.recalibration else None
     return Gaussians(
-        ufm_star_config(row), device, uses_variances=method.uses_aleatoric,
-        corrected=row.setting.corrected, posterior=row.setting.posterior,
-    )  # fmt: skip
+        ufm_star_config(row).within(max_depth),
+        device,
+        uses_variances=method.uses_aleatoric,
+        corrected=row.setting.corrected,
+        posterior=row.setting.posterior,
+        recalibration=recalibration,
+        aleatoric_in_h=row.setting.aleatoric_in_h,
+    )
 
 
 def ufm_star_config(row: Row) -> UfMStarConfig:
@@ -115,41 +131,11 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     Raises:
         ValueError: an override has an unknown name or an impossible value; the message names it.
     """
-    values: dict[str, Any] = UfMStarConfig(
-        on_bad_frame="skip", anchored=bool(row.setting.anchors), posterior=row.setting.posterior
-    ).to_dict()
-    if row.method.fixed_param:
-        values["segment"]["scale_with_image"] = False
     try:
-        for name, value in row.setting.overrides.items():
-            _override(values, name, value)
-        return UfMStarConfig.from_dict(values)
+        config = configured(row.setting).replace(on_bad_frame="skip")
     except ValueError as error:
         raise ValueError(f"{row.label}: {error}") from error
-
-
-def _override(values: dict[str, Any], name: str, value: Any) -> None:
-    """Set a field by its dotted name, in place.
-
-    Raises:
-        ValueError: there is none of that name.
-    """
-    at, known = values, _names(values)
-    if name not in known:
-        near = get_close_matches(name, known, n=1) or [", ".join(known)]
-        raise ValueError(f"UfM* has no setting {name!r}; did you mean {near[0]}?")
-    *folders, field = name.split(".")
-    for folder in folders:
-        at = at[folder]
-    at[field] = value
-
-
-def _names(values: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """The dotted names of all fields that hold a value."""
-    names: list[str] = []
-    for name, value in values.items():
-        names += _names(value, f"{prefix}{name}.") if isinstance(value, Mapping) else [f"{prefix}{name}"]
-    return names
+    return config.replace(segment=replace(config.segment, scale_with_image=False)) if row.method.fixed_param else config
 
 
 @dataclass(frozen=True)
@@ -229,6 +215,10 @@ class Gaussians:
         uses_variances: False leaves A and E aside.
         corrected: answer with the depth corrected by the anchors' bias, and the variance that remains.
         posterior: answer with the posterior's depth and variance.
+        recalibration: of the variance; None = as it is.
+        aleatoric_in_h: the config has two features: the aleatoric variance, kept in the mixture, and 1. What is read
+            back is added instead of the pixel's own, A'(x) = sum_k w_k(x) a_k + (1 - sum_k w_k(x)) A: the pixel's own
+            as far as no component explains it, where the mixture alone would read as 0.
     """
 
     def __init__(
@@ -239,20 +229,36 @@ class Gaussians:
         uses_variances: bool = True,
         corrected: bool = False,
         posterior: bool = False,
+        recalibration: Recalibration | None = None,
+        aleatoric_in_h: bool = False,
     ) -> None:
-        self.ufm = UfMStar(config, device=device)
-        self._uses_variances, self._corrected, self._posterior = uses_variances, corrected, posterior
+        self.ufm = UfMStar(config, recalibration=recalibration, device=device)
+        self._uses_variances, self._corrected, self._in_h = uses_variances, corrected, aleatoric_in_h
+        self._posterior = posterior
         self._anchors = 0
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`."""
+        """See :meth:`Estimator.update`.
+
+        Raises:
+            ValueError: ``aleatoric_in_h`` without an aleatoric variance.
+        """
         a, e = _variances(prediction, self._uses_variances)
         K = prediction.intrinsics[None]
-        out = self.ufm(prediction.depth[None], T_world_cam[None], K, _one(a), _one(e), anchors=anchors)
+        optional: dict[str, Any] = {"anchors": anchors}
+        if self._in_h:
+            if a is None:
+                raise ValueError("aleatoric_in_h needs a network that predicts an aleatoric variance")
+            optional["features"] = torch.stack([a, torch.ones_like(a)])[None]
+        out = self.ufm(prediction.depth[None], T_world_cam[None], K, _one(a), _one(e), **optional)
         self._anchors = int(out.statistics.anchors_used[0])
         depth, variance = out.corrected() if self._corrected else (prediction.depth[None], out.variance)
         if self._posterior:
             depth, variance = out.posterior()
+        if self._in_h and a is not None:
+            kept, explained = out.features.unbind(-1)
+            a = (kept + (1 - explained) * a)[0]
+            variance = variance + a
         return _estimate(
             depth=depth[0],
             variance=variance[0],

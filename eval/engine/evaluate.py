@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.confident import references
@@ -75,6 +76,7 @@ def evaluate_sequence(
     limit: slice = slice(None),
     sinks: Sequence[Sink] = (),
     confident: float = 0.5,
+    bins: str = "ours",
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[RowResult]:
@@ -89,6 +91,7 @@ def evaluate_sequence(
         limit: which frames, before a setting's skip.
         sinks: take the frames after the metrics; a row's key is its slug.
         confident: of the pixels of a frame, the share of which a reference method counts as confident.
+        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
         stop: asked before every frame.
         progress: called with the frames that are done and all of them, at the start and after every one.
 
@@ -98,13 +101,16 @@ def evaluate_sequence(
     Raises:
         SequenceError: the sequence cannot be used.
         Stopped: ``stop`` returned True; nothing of the sequence counts.
-        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know.
+        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know, or
+            preprocessing of maps that exist already.
     """
     _check_arguments(rows, networks, confident)
     indices = range(len(sequence))[limit]
     _check_sequence(sequence, rows, indices)
-    used = [networks[base] for base in dict.fromkeys(row.method.base for row in rows)]
-    tracked = any(row.setting.anchors == TRACKED for row in rows)
+    wanted = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
+    sources = {(base, how): networks[base].prepared(how) for base, how in wanted}
+    used = list(sources.values())
+    tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
 
     def check(frame: Frame) -> None:
         """Raises FrameError unless all networks and UfM* can use the frame."""
@@ -116,12 +122,12 @@ def evaluate_sequence(
         if fault is not None:
             raise FrameError(frame.name, fault)
 
-    anchors = anchor_sources(rows)
+    anchors = anchor_sources(rows, sequence.folder)
     runners = [
         RowRunner(
             row.slug,
-            networks[row.method.base],
-            make_estimator(row, device),
+            sources[row.method.base, row.setting.preprocess],
+            make_estimator(row, device, sources[row.method.base, row.setting.preprocess].max_depth),
             every=row.method.every_member,
             setting=row.setting,
             anchors=anchors.get(row),
@@ -130,7 +136,7 @@ def evaluate_sequence(
         for row in rows
     ]
     named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
-    metrics, accounts = RowMetrics(named, confident), _Accounts()
+    metrics, accounts = RowMetrics(named, confident, bins), _Accounts()
     stream = FrameStream(sequence, indices, runners, store=store, device=device, check=check)
     stream.drive([metrics, accounts, *sinks, ProgressSink(progress)], stop=stop)
     return [_result(row, accounts.rows[row.slug], metrics, sequence) for row in rows]

@@ -22,10 +22,15 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 class Figures(Generic[Key]):
-    """``SequenceMetrics`` by key, each made when its first frame with ground truth comes."""
+    """``SequenceMetrics`` by key, each made when its first frame with ground truth comes.
 
-    def __init__(self) -> None:
+    Args:
+        bins: see ``SequenceMetrics``.
+    """
+
+    def __init__(self, bins: str = "ours") -> None:
         self._metrics: dict[Key, SequenceMetrics] = {}
+        self._bins = bins
 
     def __iter__(self) -> Iterator[Key]:
         return iter(self._metrics)
@@ -35,7 +40,7 @@ class Figures(Generic[Key]):
         from ufmstar_torch.eval.metrics import SequenceMetrics
 
         if key not in self._metrics:
-            self._metrics[key] = SequenceMetrics(with_variance=with_variance)
+            self._metrics[key] = SequenceMetrics(with_variance=with_variance, bins=self._bins)
         return self._metrics[key]
 
     def state(self) -> dict[Key, dict[str, Tensor]]:
@@ -96,14 +101,15 @@ class RowMetrics(FrameSink):
     Args:
         references: by row, the rows on whose confident pixels its NLL is binned by error, and their names.
         confident: of the pixels of a frame, the share of which a reference counts as confident.
+        bins: of the calibration errors, see ``SequenceMetrics``.
 
     Attributes:
         judged: frames with ground truth, by row.
     """
 
-    def __init__(self, references: Mapping[str, Mapping[str, str]], confident: float) -> None:
+    def __init__(self, references: Mapping[str, Mapping[str, str]], confident: float, bins: str = "ours") -> None:
         self._references, self._confident = references, confident
-        self._figures: Figures[str] = Figures()
+        self._figures: Figures[str] = Figures(bins)
         self._by_error: dict[str, dict[str, NLLByError]] = {}
         self.judged = dict.fromkeys(references, 0)
 

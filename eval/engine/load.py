@@ -17,6 +17,7 @@ from ufmstar_torch.eval.engine.networks import NetworkSource, stochastic
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.sequences.frame import Size, parse_size
 from ufmstar_torch.models.dropout import SAMPLES
+from ufmstar_torch.models.inference import Inference, runtime_of
 from ufmstar_torch.models.load import DIRECTORIES, load_network, network_names
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.trained import load_trained, read_info
@@ -24,7 +25,8 @@ from ufmstar_torch.pipeline import NetworksInTurn
 
 TRUTH = "ground-truth"
 _FORM = "BASE=MODEL:FILE[,FILE...]"
-_VERSION = 2  # of the digests: raise it where predictions from the same files change
+_CPU, _AS_USERS = torch.device("cpu"), Inference()
+_VERSION = 3  # of the digests: raise it where predictions from the same files change
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,9 @@ class NetworkChoice:
         """(h, w) to which ground truth is brought; None = as it is."""
         return parse_size(self.files[0]) if self.model == TRUTH and self.files else None
 
-    def load(self, device: torch.device, *, samples: int = SAMPLES) -> NetworkSource | MapSource:
+    def load(
+        self, device: torch.device, *, samples: int = SAMPLES, inference: Inference = _AS_USERS
+    ) -> NetworkSource | MapSource:
         """The depth source.
 
         An ensemble's or BatchEnsemble's members take turns: image i is member i mod N's. MC-Dropout draws one sample
@@ -105,6 +109,7 @@ class NetworkChoice:
         Args:
             device: where networks run.
             samples: MC-Dropout's, on every image where a row asks for all.
+            inference: runtime and precision.
 
         Raises:
             FileNotFoundError: a file is missing.
@@ -115,15 +120,17 @@ class NetworkChoice:
             label = self.label or "ground truth"
             identity: dict[str, Any] = {"model": TRUTH, "label": label, "size": self.size}
             return own_depth(self.size, identity, label=label, digest=_digest(identity))
-        members, sampling = self._members(), self.base == "mc_dropout"
+        members, sampling = self._members(inference, device), self.base == "mc_dropout"
         check_members(self.base, members, device)
         files = [_identity(file) for file in self.weights]
         spec = None if self.spec is None else sha256(Path(self.spec))
+        run_by = _run_by(members, inference)
         made_of = {"model": self.model, "files": [file | {"name": None} for file in files], "spec": spec}
         drawn = {"samples": samples} if sampling else {}
         label = self.label or _label(self.model, Path(_path(self.weights[0])[0]), members[0])
         identity = {
-            "model": self.model, "label": label, "files": files, "spec": spec, "members": len(members), **drawn,
+            "model": self.model, "label": label, "files": files, "spec": spec, "members": len(members),
+            **run_by, **drawn,
         }  # fmt: skip
         turns = NetworksInTurn(members, samples=samples if sampling else None, preprocess=members[0].preprocess)
         return NetworkSource(
@@ -132,16 +139,17 @@ class NetworkChoice:
             identity,
             seeding="sample" if sampling else None,
             label=label,
-            digest=_digest({**made_of, **drawn, "device": device.type, "version": _VERSION}),
+            precision=inference.precision,
+            digest=_digest({**made_of, **run_by, **drawn, "device": device.type, "version": _VERSION}),
         )
 
-    def _members(self) -> list[DepthNetwork]:
-        """The members that the files hold, in their order."""
+    def _members(self, inference: Inference, device: torch.device) -> list[DepthNetwork]:
+        """The members that the files hold, in their order, as they run."""
         try:
             members: list[DepthNetwork] = []
             for file in self.weights:
                 path, member = _path(file)
-                loaded = load_members(self.model, [path], spec=self.spec)
+                loaded = load_members(self.model, [path], spec=self.spec, inference=inference, device=device)
                 if member is not None and member >= len(loaded):
                     raise ValueError(f"{path} has {len(loaded)} members, there is no {member} (counted from 0)")
                 members += loaded if member is None else [loaded[member]]
@@ -159,7 +167,7 @@ def network_source(
     mode: str = "alternate",
     samples: int | None = None,
     offload: bool = False,
-    threads: int | None = None,
+    inference: Inference = _AS_USERS,
     device: str = "cpu",
 ) -> NetworkSource:
     """One network, or the members of an ensemble, from files, as ``ufmstar run`` runs them.
@@ -173,7 +181,7 @@ def network_source(
             passes of a network that samples).
         samples: None: as many as the paper's baseline.
         offload: of "trained": weights stay in host memory and come to the device for their turn only.
-        threads: CPU threads of ONNX Runtime; None = its own choice.
+        inference: runtime, precision and threads.
         device: "cpu", "cuda", ...
 
     Raises:
@@ -182,7 +190,8 @@ def network_source(
             of one network that does not sample, ``samples`` for any other.
     """
     files = [Path(file) for file in weights]
-    members = load_members(model, files, spec=spec, offload=offload, threads=threads)
+    where = torch.device(device)
+    members = load_members(model, files, spec=spec, offload=offload, inference=inference, device=where)
     samples = _passes(members, mode, samples)
     identity = {
         "model": model,
@@ -190,9 +199,10 @@ def network_source(
         "mode": mode,
         "samples": samples,
         "spec": None if spec is None else sha256(Path(spec)),
+        **_run_by(members, inference),
     }
     turns = NetworksInTurn(members, samples=samples, preprocess=members[0].preprocess)
-    return NetworkSource(turns, torch.device(device), identity)
+    return NetworkSource(turns, where, identity, precision=inference.precision)
 
 
 def load_members(
@@ -201,13 +211,15 @@ def load_members(
     *,
     spec: str | Path | None = None,
     offload: bool = False,
-    threads: int | None = None,
+    inference: Inference = _AS_USERS,
+    device: torch.device = _CPU,
 ) -> list[DepthNetwork]:
     """The networks in the files, in their order, in eval mode and on the CPU. They want the same input.
 
     Args:
-        model, spec, offload, threads: as :func:`network_source` has them.
+        model, spec, offload, inference: as :func:`network_source` has them.
         files: of weights.
+        device: where they will run.
 
     Raises:
         FileNotFoundError, ValueError: as :func:`network_source`.
@@ -220,26 +232,33 @@ def load_members(
     for file in [*(paths if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
         if not file.is_file():
             raise FileNotFoundError(f"no such file: {file}")
-    options: dict[str, Any] = {} if spec is None else {"spec": spec}
-    if model == "onnx" and threads is not None:
-        options["threads"] = threads
-    members = _loaded(model, paths, options, offload)
+    options = {} if spec is None else {"spec": spec}
+    members: list[DepthNetwork] = []
+    for path in paths:
+        loaded = _loaded(model, path, options | inference.options(model, device), offload)
+        members += [inference.ready(network, path, device) for network in loaded]
     _require_same_input(members)
     return members
 
 
-def _loaded(model: str, files: list[Path], options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
-    """The networks in the files.
+def _loaded(model: str, file: Path, options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
+    """The networks in a file.
 
     Raises:
         ValueError: as :func:`network_source`.
     """
     if model == "trained" and not options:
-        return load_trained(files, offload=offload)
+        return load_trained([file], offload=offload)
     try:
-        return [load_network(model, file, **options) for file in files]
+        return [load_network(model, file, **options)]
     except TypeError as error:
         raise ValueError(f"model {model!r} does not take {sorted(options)}: {error}") from error
+
+
+def _run_by(members: Iterable[DepthNetwork], inference: Inference) -> dict[str, str]:
+    """What decides about the last bits of a prediction, for the identity: runtime and precision."""
+    first = runtime_of(next(iter(members)), inference.precision)
+    return {"runtime": first["name"], "precision": inference.precision}
 
 
 def _require_same_input(members: Iterable[DepthNetwork]) -> None:

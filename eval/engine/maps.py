@@ -4,7 +4,7 @@ depth."""
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ import torch
 
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.methods.setting import CROP
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
+from ufmstar_torch.eval.sequences.own_output import own_output
 from ufmstar_torch.models.network import DepthNetwork
 
 
@@ -57,8 +59,9 @@ class MapSource:
         digest: of the identity.
     """
 
-    needs_image, cacheable, passes = False, False, 1
+    needs_image, cacheable, passes, runtime = False, False, 1, None
     networks: tuple[DepthNetwork, ...] = ()
+    max_depth: float | None = None
 
     def __init__(
         self,
@@ -72,6 +75,12 @@ class MapSource:
     ) -> None:
         self._read, self._size = read, size
         self.identity, self.is_truth, self.label, self.digest = dict(identity), is_truth, label, digest
+
+    def prepared(self, how: str) -> MapSource:
+        """Itself: maps show the whole frame; "crop" raises ValueError."""
+        if how == CROP:
+            raise ValueError(f'preprocess = "{CROP}" goes with networks: maps exist already')
+        return self
 
     def turn(self, position: int) -> int:
         """0: maps have no members."""
@@ -96,36 +105,50 @@ def folder_source(
     scale: float | None = None,
     intrinsics: IntrinsicsLike | None = None,
     size: Size | None = None,
+    indices: Sequence[int] | None = None,
 ) -> MapSource:
     """Maps that another program predicted for the frames of a sequence (see :class:`DepthFolder`).
 
     Without ``intrinsics``, the maps must show the whole image; theirs are then the image's, scaled by the
-    sizes' ratio.
+    sizes' ratio. The output folder of a run brings its own intrinsics; a frame that the run skipped has no map.
 
     Args:
         sequence: the frames.
         folder, scale, variance: as :class:`DepthFolder` takes them.
         intrinsics: of the maps [px], where the network saw a part of the image.
         size: see :class:`MapSource`.
+        indices: the frames whose maps are wanted; None = all.
 
     Raises:
         NotADirectoryError: no such folder.
         ValueError: no maps, maps that fit no frame, or (the first one) of another aspect ratio than the images.
     """
-    maps = DepthFolder(folder, scale, variance).for_frames(sequence.names, sequence.names_on_disk)
+    own = own_output(Path(folder))
+    chosen = range(len(sequence)) if indices is None else indices
+    selected = [name for index in chosen if (name := sequence.names[index]) not in (own.skipped if own else ())]
+    if not selected:
+        raise ValueError(f"{folder}: none of the {len(chosen)} frames has a map")
+    place = DepthFolder(own.frames if own else folder, scale, variance)
+    maps = place.for_frames(sequence.names, sequence.names_on_disk, selected)
+    number = {name: i for i, name in enumerate(selected)}
     K_given = None if intrinsics is None else read_intrinsics(intrinsics)
 
     def read(frame: Frame) -> PredictedMap:
-        depth, spread = maps[frame.index]
+        if frame.name not in number:
+            raise FrameError(frame.name, f"skipped in {folder}: {own.skipped[frame.name]}" if own else "no map")
+        file = maps.depth_files[number[frame.name]]
+        depth, spread = maps[number[frame.name]]
         if K_given is not None:
             return PredictedMap(depth, spread, K_given)
+        if own is not None and file.stem in own.intrinsics:
+            return PredictedMap(depth, spread, own.intrinsics[file.stem])
         try:
             K = scaled_to_map(frame.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
         except ValueError as error:
-            raise FrameError(maps.depth_files[frame.index], _cropped(sequence, depth)) from error
+            raise FrameError(file, _cropped(sequence, depth)) from error
         return PredictedMap(depth, spread, K)
 
-    _check_first(sequence, maps, K_given is not None)
+    _check_first(sequence, maps, K_given is not None or own is not None)
     files = (*maps.depth_files, *maps.variance_files)
     listing = "\n".join(f"{file.name} {file.stat().st_size}" for file in files)
     identity = {
@@ -154,7 +177,7 @@ def _cropped(sequence: FrameSequence, depth: np.ndarray) -> str:
     height, width = sequence.image_size or (0, 0)
     return (
         f"the map is {depth.shape[1]}x{depth.shape[0]}, the images are {width}x{height}: it does not show the whole "
-        "image, so its own intrinsics must be given"
+        "image: give the intrinsics of the maps, --map-intrinsics"
     )
 
 

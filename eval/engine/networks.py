@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, cast
 
@@ -10,11 +12,14 @@ from torch import Tensor, nn
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.methods.setting import OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import LazyMember
+from ufmstar_torch.models.inference import BF16, runtime_of
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.pipeline import NetworksInTurn
 
 # Sample n of frame i is seeded by i + 1,000,003 n: another seed for every pair as long as a sequence has fewer
@@ -32,6 +37,7 @@ class NetworkSource:
         seeding: of decoder dropout. "frame": by the frame's index, once for all its passes, so that a continued run
             draws the same. "sample": by the frame's index and the number of the sample, so that a sample is the same
             whatever ran before. None: the networks draw nothing.
+        precision: of the inference, as ``Inference.precision``; predictions are of single precision in any case.
         label: as tables show it.
         digest: distinguishes these networks from others in a store; "" = their predictions are not stored.
     """
@@ -45,12 +51,13 @@ class NetworkSource:
         identity: Mapping[str, Any],
         *,
         seeding: Literal["frame", "sample"] | None = "frame",
+        precision: str = "float32",
         label: str = "",
         digest: str = "",
     ) -> None:
         self._turns = networks.to(device)
         self._members = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
-        self._device, self._seeding = device, seeding
+        self._device, self._seeding, self._precision = device, seeding, precision
         self.identity, self.label, self.digest = dict(identity), label, digest
         self._timer = StageTimer(device)
         self._generator = torch.Generator(device)
@@ -64,9 +71,40 @@ class NetworkSource:
         return self._members
 
     @property
+    def max_depth(self) -> float | None:
+        """[m] The largest depth that the members can predict, where each of them states one."""
+        return self._turns.max_depth
+
+    @property
+    def runtime(self) -> Mapping[str, Any]:
+        """What runs the networks: name, version, threads, precision."""
+        return runtime_of(self._members[0], self._precision)
+
+    @property
     def passes(self) -> int:
         """Inferences that all members, or all samples, take."""
         return self._turns.passes
+
+    def prepared(self, how: str) -> NetworkSource:
+        """The same networks, which draw from the same generator, on images that are prepared otherwise.
+
+        Raises:
+            ValueError: the networks do not declare their input by a ``Preprocess``.
+        """
+        own = self._turns.preprocess
+        if how == OF_NETWORK:
+            return self
+        if not isinstance(own, Preprocess):
+            raise ValueError(f'preprocess = "{how}" needs networks that declare their input by a Preprocess')
+        changed = own.of_whole_frame() if how == RESIZE else own.of_nyu_crop()
+        if changed == own:
+            return self
+        other = copy.copy(self)
+        other._turns = NetworksInTurn(self._members, samples=self._turns.samples, preprocess=changed)
+        other._input, other._timer = None, StageTimer(self._device)
+        other.identity = {**self.identity, "preprocess": how}
+        other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
+        return other
 
     @property
     def cacheable(self) -> bool:
@@ -87,9 +125,14 @@ class NetworkSource:
             x, K = self._prepared(frame)
             if self._seeding == "sample":
                 self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
-            with self._timer.stage("network"):
+            reduced = self._precision == BF16
+            with (
+                self._timer.stage("network"),
+                torch.autocast(self._device.type, torch.bfloat16, enabled=reduced),
+            ):
                 prediction = self._turns.member(x, K, n)
-            return Prediction.of(prediction, K[0], self._timer.take()["network"])
+            made = Prediction.of(prediction, K[0], self._timer.take()["network"])
+            return made.to(torch.float32) if reduced else made
 
     def _prepared(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3]; once for all members."""

@@ -97,6 +97,8 @@ class DepthSource(Protocol):
         needs_image: whether it predicts from the image; from the depth map otherwise.
         cacheable: whether a store may keep its predictions. They are then of single precision, read or computed.
         is_truth: whether it is the sequence's own depth, which has no error.
+        max_depth: [m] the largest depth that its networks can predict; None where it is not known.
+        runtime: what runs the networks, for the record: name, version, threads, precision; None of maps.
     """
 
     @property
@@ -115,6 +117,18 @@ class DepthSource(Protocol):
     def cacheable(self) -> bool: ...
     @property
     def is_truth(self) -> bool: ...
+    @property
+    def max_depth(self) -> float | None: ...
+    @property
+    def runtime(self) -> Mapping[str, Any] | None: ...
+
+    def prepared(self, how: str) -> DepthSource:
+        """The same source with its images prepared as ``Setting.preprocess`` says; itself where that is no change.
+
+        Raises:
+            ValueError: there are no images to prepare.
+        """
+        ...
 
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""

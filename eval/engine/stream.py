@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.eval.engine.ahead import FramesAhead
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
@@ -37,7 +38,9 @@ class FrameResult:
         frame: as it was read; None where no row selects it, or it cannot be used.
         rows: by key, of the rows that have taken it in.
         skipped: by key, why a row that selects the frame cannot use it.
-        ms: "read", "predict" and "truth", and the stages of the sinks that came before [ms].
+        ms: "read" (what was left to wait for: frames are read ahead), "predict" and "truth", and the stages of the
+            sinks that came before [ms].
+        state: the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
     """
 
     number: int
@@ -47,6 +50,7 @@ class FrameResult:
     rows: Mapping[str, RowFrame] = field(default_factory=dict)
     skipped: Mapping[str, str] = field(default_factory=dict)
     ms: dict[str, float] = field(default_factory=dict)
+    state: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 class Sink(Protocol):
@@ -135,17 +139,18 @@ class FrameStream:
         """
         for sink in sinks:
             sink.begin(self)
-        while self.position < len(self.indices):
-            if stop():
-                raise Stopped
-            result = self._next()
-            for sink in sinks:
-                if sink.stage is None:
-                    sink.take(result)
-                    continue
-                with self._timer.stage(sink.stage):
-                    sink.take(result)
-                result.ms.update(self._timer.take())
+        with FramesAhead(self.sequence, self._needed()) as frames:
+            while self.position < len(self.indices):
+                if stop():
+                    raise Stopped
+                result = self._next(frames)
+                for sink in sinks:
+                    if sink.stage is None:
+                        sink.take(result)
+                        continue
+                    with self._timer.stage(sink.stage):
+                        sink.take(result)
+                    result.ms.update(self._timer.take())
         for sink in sinks:
             sink.end()
 
@@ -163,7 +168,12 @@ class FrameStream:
             prefix = f"{row.key}/"
             row.load_state({name[len(prefix) :]: v for name, v in state.items() if name.startswith(prefix)})
 
-    def _next(self) -> FrameResult:
+    def _needed(self) -> list[int]:
+        """Of the frames that are left, those that a row selects; without rows all."""
+        left = range(self.position, len(self.indices))
+        return [self.indices[n] for n in left if not self.rows or any(row.selects(n) for row in self.rows)]
+
+    def _next(self, frames: FramesAhead) -> FrameResult:
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if row.selects(number)]
@@ -172,7 +182,7 @@ class FrameStream:
         if self.rows and not active:
             return FrameResult(number, index, name)
         try:
-            frame, predictions, truths = self._inputs(index, active)
+            frame, predictions, truths = self._inputs(frames, active)
         except FrameError as error:
             if not self.rows:
                 raise
@@ -188,7 +198,7 @@ class FrameStream:
         return FrameResult(number, index, name, frame, taken, skipped, ms)
 
     def _inputs(
-        self, index: int, active: Sequence[RowRunner]
+        self, frames: FramesAhead, active: Sequence[RowRunner]
     ) -> tuple[Frame, dict[str, Prediction], dict[str, NDArray[np.float32] | None]]:
         """The frame, and by row what is predicted for it and its ground truth.
 
@@ -196,7 +206,7 @@ class FrameStream:
             FrameError: the frame cannot be used.
         """
         with self._timer.stage("read"):
-            frame = self.sequence[index]
+            frame = frames.next()
             if self._check is not None:
                 self._check(frame)
         with self._timer.stage("predict"):

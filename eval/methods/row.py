@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting
+from ufmstar_torch.recalibrate import split_name
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """The method's name, and what is made of tracked corners: "UfM*-Anchored-Ensemble", "UfM*-Posterior-Ensemble"."""
+        """The method's name, and what tracked corners serve: "UfM*-Anchored-Ensemble", "UfM*-Posterior-Ensemble"."""
         if self.setting.anchors != TRACKED:
             return self.method.name
         kind = "Posterior" if self.setting.posterior else "Anchored"
@@ -39,6 +42,8 @@ class Row:
     def changed(self) -> dict[str, Any]:
         """Settings that are not the default, but for what is part of ``name``."""
         values = self.setting.to_dict()
+        if self.setting.recalibration:  # without the folder
+            values["recalibration"] = Path(split_name(self.setting.recalibration)[0]).name
         named = {"anchors", "posterior"} if self.setting.anchors == TRACKED else set()
         return {name: value for name, value in values.items() if name not in named}
 
@@ -48,6 +53,20 @@ class Row:
         changed = ", ".join(f"{name} {value}" for name, value in self.changed.items())
         return f"{self.name} ({changed})" if changed else self.name
 
+    @property
+    def base_line(self) -> Row:
+        """The same method with the same preset and preprocessing, and nothing varied."""
+        return Row(self.method, self.setting.chosen)
+
     def to_dict(self) -> dict[str, Any]:
         """The row as plain values, as eval.json has it."""
         return {"method": self.method.name, "setting": self.setting.to_dict()}
+
+
+def plain_rows(rows: Iterable[Row]) -> list[Row]:
+    """Of each method the first row that no ablation varies; of the paper's suites that with the paper's settings."""
+    first: dict[Method, Row] = {}
+    for row in rows:
+        if row.setting.plain:
+            first.setdefault(row.method, row)
+    return list(first.values())

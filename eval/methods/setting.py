@@ -1,4 +1,4 @@
-"""What an ablation changes about a row: settings of UfM*, noise on the poses, frames left out, anchors.
+"""What is chosen and changed about a row: settings of UfM*, preprocessing, noise on poses, frames left out, anchors.
 
 A setting's values have flat names: ``Setting``'s own fields, and those of ``UfMStarConfig``, as "segment.min_pixels".
 """
@@ -9,21 +9,32 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any
 
+from ufmstar_torch.anchors.landmarks import DENSE, FILE_TYPES
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.config import UfMStarConfig
 
 TRACKED, TRUTH = "tracked", "truth"
+DEFAULTS, PAPER = "default", "paper"
+# How an image comes to the network's input.
+OF_NETWORK, RESIZE, CROP = "network", "resize", "crop"
 _OF_POSES = ("rotation_noise", "translation_noise", "rotation_drift", "translation_drift")
 
 
 @dataclass(frozen=True)
 class Setting(Checked):
-    """One point of an ablation; the default is the row as the paper runs it.
+    """One point of an ablation; the default is the row with UfM*'s defaults and the network's own preprocessing.
 
     Attributes:
+        ufm_preset: from which UfM*'s settings start: "default", or "paper" (``UfMStarConfig.paper``).
+        preprocess: how an image comes to the network's input: "network", as its weights declare; "resize", the whole
+            frame, each axis by its own factor, as the paper's loader of ScanNet does; "crop", the centre as NYU's
+            validation. The input's size, colours and range stay the network's.
+        aleatoric_in_h: UfM* keeps the aleatoric variance in its mixture (H of the section "Gaussian mixture model"),
+            and reads it back instead of the pixel's own; see ``engine.estimators``.
         overrides: of ``UfMStarConfig`` by dotted name, as {"ema_alpha": 1.0, "segment.min_pixels": 2000}.
         rotation_noise: standard deviation of each component of a rotation vector that is added to a pose [deg].
         translation_noise: the same of each component of the position [m].
@@ -32,31 +43,41 @@ class Setting(Checked):
         skip: images left out between two that are used; the paper's skip interval, 0 = consecutive ones.
         seed: of everything that is drawn: noise, and which anchors are taken.
         anchors: what UfM* is anchored by (``UfMStarConfig.anchored`` follows): "" nothing; "tracked": corners of the
-            images, triangulated with the row's poses; "truth": ground truth at pixels drawn at random, the upper bound.
+            images, triangulated with the row's poses; "dense": dense evidence, likewise; "truth": ground truth at
+            pixels drawn at random, the upper bound; or a file of landmarks in the folder of each sequence, see
+            ``ufmstar_torch.anchors.LandmarkMap.read``.
         anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
         posterior: judge the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
+        recalibration: FILE or FILE@DIGEST of a map of the variance (``ufmstar recalibrate``); "" = none.
 
     Raises:
         ValueError: a value is out of range, or they do not go together.
     """
 
     overrides: Mapping[str, Any] = field(default_factory=dict)
+    ufm_preset: str = choice(DEFAULTS, PAPER)
+    preprocess: str = choice(OF_NETWORK, RESIZE, CROP)
+    aleatoric_in_h: bool = False
     rotation_noise: float = number(0.0, "", "deg", 0.0, open_high=True)
     translation_noise: float = number(0.0, "", "m", 0.0, open_high=True)
     rotation_drift: float = number(0.0, "", "deg", 0.0, open_high=True)
     translation_drift: float = number(0.0, "", "m", 0.0, open_high=True)
     skip: int = number(0, "", "1", 0)
     seed: int = number(0, "", "1", 0)
-    anchors: str = choice("", TRACKED, TRUTH)
+    anchors: str = ""
     anchor_count: int | None = number(None, "", "1", 0)
     track_noise: float = number(0.0, "", "px", 0.0, open_high=True)
     corrected: bool = False
     posterior: bool = False
+    recalibration: str = ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.anchors not in ("", TRACKED, DENSE, TRUTH) and not str(self.anchors).lower().endswith(FILE_TYPES):
+            known = f"{TRACKED!r}, {DENSE!r}, {TRUTH!r} or a file {', '.join(FILE_TYPES)}"
+            raise ValueError(f"Setting.anchors must be {known}, got {self.anchors!r}")
         count = self.anchor_count
         if count is not None and not isinstance(count, int):
             raise ValueError(f"Setting.anchor_count must be a whole number, got {count!r}")
@@ -68,6 +89,8 @@ class Setting(Checked):
             raise ValueError('track_noise goes with anchors = "tracked"')
         if "anchored" in self.overrides:
             raise ValueError('anchored follows from anchors: set anchors = "tracked" or "truth"')
+        if self.aleatoric_in_h and (self.anchors or self.overrides.keys() & {"features", "add_aleatoric"}):
+            raise ValueError("aleatoric_in_h goes without anchors, features and add_aleatoric")
         object.__setattr__(self, "overrides", MappingProxyType(dict(sorted(self.overrides.items()))))
 
     def __hash__(self) -> int:
@@ -78,6 +101,22 @@ class Setting(Checked):
         own = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}
         changed = {name: getattr(self, name) for name, plain in own.items() if getattr(self, name) != plain}
         return {**dict(self.overrides), **changed, **({"seed": self.seed} if self.draws else {})}
+
+    @property
+    def chosen(self) -> Setting:
+        """What is chosen and not varied: the preset and the preprocessing alone."""
+        return Setting(ufm_preset=self.ufm_preset, preprocess=self.preprocess)
+
+    @property
+    def plain(self) -> bool:
+        """Whether no ablation varies anything."""
+        return self == self.chosen
+
+    @property
+    def of_ufm_star(self) -> tuple[str, ...]:
+        """Names of what is changed of UfM*, which other methods do without."""
+        own = ("ufm_preset",) if self.ufm_preset != DEFAULTS else ()
+        return (*self.overrides, *own, *(("aleatoric_in_h",) if self.aleatoric_in_h else ()))
 
     @property
     def draws(self) -> bool:
@@ -107,14 +146,15 @@ _OWN = tuple(f.name for f in fields(Setting) if f.name != "overrides")
 def setting_from(values: Mapping[str, Any]) -> Setting:
     """A setting from the flat form of ``Setting.to_dict``.
 
-    Values that UfM* has anyway are left out, so that such a row is the default one.
+    Values that UfM* has anyway, by the preset, are left out, so that such a row is the plain one.
 
     Raises:
         ValueError: an unknown name, or a value that it does not take.
     """
     own = {name: value for name, value in values.items() if name in _OWN}
     overrides = {name: value for name, value in values.items() if name not in _OWN}
-    changed = {name: value for name, value in overrides.items() if value != default_of(name)}
+    preset = own.get("ufm_preset", DEFAULTS)
+    changed = {name: value for name, value in overrides.items() if value != default_of(name, preset)}
     setting = Setting(overrides=changed, **own)
     configured(setting)
     return setting
@@ -126,22 +166,30 @@ def value_of(setting: Mapping[str, Any], name: str) -> Any:
     Raises:
         ValueError: an unknown name.
     """
-    return setting[name] if name in setting else default_of(name)
+    return setting[name] if name in setting else default_of(name, setting.get("ufm_preset", DEFAULTS))
 
 
-def default_of(name: str) -> Any:
-    """The value that a row has as the paper runs it.
+def default_of(name: str, preset: str = DEFAULTS) -> Any:
+    """The value that a row has where nothing is changed.
+
+    Args:
+        name: of a setting.
+        preset: from which UfM*'s settings start.
 
     Raises:
-        ValueError: no setting has the name.
+        ValueError: no setting has the name, or there is no such preset.
     """
     if name in _OWN:
         return getattr(DEFAULT, name)
-    value: Any = UfMStarConfig()
+    value: Any = _start(preset)
     for part in name.split("."):
         if not is_dataclass(value) or part not in {f.name for f in fields(value)}:
-            known = ", ".join(own for own in _OWN if own != "seed")
-            raise ValueError(f"no setting is called {name!r}: expected {known}, or UfM*'s own, as ema_alpha")
+            known = [own for own in _OWN if own != "seed"]
+            near = get_close_matches(name, [*known, *_names(_start(preset))], n=1)
+            meant = f"; did you mean {near[0]}?" if near else ""
+            raise ValueError(
+                f"no setting is called {name!r}: expected {', '.join(known)}, or UfM*'s own, as ema_alpha{meant}"
+            )
         value = getattr(value, part)
     if is_dataclass(value):
         raise ValueError(f"setting {name!r} is a group: name one of its values, as {name}.min_pixels")
@@ -159,9 +207,27 @@ def configured(setting: Setting) -> UfMStarConfig:
         default_of(name)
         group, _, field = name.rpartition(".")
         (nested.setdefault(group, {}) if group else nested)[field] = value
-    config = UfMStarConfig(anchored=bool(setting.anchors), posterior=setting.posterior)
+    config = _start(setting.ufm_preset).replace(anchored=bool(setting.anchors), posterior=setting.posterior)
+    if setting.aleatoric_in_h:
+        config = config.replace(features=2, add_aleatoric=False)
     groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}
     return config.replace(**{name: value for name, value in nested.items() if not _group(value)}, **groups)
+
+
+def _start(preset: str) -> UfMStarConfig:
+    """UfM*'s settings of a preset; another name raises ValueError."""
+    if preset not in (DEFAULTS, PAPER):
+        raise ValueError(f"ufm_preset must be {DEFAULTS} or {PAPER}, got {preset!r}")
+    return UfMStarConfig.paper() if preset == PAPER else UfMStarConfig()
+
+
+def _names(config: Any, prefix: str = "") -> list[str]:
+    """The dotted names of all fields of a settings class that hold a value."""
+    names: list[str] = []
+    for f in fields(config):
+        value = getattr(config, f.name)
+        names += _names(value, f"{prefix}{f.name}.") if is_dataclass(value) else [f"{prefix}{f.name}"]
+    return names
 
 
 def _group(value: Any) -> bool:

@@ -14,7 +14,7 @@ methods = ["{alone}", "UfM*-{behind}"]     # as the paper names them: "Ensemble"
 [[rows]]
 bases = ["ensemble"]                       # of no other base
 methods = ["UfM*-{behind}"]
-setting = { "segment.min_pixels" = 2000 }  # of UfM*, or of ``Setting``: rotation_noise [deg], skip, anchors ...
+setting = { "segment.min_pixels" = 2000 }  # of UfM*, or of ``Setting``: ufm_preset, preprocess, rotation_noise ...
 each = { ema_alpha = [0.1, 0.25, 1.0] }    # one row for every value
 multiples = { eta = [0.5, 2.0] }           # likewise, of UfM*'s own value
 ```
@@ -36,7 +36,7 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
+from ufmstar_torch.eval.methods.setting import DEFAULT, DEFAULTS, Setting, configured, default_of, setting_from
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
@@ -143,12 +143,14 @@ def listing() -> str:
     return "\n".join(f"{suite.name:26}{len(suite.rows):3} rows  {suite.title}" for suite in suites)
 
 
-def suite_named(name: str, base: str | None = None) -> Suite:
+def suite_named(name: str, base: str | None = None, preset: str | None = None) -> Suite:
     r"""Read a suite.
 
     Args:
         name: one of ``names()``, or a TOML file (\*.toml).
         base: the network that a figure or ablation is about, instead of its own; a key of ``method.BASES``.
+        preset: where UfM*'s settings start in all rows of UfM*, "paper" or "default"; None = as the suite has it. What
+            rows change beside it stays.
 
     Raises:
         FileNotFoundError: no such file.
@@ -162,7 +164,7 @@ def suite_named(name: str, base: str | None = None) -> Suite:
         values = _read(name)
         if base is not None and "base" not in values:
             raise ValueError("--base goes with figures and ablations of one network, the suite names its own")
-        rows = tuple(dict.fromkeys(_rows_of(values, base or values.get("base"))))
+        rows = tuple(dict.fromkeys(_rows_of(values, base or values.get("base"), preset)))
         own = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
@@ -175,11 +177,13 @@ def suite_named(name: str, base: str | None = None) -> Suite:
 
 def check_row(row: Row) -> None:
     """Raises ValueError unless the setting changes something of the method, in a way that it takes."""
-    if row.setting.overrides and row.method.fusion != UFM_STAR:
-        names = ", ".join(row.setting.overrides)
+    if row.setting.of_ufm_star and row.method.fusion != UFM_STAR:
+        names = ", ".join(row.setting.of_ufm_star)
         raise ValueError(f"row {row.method.name}: {names} is of UfM*, which the row does without")
     if row.setting.anchors and row.method.fusion != UFM_STAR:
         raise ValueError(f"row {row.method.name}: anchors are of UfM*, which the row does without")
+    if row.setting.aleatoric_in_h and not row.method.uses_aleatoric:
+        raise ValueError(f"row {row.method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
     configured(row.setting)
 
 
@@ -218,17 +222,17 @@ def _read(name: str) -> dict[str, Any]:
     return values
 
 
-def _rows_of(values: Mapping[str, Any], base: str | None) -> Iterator[Row]:
+def _rows_of(values: Mapping[str, Any], base: str | None, preset: str | None) -> Iterator[Row]:
     """The rows of a suite and of those that it includes, for a base or for the suite's own bases."""
     for own in values.get("bases", [base]):
         for n, part in enumerate(values.get("rows", [])):
             _check(part, _ROW_KEYS, f"rows {n + 1}")
             try:
-                yield from _expanded(part, own)
+                yield from _expanded(part, own, preset)
             except ValueError as error:
                 raise ValueError(f"rows {n + 1}: {error}") from error
     for name in values.get("include", []):
-        yield from _rows_of(_read(name), base)
+        yield from _rows_of(_read(name), base, preset)
 
 
 def _sweep(values: Mapping[str, Any]) -> Iterator[str]:
@@ -237,7 +241,7 @@ def _sweep(values: Mapping[str, Any]) -> Iterator[str]:
         yield from _sweep(_read(name))
 
 
-def _expanded(part: Any, base: str | None) -> Iterator[Row]:
+def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
     """The rows of one [[rows]]: every method at every point."""
     methods = _words(part, "methods")
     if not methods:
@@ -250,11 +254,15 @@ def _expanded(part: Any, base: str | None) -> Iterator[Row]:
         for name, points in part.get(kind, {}).items():
             if not isinstance(points, list) or not points:
                 raise ValueError(f"{kind}.{name} must be a list of values, got {points!r}")
-            ranges[name] = points if kind == "each" else [factor * default_of(name) for factor in points]
+            start = preset or part.get("setting", {}).get("ufm_preset", DEFAULTS)
+            ranges[name] = points if kind == "each" else [factor * default_of(name, start) for factor in points]
     if base is not None and base not in _words(part, "bases", (base,)):
         return
     for point in itertools.product(*ranges.values()):
-        yield from rows_of(methods, setting_from({**part.get("setting", {}), **dict(zip(ranges, point, strict=True))}))
+        setting = {**part.get("setting", {}), **dict(zip(ranges, point, strict=True))}
+        for method in map(Method.parse, methods):
+            started = {"ufm_preset": preset} if preset is not None and method.fusion == UFM_STAR else {}
+            yield Row(method, setting_from(setting | started))
 
 
 def _check(values: Any, kinds: Mapping[str, type], where: str) -> None:

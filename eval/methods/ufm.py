@@ -7,18 +7,20 @@ hundred Gaussians, UfM keeps every pixel it has ever seen as a point: 40 bytes e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.camera import relative_pose
+from ufmstar_torch.camera import relative_pose, rotation_deviation
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.eval.methods.ufm_cloud import MOMENTS, Cloud, Taken, View, take_in
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.stateful import StatefulModule, full_precision
 
+# [1] Share by which a covariance may exceed the bound of Cauchy and Schwarz.
+_ROUNDING = 1e-2
 _STATE = ("moments", "count", "points", "T_world_first", "started", "frames", "skipped")
 
 
@@ -122,6 +124,7 @@ class UfM(StatefulModule):
     """
 
     STATE = _STATE
+    CONFIG = UfMConfig
     config: UfMConfig
     moments: Tensor
     count: Tensor
@@ -220,6 +223,9 @@ class UfM(StatefulModule):
                 kept[name] = torch.where(keep.view(-1, *[1] * (old.dim() - 1)), old, fresh[name])
             self._store(kept)
 
+    def _require_state(self, state: Mapping[str, Tensor]) -> None:
+        require_state(state, self.config.max_points)
+
     def _advance(self, frame: FrameInput) -> tuple[Tensor, UfMStatistics]:
         """One frame, whose state is stored when all streams are through; variance [B, H, W]."""
         clouds, state = self._streams(frame)
@@ -276,6 +282,48 @@ class UfM(StatefulModule):
     def extra_repr(self) -> str:
         """Streams and points."""
         return f"streams={len(self.points)}, points={self.points.tolist()}, max_points={self.config.max_points}"
+
+
+def require_state(state: Mapping[str, Tensor], max_points: int | None) -> None:
+    """Check tensors that come from elsewhere, a checkpoint say, before they become the state of UfM.
+
+    Raises:
+        ValueError: shapes that do not fit each other; values that are not finite or out of their range; covariances
+            that no points have; more points of a stream than ``max_points``.
+    """
+    if state["moments"].dim() != 2 or state["points"].dim() != 1:
+        raise ValueError(f"moments must be [N, {MOMENTS}] and points [B]")
+    n, b = len(state["moments"]), len(state["points"])
+    shapes = {
+        "moments": (n, MOMENTS), "count": (n,), "points": (b,), "T_world_first": (b, 4, 4), "started": (b,),
+        "frames": (b,), "skipped": (b,),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if (given := tuple(state[name].shape)) != shape:
+            raise ValueError(f"{name} must have shape {shape}, got {given}")
+    if state["moments"].device.type == "meta":
+        return
+    for name in ("points", "frames", "skipped"):
+        if bool((state[name] < 0).any()):
+            raise ValueError(f"{name} holds negative values")
+    if int(state["points"].sum()) != n:
+        raise ValueError(f"points must add up to the {n} rows of moments, got {int(state['points'].sum())}")
+    if max_points is not None and b and int(state["points"].max()) > max_points:
+        raise ValueError(f"points: {int(state['points'].max())} exceed max_points = {max_points}")
+    if bool((state["count"] < 1).any()):
+        raise ValueError("count must be at least 1")
+    for name in ("moments", "T_world_first"):
+        if not bool(state[name].isfinite().all()):
+            raise ValueError(f"{name} holds NaN or infinity")
+    covariance = Cloud(state["moments"].double(), state["count"]).covariance
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    # |cov(x, y)| <= sqrt(var x var y), up to what float32 rounds away over many fusions.
+    bound = (1 + _ROUNDING) * (variance[:, :, None] * variance[:, None, :]).sqrt()
+    if bool((variance < 0).any()) or bool((covariance.abs() > bound + torch.finfo(torch.float32).tiny).any()):
+        raise ValueError("moments hold covariances that are none")
+    R = state["T_world_first"][:, :3, :3]
+    if b and float(rotation_deviation(R).max()) > 1e-6:
+        raise ValueError("T_world_first holds matrices that are not rigid")
 
 
 def _empty(streams: int, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:

@@ -53,7 +53,7 @@ class ECEDelta(SumMetric):
 
     Args:
         delta: half-width of the interval relative to the depth; the paper's .25.
-        bins: B; the paper names none, 10 here.
+        bins: B; the paper names none, 10 here; the authors' 100.
     """
 
     confidence: Tensor
@@ -114,7 +114,8 @@ class ECEQuantile(SumMetric):
     ``compute()``: ``ece_q``, NaN without a pixel; curve [B] ``ece_q_levels``, ``ece_q_observed``.
 
     Args:
-        levels: q_b, rising, within (0, 1); None = .05, .15, ..., .95 (B = 10, which the paper leaves open).
+        levels: q_b, rising, within [0, 1]; None = .05, .15, ..., .95 (B = 10, which the paper leaves open); the
+            authors' 0, .01, ..., 1, of which the ends are right by definition.
     """
 
     at_or_below: Tensor
@@ -122,8 +123,8 @@ class ECEQuantile(SumMetric):
 
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
         q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
-        if q.numel() == 0 or not bool(((q > 0) & (q < 1)).all() and (q.diff() > 0).all()):
-            raise ValueError(f"levels must rise within (0, 1), got {levels}")
+        if q.numel() == 0 or not bool(((q >= 0) & (q <= 1)).all() and (q.diff() > 0).all()):
+            raise ValueError(f"levels must rise within [0, 1], got {levels}")
         super().__init__({"levels": q.tolist()}, **kwargs)
         self.levels, self.thresholds = q, torch.special.ndtri(q)
         self.add_count("at_or_below", q.numel())

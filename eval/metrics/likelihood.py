@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixels import Pixels, require_variance, select_pixels
+from ufmstar_torch.eval.metrics.pixels import Pixels, check_maps, require_variance, select_pixels
 
 
 def gaussian_nll(depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
@@ -67,7 +67,7 @@ def _entropy_update(variance: Tensor, edges: Tensor) -> Tensor:
 
 
 class EntropyHistogram(SumMetric):
-    """Histogram of the predictive entropy 0.5 ln(2 pi e v) over the pixels with valid ground truth.
+    """Histogram of the predictive entropy 0.5 ln(2 pi e v) over all predicted pixels, with ground truth or without.
 
     ``compute()``: ``entropy_counts`` [bins + 2], first and last = under and over the range (v = 0 lies
     under it); ``entropy_edges`` [bins + 1] [nats]; ``entropy`` the mean over v > 0.
@@ -92,8 +92,11 @@ class EntropyHistogram(SumMetric):
         self.add_count("pixels")
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
-        v = select_pixels(depth, require_variance(variance, "the entropy"), target, valid).variance
+        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the target is unused."""
+        variance = require_variance(variance, "the entropy")
+        check_maps(depth, variance, target, valid)
+        predicted = torch.isfinite(depth) & torch.isfinite(variance) & (variance >= 0)
+        v = variance.detach()[predicted if valid is None else predicted & valid].double()
         positive = v[v > 0]
         counts = _entropy_update(v, self.edges.to(v.device))
         total = gaussian_entropy(positive).sum()

@@ -76,7 +76,7 @@ def check_maps(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Te
 
 
 def require_variance(variance: Tensor | None, metric: str) -> Tensor:
-    """The variance, or a ValueError that says who needs it."""
+    """The variance, or a ValueError that names the metric."""
     if variance is None:
         raise ValueError(f"variance must be given: {metric} judges the predicted distribution N(depth, variance)")
     return variance

@@ -17,7 +17,7 @@ from ufmstar_torch.eval.metrics.base import SumMetric
 from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
 from ufmstar_torch.eval.metrics.pixels import require_variance, select_pixels
 
-# Variances and squared errors [m^2] between (0.1 mm)^2 and (100 m)^2 are told apart; 0 and what is
+# Variances and squared errors [m^2] between (0.1 mm)^2 and (100 m)^2 are distinguished; 0 and what is
 # smaller share the bin below, what is larger the bin above. Relative errors use the same bins.
 LOW, HIGH = 1e-8, 1e4
 
@@ -224,5 +224,5 @@ class NLLByError(SumMetric):
 
 
 def confident(variance: Tensor, threshold: float) -> Tensor:
-    """[...] bool, where a method says sigma <= threshold [m] (NaN: False); for ``NLLByError``'s ``valid``."""
+    """[...] bool, where a method states sigma <= threshold [m] (NaN: False); for ``NLLByError``'s ``valid``."""
     return variance <= threshold**2

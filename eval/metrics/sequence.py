@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -13,6 +14,11 @@ from ufmstar_torch.eval.metrics.calibration import ECEDelta, ECEQuantile
 from ufmstar_torch.eval.metrics.likelihood import NLL, EntropyHistogram
 from ufmstar_torch.eval.metrics.pixels import check_maps, truth_mask
 from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelation
+
+OURS, AUTHORS = "ours", "authors"
+BINS = (OURS, AUTHORS)
+_LEVELS = [level / 100 for level in range(101)]
+_AUTHORS: dict[type[SumMetric], dict[str, Any]] = {ECEDelta: {"bins": 100}, ECEQuantile: {"levels": _LEVELS}}
 
 
 class SequenceMetrics(nn.Module):
@@ -24,18 +30,25 @@ class SequenceMetrics(nn.Module):
     Args:
         with_variance: False for a network that predicts depth alone.
         ranking: with AUSE, AURG and Spearman's correlation.
+        bins: of the calibration errors: "ours", 10 of the confidence and 10 levels, or "authors", 100 and 101.
         sync_on_compute: add up the sums of all processes of ``torch.distributed`` at ``compute``. Off,
             since evaluation gives every process sequences of its own.
     """
 
-    def __init__(self, *, with_variance: bool = True, ranking: bool = True, sync_on_compute: bool = False) -> None:
+    def __init__(
+        self, *, with_variance: bool = True, ranking: bool = True, bins: str = OURS, sync_on_compute: bool = False
+    ) -> None:
         super().__init__()
+        if bins not in BINS:
+            raise ValueError(f"bins must be one of {', '.join(BINS)}, got {bins!r}")
         self.with_variance = with_variance
         kinds: list[type[SumMetric]] = [Delta1, AbsRel, RMSE]
         if with_variance:
             kinds += [NLL, ECEDelta, ECEQuantile, EntropyHistogram]
             kinds += [Sparsification, SpearmanCorrelation] if ranking else []
-        self.metrics = nn.ModuleDict({k.__name__: k(sync_on_compute=sync_on_compute) for k in kinds})
+        finer = _AUTHORS if bins == AUTHORS else {}
+        made = {kind.__name__: kind(**finer.get(kind, {}), sync_on_compute=sync_on_compute) for kind in kinds}
+        self.metrics = nn.ModuleDict(made)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """Add one or more frames.
@@ -46,6 +59,8 @@ class SequenceMetrics(nn.Module):
             target: [...] ground truth [m]; NaN or <= 0 means there is none.
             valid: [...] bool, True = use.
 
+        All figures but the entropy are of the pixels with ground truth.
+
         Raises:
             ValueError: shapes or types disagree, or a needed variance is missing.
         """
@@ -55,7 +70,10 @@ class SequenceMetrics(nn.Module):
         d, g = depth[truth].double(), target[truth].double()
         v = None if variance is None else variance[truth].double()
         for metric in self._all():
-            metric.update(d, v, g)
+            if isinstance(metric, EntropyHistogram):
+                metric.update(depth, variance, target, valid)
+            else:
+                metric.update(d, v, g)
 
     def compute(self) -> dict[str, float]:
         """The scalar figures by name: delta1, delta1_ratio, abs_rel, rmse [m], nll, ece_delta, ece_q, ...

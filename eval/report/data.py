@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import unpack
 from ufmstar_torch.eval.results.record import Record
@@ -111,6 +111,10 @@ class Results:
     def of(self, row: Row, dataset: str | None = None) -> tuple[Record, ...]:
         """The records of a row, of one data set or (None) of all, by data set and sequence."""
         return self._by_row.get((row, dataset), ())
+
+    def default_rows(self, base: str | None = None) -> list[Row]:
+        """Of each method of a base (None: of all) the first row that no ablation varies."""
+        return [row for row in plain_rows(self.rows) if base in (None, row.method.base)]
 
     def sequences(self, dataset: str | None = None) -> tuple[tuple[str, str], ...]:
         """(dataset, sequence) with a record, sorted."""
@@ -283,7 +287,7 @@ def _merge_sums(paths: Sequence[Path]) -> Merged:
     """Add sums in the order given, which decides the last bits, and compute figures and curves from them."""
     total: Sums = {}
     for path in paths:
-        for name, states in _read_sums(path).items():
+        for name, states in read_sums(path).items():
             mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
             if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
                 raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
@@ -292,7 +296,7 @@ def _merge_sums(paths: Sequence[Path]) -> Merged:
     return _compute(total, paths)
 
 
-def _read_sums(path: Path) -> Sums:
+def read_sums(path: Path) -> Sums:
     """``RowResult.sums`` of one row on one sequence."""
     try:
         sums = torch.load(path, map_location="cpu", weights_only=True)
@@ -309,7 +313,9 @@ def _compute(total: Sums, paths: Sequence[Path]) -> Merged:
 
     states = total[METRICS]
     kinds = {key.split(".")[1] for key in states if key.startswith("metrics.")}
-    metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds)
+    many = "NLL" in kinds and states["metrics.ECEDelta.pixels"].numel() == 100
+    bins = "authors" if many else "ours"
+    metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds, bins=bins)
     by_error = {name: NLLByError() for name in total if name.startswith(BY_ERROR)}
     try:
         metrics.load_state_dict(dict(states))

@@ -21,7 +21,7 @@ class RowMaps:
 
     Attributes:
         depth: [m].
-        variance: of all that the row knows, V [m^2].
+        variance: of the row, V [m^2].
         aleatoric: the network's own A [m^2], None where the row has none.
         epistemic: the spread of members or samples E [m^2], or None.
         disagreement: between the views M [m^2], or None.

@@ -12,7 +12,7 @@ import numpy as np
 
 from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, TRUTH
+from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH
 from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, difference
@@ -193,7 +193,7 @@ def _end(line: SweepLine) -> str:
 
 
 def _styles(lines: Iterable[SweepLine]) -> Iterator[Style]:
-    """The method's own look, or one that says what is fixed."""
+    """The method's own look, or one that states what is fixed."""
     others = cycle(_OTHERS)
     for line in lines:
         known = {(): style_of(line.method), (("anchors", TRACKED),): _TRACKED, (("anchors", TRUTH),): _TRUTH}
@@ -262,10 +262,9 @@ def draw_changes(results: Results, base: str) -> Any | None:
 def _variants(results: Results, base: str) -> Iterator[tuple[Row, Row]]:
     """Rows of an ablation with the default of the same method."""
     for row in results.rows:
-        if row.method.base == base and row.method.fusion != ALONE and row.setting != DEFAULT:
-            default = Row(row.method)
-            if default in results.rows:
-                yield row, default
+        varied = row.method.base == base and row.method.fusion != ALONE and not row.setting.plain
+        if varied and row.base_line in results.rows:
+            yield row, row.base_line
 
 
 def _variant_names(rows: Sequence[Row]) -> list[str]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import (
     MIN_SEQUENCES,
@@ -90,7 +89,7 @@ def compare(results: Results, row: Row, reference: Row, dataset: str | None = No
 
 def comparisons(results: Results, dataset: str | None = None) -> dict[tuple[Row, Row], list[PairedComparison]]:
     """Every row of UfM* with its default settings against its references."""
-    rows = [row for row in results.rows if row.method.fusion == UFM_STAR and row.setting == DEFAULT]
+    rows = [row for row in results.rows if row.method.fusion == UFM_STAR and row.setting.plain]
     pairs = ((row, reference) for row in rows for reference in references(results, row))
     return {pair: made for pair in pairs if (made := compare(results, *pair, dataset))}
 
@@ -198,7 +197,7 @@ def _losses(made: Iterable[PairedComparison]) -> str:
 
 def _best(results: Results, quantity: Quantity) -> str:
     """Which row has the best mean of a figure, and whether its lead is beyond chance; "" where rows are not alike."""
-    rows = [row for row in results.rows if row.setting == DEFAULT]
+    rows = [row for row in results.rows if row.setting.plain]
     if quantity is not DELTA1:
         rows = [row for row in rows if has_variance(results, row)]
     on = {frozenset((r.dataset, r.sequence) for r in results.of(row)) for row in rows}
@@ -228,9 +227,8 @@ def _best(results: Results, quantity: Quantity) -> str:
 def _settings(results: Results) -> list[str]:
     """For an ablation: which settings beat the default, figure by figure."""
     sentences = []
-    varied = [row for row in results.rows if row.setting != DEFAULT and row.method.fusion == UFM_STAR]
-    defaults = {row.method: row for row in results.rows if row.setting == DEFAULT}
-    pairs = [(row, defaults[row.method]) for row in varied if row.method in defaults]
+    varied = [row for row in results.rows if not row.setting.plain and row.method.fusion == UFM_STAR]
+    pairs = [(row, row.base_line) for row in varied if row.base_line in results.rows]
     made = [c for pair in pairs for c in compare(results, *pair)]
     for quantity in DIFFERENCES:
         of_figure = [c for c in made if c.quantity is quantity and c.verdict != UNDECIDED]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import LOWER, Quantity
 from ufmstar_torch.eval.results.record import Record
@@ -89,22 +89,24 @@ def references(results: Results, row: Row) -> list[Row]:
     """The rows with a variance with which a row is compared.
 
     The base alone on the same images; UfM of the same base, pruned rather than not, for rows of UfM*; plain UfM* for
-    its variants; and the default for a row of an ablation.
+    its variants; the row as it is for a row of an ablation, and our defaults for the paper's settings.
     """
     method, base = row.method, row.method.base
-    same_images = Setting(skip=row.setting.skip)
+    same_images = Setting(skip=row.setting.skip, preprocess=row.setting.preprocess)
+    plain = Setting(preprocess=row.setting.preprocess)
     mine = [r for r in results.rows if r.method.base == base and r != row]
     wanted: list[Row] = []
     if method.fusion != ALONE:
         wanted += [r for r in mine if r.method.fusion == ALONE and r.setting == same_images]
-    if method.fusion == UFM_STAR and row.setting == DEFAULT:
-        points = [r for r in mine if r.method.fusion == UFM and not r.method.full and r.setting == DEFAULT]
+    if method.fusion == UFM_STAR and row.setting.plain:
+        points = [r for r in mine if r.method.fusion == UFM and not r.method.full and r.setting == plain]
         wanted += sorted(points, key=lambda r: r.method.max_points or math.inf)[:1]
         if method.full or method.fixed_param:
-            plain = (r for r in mine if r.method.fusion == UFM_STAR and r.setting == DEFAULT)
-            wanted += [r for r in plain if not (r.method.full or r.method.fixed_param)]
-    if row.setting != DEFAULT:
-        wanted += [r for r in mine if r.method == method and r.setting == DEFAULT]
+            alike = (r for r in mine if r.method.fusion == UFM_STAR and r.setting == row.setting)
+            wanted += [r for r in alike if not (r.method.full or r.method.fixed_param)]
+    if row.setting != plain:  # an ablation's row, or the paper's settings, to ours
+        wanted += [r for r in mine if r.method == method and r.setting == row.setting.chosen]
+        wanted += [r for r in mine if r.method == method and row.setting.plain and r.setting == plain]
     return [r for r in wanted if has_variance(results, r)]
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import PAPER
 
 LOWER, HIGHER = "lower", "higher"
 
@@ -103,6 +104,8 @@ SETTINGS = {
     "overlap_weighted": ("fusion weighted by overlap", ""),
     "disagreement": ("disagreement", ""),
     "regression": ("regression", ""),
+    "unmeasured": ("not measured:", ""),
+    "unmeasured_relative": ("ρ", "of the depth"),
     "near_radius": ("search radius", "m"),
     "far_radius": ("far search radius", "m"),
     "variance_floor": ("variance floor", "m²"),
@@ -115,6 +118,13 @@ SETTINGS = {
 }
 
 
+# Settings that a word names, without their own name.
+_WORDS = {
+    ("ufm_preset", "paper"): "paper's settings",
+    ("preprocess", "resize"): "whole frame",
+    ("preprocess", "crop"): "NYU's crop",
+    ("aleatoric_in_h", True): "A in H",
+}
 # Values in words.
 _VALUES = {"tracked": "tracked corners", "truth": "ground truth"}
 
@@ -136,9 +146,32 @@ def setting_value(name: str, value: Any) -> str:
 def setting_label(values: Mapping[str, Any]) -> str:
     """A setting for people, "" for the default: "rotation noise 2°, images skipped 4"."""
     shown = {name: value for name, value in values.items() if name != "seed" or value}
-    return ", ".join(f"{setting_name(name)} {setting_value(name, value)}" for name, value in shown.items())
+    return ", ".join(
+        _WORDS.get((name, value)) or f"{setting_name(name)} {setting_value(name, value)}"
+        for name, value in shown.items()
+    )
 
 
 def row_label(row: Row) -> str:
     """A row for people: "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
     return ", ".join(filter(None, (row.name, setting_label(row.changed))))
+
+
+def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
+    """The labels of a table's rows: without the preprocessing that all of them share (:func:`shared_words`), and with
+    "our defaults" where the same method stands there with the paper's settings as well."""
+    listed = list(rows)
+    shared = len({row.setting.preprocess for row in listed}) == 1
+    papers = {row.method for row in listed if row.setting.ufm_preset == PAPER}
+    labels = {}
+    for row in listed:
+        ours = "our defaults" if row.method in papers and row.setting.ufm_preset != PAPER else ""
+        changed = {name: value for name, value in row.changed.items() if not (shared and name == "preprocess")}
+        labels[row] = ", ".join(filter(None, (row.name, ours, setting_label(changed))))
+    return labels
+
+
+def shared_words(rows: Iterable[Row]) -> str:
+    """How images were prepared for all rows, "" where their networks' weights decide or rows differ."""
+    prepared = {row.setting.preprocess for row in rows}
+    return _WORDS.get(("preprocess", prepared.pop()), "") if len(prepared) == 1 else ""

@@ -220,7 +220,7 @@ def write_pictures(
     Raises:
         OSError: a full disk, say.
     """
-    from ufmstar_torch.eval.report.figures import write_curves
+    from ufmstar_torch.eval.report.figures_calibration import write_curves
 
     curves = {name: values.curves() for name, values in metrics.items()}
     todo: dict[str, Callable[[Path], object]] = {

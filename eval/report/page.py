@@ -275,7 +275,7 @@ def _made(results: Results) -> Part:
 
 
 def command(about: Mapping[str, Any]) -> str:
-    """The command that repeats the evaluation; DIR stands for what only the reader knows."""
+    """The command that repeats the evaluation; DIR stands for a folder of the reader."""
     parts = ["ufmstar eval", f"--suite {about['suite']}"]
     parts += [f"--root {dataset}=DIR" for dataset in about.get("datasets") or []]
     for base, network in (about.get("networks") or {}).items():

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
-from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT
+from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, Map, RowMaps, deviation, find_examples
@@ -126,7 +125,7 @@ def choose(examples: Sequence[Example], most: int) -> list[Example]:
 
 def strip_rows(rows: Sequence[Row], base: str) -> list[Row]:
     """A base's rows for a strip, as the paper's: alone, UfM (pruned if there is such), UfM*; of default settings."""
-    of_base = [row for row in rows if row.method.base == base and row.setting == DEFAULT and not row.method.full]
+    of_base = [row for row in plain_rows(rows) if row.method.base == base and not row.method.full]
     default = [row for row in of_base if not row.method.fixed_param]
     by_fusion = {fusion: [row for row in default if row.method.fusion == fusion] for fusion in (ALONE, UFM, UFM_STAR)}
     pruned = [row for row in by_fusion[UFM] if row.method.max_points is not None]
@@ -162,7 +161,7 @@ def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[
     for dataset, sequence in results.sequences():
         rooms = find_rooms(_folder_of(results, dataset, sequence))
         # One row of each room is enough: the suite's first UfM* with its default settings.
-        slug = next((s for s, row in rows.items() if s in rooms and row.setting == DEFAULT), None)
+        slug = next((s for s, row in rows.items() if s in rooms and row.setting.plain), None)
         if slug is None or drawn == MOST_ROOMS:
             continue
         snapshots = choose_times(rooms[slug])

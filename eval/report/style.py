@@ -75,6 +75,14 @@ def new_figure(width: float, height: float, title: str) -> Any:
     return figure
 
 
+def hidden_panels(figure: Any, lines: int, columns: int) -> Any:
+    """[lines, columns] axes that are invisible until they are drawn on."""
+    axes = figure.subplots(lines, columns, squeeze=False)
+    for panel in axes.flat:
+        panel.set_visible(False)
+    return axes
+
+
 def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
     """Words, a faint grid behind, no box."""
     axes.set_title(plain(title), size=LABEL + 0.5, color=INK, loc="left")
@@ -133,7 +141,7 @@ def label_ends(axes: Any, ends: Iterable[tuple[float, str, str]], *, size: float
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, as the suffix says (.svg or .png); the same figure gives the same bytes.
+    """Write a figure, by its suffix (.svg or .png); the same figure gives the same bytes.
 
     Raises:
         OSError: see ``write_atomic``.

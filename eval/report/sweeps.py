@@ -11,7 +11,7 @@ from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH, default_of
+from ufmstar_torch.eval.methods.setting import DEFAULTS, TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, mean_over, value_of
 from ufmstar_torch.eval.report.names import Quantity, setting_label
@@ -51,7 +51,7 @@ class SweepLine:
     def words(self) -> str:
         """What is fixed, for people: "", "anchored", "truth anchors, shrinkage κ 1 anchors"."""
         values = dict(self.rest)
-        anchors = _ANCHORED.get(values.pop("anchors", ""), "")
+        anchors = _ANCHORED.get(kind := values.pop("anchors", ""), kind)
         return ", ".join(filter(None, (anchors, setting_label(values))))
 
     def at(self, value: float) -> Point | None:
@@ -70,12 +70,16 @@ def sweeps(results: Results) -> list[tuple[str, str]]:
 
 
 def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
-    """The lines of a base over the values of a setting, those of one point too, in the order of the rows."""
+    """The lines of a base over the values of a setting, those of one point too, in the order of the rows. How images
+    are prepared is no difference where it is the same of all rows."""
     groups: dict[tuple[Method, Rest], dict[float, list[Row]]] = {}
-    for row in results.rows:
+    rows = [row for row in results.rows if row.method.base == base]
+    prepared = {row.setting.preprocess for row in rows}
+    for row in rows:
         value = _value(row, name)
-        if row.method.base == base and _is_number(value):
-            groups.setdefault((row.method, _rest(row, name)), {}).setdefault(float(value), []).append(row)
+        if _is_number(value):
+            rest = tuple(item for item in _rest(row, name) if item[0] != "preprocess" or len(prepared) > 1)
+            groups.setdefault((row.method, rest), {}).setdefault(float(value), []).append(row)
     if name == COUNT:
         _begin_without_anchors(groups)
     return [
@@ -101,10 +105,10 @@ def change(results: Results, point: Point, reference: Point, quantity: Quantity)
     return mean_over([value - theirs.get(where, math.nan) for where, value in mine.items()])
 
 
-def default_value(name: str) -> float:
-    """The value that a row has as the paper runs it, NaN where it is no number."""
+def default_value(name: str, preset: str = DEFAULTS) -> float:
+    """The value that a row of a preset has where nothing is changed, NaN where it is no number."""
     try:
-        value = default_of(name)
+        value = default_of(name, preset)
     except ValueError:  # a setting of another version: without a default, its rows stand alone
         return math.nan
     return float(value) if _is_number(value) else math.nan
@@ -116,8 +120,8 @@ def _is_number(value: Any) -> bool:
 
 def _value(row: Row, name: str) -> Any:
     if name == COUNT and row.setting.anchor_count is None:
-        return _COUNTS[row.setting.anchors]
-    return row.setting.to_dict().get(name, default_value(name))
+        return _COUNTS.get(row.setting.anchors, math.nan)
+    return row.setting.to_dict().get(name, default_value(name, row.setting.ufm_preset))
 
 
 def _begin_without_anchors(groups: dict[tuple[Method, Rest], dict[float, list[Row]]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from ufmstar_torch.eval.methods.method import UFM_STAR
-from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import FORMAT, Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables, paper_efficiency_tables
 from ufmstar_torch.eval.report.means import (
@@ -26,7 +26,7 @@ from ufmstar_torch.eval.report.means import (
     references,
     value_of,
 )
-from ufmstar_torch.eval.report.names import DIFFERENCES, EXTRA, MAIN, Quantity, row_label
+from ufmstar_torch.eval.report.names import DIFFERENCES, EXTRA, MAIN, Quantity, row_labels, shared_words
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
 from ufmstar_torch.eval.report.table import (
     Cell,
@@ -92,7 +92,7 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
 def difference_table(results: Results, dataset: str | None = None) -> Table:
     """Row less reference, in pairs on the same sequences; bold where the interval leaves out 0 to the better side."""
     blocks: dict[str, int] = {}
-    lines = []
+    lines, labels = [], row_labels(results.rows)
     for row in (row for row in results.rows if has_variance(results, row)):
         for reference in references(results, row):
             means = [difference(results, row, reference, q, dataset) for q in DIFFERENCES]
@@ -100,7 +100,7 @@ def difference_table(results: Results, dataset: str | None = None) -> Table:
             if count:
                 block = blocks.setdefault(row.method.base, len(blocks))
                 cells = (Cell(str(count)), *map(_difference_cell, means, DIFFERENCES))
-                lines.append(Line(block, f"{row_label(row)} – {row_label(reference)}", False, cells))
+                lines.append(Line(block, f"{labels[row]} – {labels[reference]}", False, cells))
     columns = [
         Column("", "sequences", "Sequences"),
         *(Column("", f"Δ {q.heading}", rf"$\Delta$ {q.latex_heading}") for q in DIFFERENCES),
@@ -134,7 +134,7 @@ def _means(
     cells = {row: _cells(listed, quantities) for row, listed in records.items()}
     group = "Ours" if quoted else ""
     columns = _columns(quantities, group)
-    notes = [_network_note(results), _interval_note(records), _nll_note(records, quantities)]
+    notes = [_network_note(results), _prepared_note(records), _interval_note(records), _nll_note(records, quantities)]
     if not alike:
         columns = [Column(group, "sequences", "Sequences"), *columns]
         cells = {row: [Cell(str(len(on[row]))), *listed] for row, listed in cells.items()}
@@ -142,9 +142,10 @@ def _means(
     lines = _lines(cells, quantities if alike else ())
     if quoted:
         columns += [Column("Paper", f"paper: {_PAPER_COLUMNS[c][0]}", _PAPER_COLUMNS[c][1]) for c in quoted.columns]
-        theirs = {row_label(row): quoted.rows.get(row.method.name, {}) for row in cells}
+        labels = row_labels(cells)
+        theirs = {labels[row]: quoted.rows.get(row.method.name, {}) for row in plain_rows(cells)}
         lines = [
-            line._replace(cells=(*line.cells, *(theirs[line.label].get(c, Cell()) for c in quoted.columns)))
+            line._replace(cells=(*line.cells, *(theirs.get(line.label, {}).get(c, Cell()) for c in quoted.columns)))
             for line in lines
         ]
         notes.append(
@@ -167,14 +168,14 @@ def _lines(cells: Mapping[Row, Sequence[Cell]], quantities: Sequence[Quantity]) 
     """Rows by base, the best of each in bold; one block where every base has a single row, as in table 4."""
     bases = [row.method.base for row in cells]
     together = len(set(bases)) == len(bases)
-    lines = []
+    lines, labels = [], row_labels(cells)
     for block, (_, group) in enumerate(groupby(cells, key=lambda row: None if together else row.method.base)):
         rows = list(group)
         columns: list[Sequence[Cell]] = list(zip(*(cells[row] for row in rows), strict=True))
         if quantities:
             columns = [mark_best(column, q) for column, q in zip(columns, quantities, strict=True)]
         for row, of_row in zip(rows, zip(*columns, strict=True), strict=True):
-            lines.append(Line(block, row_label(row), row.method.fusion == UFM_STAR, of_row))
+            lines.append(Line(block, labels[row], row.method.fusion == UFM_STAR, of_row))
     return lines
 
 
@@ -195,6 +196,11 @@ def _network_note(results: Results) -> str:
     if len(networks) == 1:
         return f"Network: {next(iter(networks))}."
     return "Networks: " + ", ".join(f"{name} ({', '.join(bases)})" for name, bases in networks.items()) + "."
+
+
+def _prepared_note(rows: Iterable[Row]) -> str:
+    words = shared_words(rows)
+    return f"Images of all rows: {words}, resized to the networks' input." if words else ""
 
 
 def _interval_note(records: Mapping[Row, Sequence[Record]]) -> str:

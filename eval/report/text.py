@@ -25,6 +25,8 @@ _DEMO_COLUMNS = {
 }
 # [nats] Above it, the mean NLL is decided by a few pixels with almost no variance.
 _NLL_DOMINATED = 100.0
+# What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
+_FOUND = {"tracked": ("triangulated", "tracked"), "landmarks": ("in view", "in the map")}
 _RUN_COLUMNS = {
     "delta1": "delta1",
     "abs_rel": "AbsRel",
@@ -139,7 +141,11 @@ def run_table(summary: Mapping[str, Any]) -> str:
     mixture, time = summary["mixture"], summary["time"]
     stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
     rate = time["frames_per_second"]
-    lines += [] if summary["anchors"] is None else _anchor_lines(summary["anchors"], summary["frames"]["done"])
+    lines += (
+        []
+        if summary["anchors"] is None
+        else _anchor_lines(summary["anchors"], summary["frames"]["done"], summary["source"]["anchors"])
+    )
     lines += [
         f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
         f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "
@@ -151,10 +157,10 @@ def run_table(summary: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _anchor_lines(anchors: Mapping[str, Any], frames: int) -> list[str]:
+def _anchor_lines(anchors: Mapping[str, Any], frames: int, kind: str) -> list[str]:
     """A line on the effect of anchors, and one on the frames that had none."""
     used, found, tracked = (anchors[f"{key}_per_frame"] for key in ("used", "found", "tracked"))
-    line = f"anchors: {used:.1f} used a frame, of {found:.1f} triangulated and {tracked:.1f} tracked"
+    line = f"anchors: {used:.1f} used a frame, of {found:.1f} {_FOUND[kind][0]} and {tracked:.1f} {_FOUND[kind][1]}"
     if used and anchors["mean_bias"] is not None:
         way = "nearer" if anchors["mean_bias"] < 0 else "farther"
         expected = f"{abs(anchors['mean_bias']):.0%} {way} than predicted"

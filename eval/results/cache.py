@@ -20,7 +20,7 @@ _DIGEST = 32  # bytes of a SHA-256
 
 
 class CacheError(Exception):
-    """The folder cannot be used; says which one and why."""
+    """The folder cannot be used; the message names it and the reason."""
 
 
 class PredictionCache:

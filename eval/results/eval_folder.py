@@ -99,9 +99,15 @@ class EvalFolder:
                     continue
         return records
 
-    def require_same_sequence(self, item: WorkItem, digest: str) -> None:
-        """Raises FolderError where the finished rows were computed from other frames, cameras or poses."""
-        for record in self.records(item).values():
+    def require_same_sequence(self, item: WorkItem, digest: str, landmarks: Mapping[str, str]) -> None:
+        """Raises FolderError where finished rows were computed from other frames, cameras, poses or ``landmarks``,
+        whose digests are by row."""
+        for slug, record in self.records(item).items():
+            if slug in landmarks and record.provenance.get("landmarks") != landmarks[slug]:
+                raise FolderError(
+                    f"--resume: {item.label} has other landmarks in {record.setting['anchors']} than when "
+                    f"{record.method} was computed there; --overwrite starts again"
+                )
             then = record.provenance.get("sequence")
             if then != digest:
                 raise FolderError(

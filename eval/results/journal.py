@@ -54,7 +54,7 @@ class MapWriter(FrameSink):
 
 
 class Journal(FrameSink):
-    """Commits every frame to the run's folder, with the state that the next one depends on.
+    """Commits every frame to the run's folder, with the state that the next one depends on (``FrameResult.state``).
 
     Args:
         key: of the row.
@@ -80,7 +80,6 @@ class Journal(FrameSink):
     def begin(self, stream: FrameStream) -> None:
         """The clock of this session starts."""
         self._first, self._started = stream.position, perf_counter()
-        [self._row] = [row for row in stream.rows if row.key == self._key]
 
     def take(self, result: FrameResult) -> None:
         """Commit a frame.
@@ -95,7 +94,7 @@ class Journal(FrameSink):
         }
         checkpoint = Checkpoint(
             position=result.number + 1,
-            module=saved_state(self._row.state(), bare=self._bare),
+            module=saved_state(row_part(result.state, self._key), bare=self._bare),
             metrics=self._sums(),
             sessions=[*self._earlier, session],
         )
@@ -112,6 +111,11 @@ class Journal(FrameSink):
         written = {"depth": self._maps.written.depth_saturated, "sigma": self._maps.written.sigma_saturated}
         times = {"ms": _times(result, row, self._saving)}
         return {**about, "state": "done", **_figures(row), "saturated": written, **times, **_anchor_figures(row)}
+
+
+def row_part(state: Mapping[str, Tensor], key: str) -> dict[str, Tensor]:
+    """A row's part of a stream's state (``FrameStream.state``)."""
+    return {name.removeprefix(f"{key}/"): value for name, value in state.items() if name.startswith(f"{key}/")}
 
 
 def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
@@ -150,7 +154,7 @@ def _figures(row: RowFrame) -> dict[str, Any]:
 
 def _times(result: FrameResult, row: RowFrame, saving: float) -> dict[str, float]:
     """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
-    this frame's is not known yet."""
+    this frame's is not known yet. "cycle" is the time since the frame before: stages overlap."""
     ms = result.ms
     optional = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
     return {
@@ -161,6 +165,7 @@ def _times(result: FrameResult, row: RowFrame, saving: float) -> dict[str, float
         "write": ms["write"],
         "save": saving,
         "prepare": ms["predict"] - row.ms.get("network", 0.0),
+        "cycle": ms["cycle"],
     }
 
 
@@ -168,7 +173,8 @@ def _anchor_figures(row: RowFrame) -> dict[str, Any]:
     """Of a run with anchors: what became of the frame's corners, and the means of B [m^2] and of r.
 
     ``tracked`` were followed from the frame before, of which ``found`` were triangulated; ``usable`` lie on a pixel
-    with a depth, and ``used`` agree with others. Without any used, ``without`` says why.
+    with a depth, and ``used`` agree with others. Without any used, ``without`` says why. Of a map of landmarks,
+    ``tracked`` counts all, and ``found`` those in view.
     """
     anchors, estimate = row.anchors, row.estimate
     if anchors is None or estimate.anchored is None or estimate.bias is None:
@@ -199,15 +205,16 @@ def _corners(anchors: FrameAnchors, estimate: Estimate) -> dict[str, Any]:
     assert estimate.statistics is not None
     used, usable = int(estimate.statistics.anchors_used[0]), int(estimate.statistics.anchors[0])
     counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
-    return {**counts, "without": None if used else why_none(anchors.tracked, anchors.triangulated, usable)}
+    why = None if used else why_none(anchors.tracked, anchors.triangulated, usable, anchors.none)
+    return {**counts, "without": why}
 
 
-def why_none(tracked: int, triangulated: int, usable: int) -> str:
-    """Why a frame has no anchors, from how many were left at each stage."""
+def why_none(tracked: int, triangulated: int, usable: int, none: str) -> str:
+    """Why a frame has no anchors, from how many were left at each stage, and why none was triangulated."""
     if not tracked:
         return "no corner followed from the frame before"
     if not triangulated:
-        return "no parallax, or no track that fits the poses"
+        return none
     return "none lies on a pixel with a depth" if not usable else "they contradict each other"
 
 

@@ -138,7 +138,7 @@ class Slurm:
         if cluster not in ("slurm", "local", "debug"):
             raise ValueError(f"--slurm cluster must be slurm, local or debug, got {cluster!r}")
         if {"nodes", "tasks_per_node"} & values.keys():
-            raise ValueError("--slurm: every job is one process; jobs=N says how many")
+            raise ValueError("--slurm: every job is one process; jobs=N sets their number")
         plain = {key for key in values if key in _SUBMITIT or key.startswith("slurm_")}
         return cls(jobs, cluster, {key if key in plain else f"slurm_{key}": v for key, v in values.items()})
 

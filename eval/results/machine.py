@@ -11,7 +11,7 @@ from typing import Any
 
 # Distributions by the name under which a report lists them.
 _PACKAGES = {"ufmstar_torch": "ufmstar-torch", "torch": "torch", "numba": "numba", "numpy": "numpy"}
-_PACKAGES |= {"torchvision": "torchvision", "llvmlite": "llvmlite"}
+_PACKAGES |= {"torchvision": "torchvision", "llvmlite": "llvmlite", "onnxruntime": "onnxruntime"}
 # Settings of the environment that change how long a parallel loop takes, above all beside other work.
 _ENVIRONMENT = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER")
 

@@ -31,7 +31,7 @@ class Record:
         state: of the multiview method: "bytes_mean", "bytes_max", "bytes_end" [B], "count_mean", "count_max",
             "count_end" (points or components), "smoothing_bytes" (the map kept for smoothing) [B]; {} if alone.
         ms: median time per frame [ms] by stage: "network" (one inference, or all of them), "uncertainty".
-        provenance: "versions", "machine", "device", digests of networks and sequence.
+        provenance: "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     """
 
     suite: str

@@ -29,6 +29,7 @@ from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
 from ufmstar_torch.eval.results.files import to_json, write_atomic
 from ufmstar_torch.eval.results.folder import FolderError, FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.writers import FrameWriter
+from ufmstar_torch.eval.sequences.own_output import read_journal
 
 FORMAT = 1
 # Outputs that are made from the finished frames.
@@ -166,7 +167,7 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
         stored = torch.load(file, map_location="cpu", weights_only=True)
         stored_format = stored.pop("format")
         text = journal.read_bytes()[: stored["journal_bytes"]]
-        records = [json.loads(line) for line in text.splitlines()]
+        records = read_journal(text, journal)
     except (OSError, EOFError, RuntimeError, KeyError, UnpicklingError, zipfile.BadZipFile, ValueError) as error:
         raise FolderError(f"--resume: the state in {out} cannot be read ({error}); --overwrite starts again") from error
     writer = FrameWriter(out)

@@ -15,7 +15,7 @@ from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
-# [m] A sigma below it claims more than any depth network knows.
+# [m] A sigma below it claims more than any depth network can measure.
 NEAR_ZERO = 1e-3
 STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "save")
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
@@ -36,6 +36,7 @@ def summarise(
     sequence: FrameSequence,
     selected: int,
     source: Mapping[str, Any],
+    runtime: Mapping[str, Any] | None,
     records: Sequence[Mapping[str, Any]],
     sessions: Sequence[Mapping[str, float]],
     mixture: GaussianMixture,
@@ -50,6 +51,7 @@ def summarise(
         sequence: the frames, of which ``selected`` were asked for.
         selected: see above.
         source: what the depth came from.
+        runtime: what ran the networks (``DepthSource.runtime``).
         records: the lines of frames.jsonl.
         sessions: of every start of the program.
         mixture: at the end.
@@ -64,6 +66,7 @@ def summarise(
         "sequence": _sequence(sequence),
         "frames": _frames(records, selected),
         "source": source,
+        "runtime": runtime,
         "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
         "metrics": figures.get(UFM),
         "metrics_reason": None if UFM in figures else "no ground truth",
@@ -183,13 +186,14 @@ def _mixture(done: Sequence[Mapping[str, Any]], mixture: GaussianMixture) -> dic
 
 
 def _time(done: Sequence[Mapping[str, Any]], sessions: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Medians by stage; "prepare" is preprocessing, or reading the predicted map.
+    """Medians by stage; "prepare" is preprocessing, or reading the predicted map, and "frame" the time from a frame to
+    the next, which is shorter than the sum of the stages: frames are read ahead and written behind in threads.
 
     The rate is that of the median frame: the first one also loads libraries and compiled kernels.
     """
     seconds = sum(session["seconds"] for session in sessions)
     stages = {stage: [record["ms"][stage] for record in done if stage in record["ms"]] for stage in STAGES}
-    total = median(sum(record["ms"].values()) for record in done) if done else None
+    total = median(record["ms"]["cycle"] for record in done) if done else None
     return {
         "median_ms": {stage: median(times) if times else None for stage, times in stages.items()} | {"frame": total},
         "frames_per_second": 1000 / total if total else None,

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
 from ufmstar_torch.eval.engine.load import NetworkChoice
@@ -26,6 +27,8 @@ from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.recalibrate import read_recalibration
 
 Evaluate = Callable[..., list[RowResult]]
 # Errors of a sequence that cannot be used, raised when it is opened or evaluated. Any other error is a mistake in this
@@ -35,6 +38,7 @@ _POLL_SECONDS = 0.2
 DIED = "the process that evaluated it was killed (for want of memory?)"
 # Of a sequence of single images.
 _NO_POSES = "its images have no poses: the rows of networks alone are finished, {} that compare views cannot be had"
+_FITTED = "{} recalibrated rows were fitted to this sequence and are not judged on it"
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,10 @@ class EvalJob:
         cache: folder of predictions; None = in ``out``.
         device: "cpu", "cuda", "cuda:1".
         confident: share of a frame's pixels of which a reference method counts as confident.
+        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
         examples: of each data set, sequences of which a few frames are stored for pictures.
         samples: passes of MC-Dropout.
+        runtime, precision: of the networks (``Inference``).
     """
 
     suite: Suite
@@ -64,8 +70,11 @@ class EvalJob:
     cache: Path | None = None
     device: str = "cpu"
     confident: float = 0.5
+    bins: str = "ours"
     examples: int = 3
     samples: int | None = None
+    runtime: str = "auto"
+    precision: str = "float32"
 
     def load(self, device: torch.device) -> dict[str, DepthSource]:
         """The networks that the rows need.
@@ -75,11 +84,13 @@ class EvalJob:
         """
         passes = {} if self.samples is None else {"samples": self.samples}
         needed = [self.networks[base] for base in self.suite.bases]
-        return {choice.base: choice.load(device, **passes) for choice in needed}
+        inference = Inference(self.runtime, self.precision)
+        return {choice.base: choice.load(device, inference=inference, **passes) for choice in needed}
 
     def about(self, networks: Mapping[str, DepthSource]) -> dict[str, Any]:
         """eval.json."""
         suite, f = self.suite, self.frames
+        bins = {} if self.bins == "ours" else {"bins": self.bins}  # as folders have it that were written before
         opening = {name: value for item in self.items for name, value in item.opening}
         return {
             "suite": suite.name,
@@ -90,7 +101,7 @@ class EvalJob:
             "datasets": sorted({item.dataset for item in self.items}),
             "sequences": [{"dataset": item.dataset, "sequence": item.sequence} for item in self.items],
             "missing_bases": list(self.missing_bases),
-            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **opening},
+            "settings": {"frames": [f.start, f.stop, f.step], "confident": self.confident, **bins, **opening},
             "versions": versions(),
             "machine": hardware(),
         }
@@ -102,7 +113,8 @@ class EvalJob:
 
     def to_dict(self) -> dict[str, Any]:
         """The job as plain values, for another process."""
-        own = {name: getattr(self, name) for name in ("missing_bases", "device", "confident", "examples", "samples")}
+        plain = ("missing_bases", "device", "confident", "bins", "examples", "samples", "runtime", "precision")
+        own = {name: getattr(self, name) for name in plain}
         return own | {
             "suite": self.suite.to_dict(),
             "networks": [asdict(choice) for choice in self.networks.values()],
@@ -218,11 +230,13 @@ class _Worker:
         try:
             sequence = item.open()
             digest = content_digest(sequence)
+            landmarks = landmark_digests(self.job.suite.rows, sequence.folder)
         except (*_BROKEN, OSError) as error:
             self._fail(item, error, missing)
             return
-        self.folder.require_same_sequence(item, digest)
-        possible = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        self.folder.require_same_sequence(item, digest, landmarks)
+        posed = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        possible = [row for row in posed if not _fitted_to(row, digest)]
         left_out = [row for row in missing if row not in possible]
         started = time.monotonic()
         try:
@@ -230,13 +244,13 @@ class _Worker:
         except _BROKEN as error:
             self._fail(item, error, missing)
             return
-        self._store(item, digest, [result for result in results if result.row in missing])
+        self._store(item, digest, landmarks, [result for result in results if result.row in missing])
         if missing:
             frames = results[0].frames.get("done", 0) if results else 0
             rows, seconds = len(missing) - len(left_out), time.monotonic() - started
             self.context.report(f"{item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
         if left_out:
-            self._fail(item, _NO_POSES.format(len(left_out)), left_out)
+            self._fail(item, (_FITTED if sequence.posed else _NO_POSES).format(len(left_out)), left_out)
         else:
             self.folder.succeeded(item)
 
@@ -254,6 +268,7 @@ class _Worker:
             limit=job.frames,
             sinks=[ExampleWriter(Examples(self.folder.place(item)))] if job.keeps_examples(item) else [],
             confident=job.confident,
+            bins=job.bins,
             stop=self.context.stop,
             progress=lambda done, total: self.context.progress(item.label, done, total),
         )
@@ -263,11 +278,12 @@ class _Worker:
         self.folder.fail(item, reason, rows, self.context.launch)
         self.context.report(f"{item.label}: failed: {reason}")
 
-    def _store(self, item: WorkItem, digest: str, results: Iterable[RowResult]) -> None:
+    def _store(self, item: WorkItem, digest: str, landmarks: Mapping[str, str], results: Iterable[RowResult]) -> None:
         """Store rows with what they were computed from."""
         common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": digest}
         for result in results:
             row, network = result.row, self.networks[result.row.method.base]
+            own = {"landmarks": landmarks[row.slug]} if row.slug in landmarks else {}
             record = Record(
                 suite=self.job.suite.name,
                 dataset=item.dataset,
@@ -280,9 +296,21 @@ class _Worker:
                 curves=result.curves,
                 state=result.state,
                 ms=result.ms,
-                provenance={**common, "network": network.digest, "threads": torch.get_num_threads()},
+                provenance={
+                    **common,
+                    "network": network.digest,
+                    "runtime": network.runtime,
+                    "threads": torch.get_num_threads(),
+                    **own,
+                },
             )
             self.folder.keep(item, record, result)
+
+
+def _fitted_to(row: Row, digest: str) -> bool:
+    """Whether the row's recalibration was fitted to the sequence with this digest."""
+    name = row.setting.recalibration
+    return bool(name) and digest in read_recalibration(name).digests
 
 
 def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:

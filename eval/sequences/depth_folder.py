@@ -92,21 +92,29 @@ class DepthFolder:
     def __len__(self) -> int:
         return len(self.files)
 
-    def for_frames(self, names: Sequence[str], names_on_disk: Sequence[str] = ()) -> DepthMaps:
+    def for_frames(
+        self, names: Sequence[str], names_on_disk: Sequence[str] = (), selected: Sequence[str] | None = None
+    ) -> DepthMaps:
         """The maps of a sequence's frames: by stem, or by the numbers in the names, or else in sorted order.
 
         Args:
             names: the frames' names (:attr:`FrameSequence.names`).
             names_on_disk: the same with the frames that the sequence skips (:attr:`FrameSequence.names_on_disk`);
-                sorted order counts on there being as many maps as one of the two.
+                sorted order counts on there being as many maps as one of the two, or as ``selected``.
+            selected: those of ``names`` whose maps are wanted, in order; None = all.
+
+        Returns:
+            The maps of ``selected``.
 
         Raises:
             ValueError: some frames have no map (they are listed).
         """
-        depth = _paired(self.path, self.files, names, names_on_disk or names)
+        wanted = names if selected is None else selected
+        orders = (names_on_disk or names, names, wanted)
+        depth = _paired(self.path, self.files, wanted, orders)
         variance: tuple[Path, ...] = ()
         if self.variance_path is not None:
-            variance = _paired(self.variance_path, self.variance_files, names, names_on_disk or names)
+            variance = _paired(self.variance_path, self.variance_files, wanted, orders)
         return DepthMaps(depth, variance, self.scale)
 
 
@@ -121,12 +129,12 @@ def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
     return files
 
 
-def _paired(folder: Path, files: list[Path], names: Sequence[str], names_on_disk: Sequence[str]) -> tuple[Path, ...]:
+def _paired(folder: Path, files: list[Path], names: Sequence[str], orders: Sequence[Sequence[str]]) -> tuple[Path, ...]:
     pairs = pair_by_name(names, files)
     missing = [name for name in names if name not in pairs]
     if not missing:
         return tuple(pairs[name] for name in names)
-    for order in (names_on_disk, names):
+    for order in orders:
         if len(files) == len(order):
             by_order = dict(zip(order, files, strict=True))
             return tuple(by_order[name] for name in names)

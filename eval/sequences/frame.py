@@ -122,6 +122,7 @@ class FrameSequence:
         names_on_disk: every frame's name in order, skipped ones included.
         posed: whether poses are known. Without, they are all the identity and mean nothing: single images, on which
             a network can be judged but nothing that compares views.
+        folder: where it lies; None where it is no recording.
     """
 
     name: str
@@ -134,6 +135,7 @@ class FrameSequence:
     skipped: tuple[Skipped, ...] = ()
     names_on_disk: tuple[str, ...] = ()
     posed: bool = True
+    folder: Path | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

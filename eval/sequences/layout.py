@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -112,7 +113,8 @@ def open_sequence(
         raise ValueError(f"{path} has not the layout {layout!r}: looked for {looked_for}")
     if layout != "kitti360":
         options.reject(layout, "drive", "scans")
-    return convert_poses(open_reader(path, options), poses)
+    sequence = replace(open_reader(path, options), folder=path if path.is_dir() else path.parent)
+    return convert_poses(sequence, poses)
 
 
 def detect_layout(path: Path, explicit: bool = False) -> str:

@@ -18,7 +18,7 @@ CLEARANCE = 0.38  # between furniture and any way: 0.3 m for the camera, and the
 OVERHEAD = 2.0  # things whose lower edge is higher than this hang over a way [m]
 LIGHTS = 3  # of a room at most
 _FROM_WALL = 0.02  # the skirting board stands between [m]
-_HALL_FROM = 7.0  # rooms with a side from here on are furnished as halls [m]
+_HALL_FROM = 7.0  # rooms with a side from here on are stock as halls [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Light:
 
 @dataclass(eq=False)
 class Furnished:
-    """What a room holds; it grows while the room is furnished.
+    """What a room holds; it grows while the room is stock.
 
     Attributes:
         parts: primitives.
@@ -63,24 +63,24 @@ def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np
         palette: of the room.
         rng: where the draws come from.
     """
-    found = Furnished()
+    stock = Furnished()
     for door in doors:
         across = door.along * (door.width / 2 + 0.15) + np.abs(door.normal) * 0.5
         low, high = door.middle - across, door.middle + across
-        found.taken.append(np.array([[low[0], -door.height - 0.1, low[1]], [high[0], 0.0, high[1]]]))
+        stock.taken.append(np.array([[low[0], -door.height - 0.1, low[1]], [high[0], 0.0, high[1]]]))
     near = way[((way > room.lower - 1) & (way < room.upper + 1)).all(1)]
-    _ceiling_lamps(found, room, palette, rng)
+    _ceiling_lamps(stock, room, palette, rng)
     if rng.random() < 0.7:
-        _rug(found, room, palette, rng)
-    _furniture(found, room, near, palette, rng)
+        _rug(stock, room, palette, rng)
+    _furniture(stock, room, near, palette, rng)
     for _ in range(int(rng.integers(1, 3))):
-        _window(found, room, near, palette, rng)
+        _window(stock, room, near, palette, rng)
     for _ in range(int(rng.integers(2, 6))):
-        _picture(found, room, near, palette, rng)
-    return found
+        _picture(stock, room, near, palette, rng)
+    return stock
 
 
-def _furniture(found: Furnished, room: Room, way: Array, palette: Palette, rng: np.random.Generator) -> None:
+def _furniture(stock: Furnished, room: Room, way: Array, palette: Palette, rng: np.random.Generator) -> None:
     size = room.upper - room.lower
     large = size.max() >= _HALL_FROM
     wanted, placed = round(float(room.style.furniture * size.prod())), 0
@@ -96,10 +96,10 @@ def _furniture(found: Furnished, room: Room, way: Array, palette: Palette, rng: 
             spot = rng.uniform(room.lower, room.upper)
         else:
             spot, yaw = _at_wall(room, piece.width * scale, rng)
-        if _place(found, room, way, piece, spot, yaw, scale):
+        if _place(stock, room, way, piece, spot, yaw, scale):
             placed += 1
             if piece.name == "table":
-                _chairs(found, room, way, piece, spot, yaw, scale, palette, rng)
+                _chairs(stock, room, way, piece, spot, yaw, scale, palette, rng)
 
 
 def _at_wall(room: Room, width: float, rng: np.random.Generator, gap: float = _FROM_WALL) -> tuple[Array, float]:
@@ -116,7 +116,7 @@ def _at_wall(room: Room, width: float, rng: np.random.Generator, gap: float = _F
 
 
 def _place(
-    found: Furnished,
+    stock: Furnished,
     room: Room,
     way: Array,
     piece: Piece,
@@ -136,14 +136,14 @@ def _place(
         return False
     if -space[0, 1] > room.height - 0.08 or (bottom < OVERHEAD and _to_way(way, low, high) < CLEARANCE):
         return False
-    for other in found.taken:
+    for other in stock.taken:
         if other is not ignore and (space[0] < other[1] + 0.02).all() and (space[1] > other[0] - 0.02).all():
             return False
-    found.taken.append(space)
+    stock.taken.append(space)
     base = np.array([spot[0], -bottom, spot[1]])
     for p in piece.parts:
         centre = base + R @ (p.centre * scale)
-        found.parts.append(Part(p.kind, centre, p.half * scale, p.finish, R @ p.rotation, p.taper, label=piece.name))
+        stock.parts.append(Part(p.kind, centre, p.half * scale, p.finish, R @ p.rotation, p.taper, label=piece.name))
     return True
 
 
@@ -155,7 +155,7 @@ def _to_way(way: Array, low: Array, high: Array) -> float:
 
 
 def _chairs(
-    found: Furnished,
+    stock: Furnished,
     room: Room,
     way: Array,
     piece: Piece,
@@ -166,18 +166,18 @@ def _chairs(
     rng: np.random.Generator,
 ) -> None:
     """Chairs around a table that was just placed, pushed under it halfway."""
-    own = found.taken[-1]
+    own = stock.taken[-1]
     middle = spot + scale * piece.depth / 2 * np.array([np.sin(yaw), np.cos(yaw)])
     model, wanted = chair(rng, palette), int(rng.integers(1, 4))
     for angle in yaw + np.pi / 2 * rng.permutation(4):
         reach = scale * (0.22 + (piece.depth if abs(np.cos(angle - yaw)) > 0.5 else piece.width) / 2)
         outward = np.array([np.sin(angle), np.cos(angle)])
         facing = float(angle + np.pi + rng.normal(0, 0.1))
-        if wanted and _place(found, room, way, model, middle + reach * outward, facing, scale, ignore=own):
+        if wanted and _place(stock, room, way, model, middle + reach * outward, facing, scale, ignore=own):
             wanted -= 1
 
 
-def _ceiling_lamps(found: Furnished, room: Room, palette: Palette, rng: np.random.Generator) -> None:
+def _ceiling_lamps(stock: Furnished, room: Room, palette: Palette, rng: np.random.Generator) -> None:
     size, style = room.upper - room.lower, room.style
     count = 2 if size.max() > 5 else 1
     warm = float(rng.uniform(*style.warmth))
@@ -190,28 +190,28 @@ def _ceiling_lamps(found: Furnished, room: Room, palette: Palette, rng: np.rando
         x, z = room.centre + offset + rng.uniform(-0.2, 0.2, 2)
         drop = min(0.08, room.height - OVERHEAD - 0.22) + (room.height - 2.9 if room.height > 3.2 else 0.0)
         if what == 0:
-            found.parts.append(tube((x, -room.height + drop + 0.1, z), 0.22, 0.09, shade, 0.5))
+            stock.parts.append(tube((x, -room.height + drop + 0.1, z), 0.22, 0.09, shade, 0.5))
         elif what == 1:
-            found.parts.append(ball((x, -room.height + drop + 0.1, z), (0.17, 0.1, 0.17), shade))
+            stock.parts.append(ball((x, -room.height + drop + 0.1, z), (0.17, 0.1, 0.17), shade))
         else:
-            found.parts.append(box((x, -room.height + drop + 0.05, z), (0.3, 0.03, 0.3), shade))
+            stock.parts.append(box((x, -room.height + drop + 0.05, z), (0.3, 0.03, 0.3), shade))
         if drop > 0.02:
-            found.parts.append(tube((x, -room.height + drop / 2, z), 0.012, drop / 2, metal))
+            stock.parts.append(tube((x, -room.height + drop / 2, z), 0.012, drop / 2, metal))
         power = float(rng.uniform(*style.brightness)) / count**0.7
-        found.lights.append(Light(np.array([x, -room.height + drop + 0.16, z]), color * power, 0.5 * size.mean(), 0.25))
+        stock.lights.append(Light(np.array([x, -room.height + drop + 0.16, z]), color * power, 0.5 * size.mean(), 0.25))
 
 
-def _rug(found: Furnished, room: Room, palette: Palette, rng: np.random.Generator) -> None:
+def _rug(stock: Furnished, room: Room, palette: Palette, rng: np.random.Generator) -> None:
     x, z = room.centre + rng.uniform(-0.3, 0.3, 2)
     half = (room.upper - room.lower) * rng.uniform(0.2, 0.32, 2)
     finish = palette.finish("cloth")
     if rng.random() < 0.35:
-        found.parts.append(tube((x, -0.006, z), float(half.min()), 0.007, finish))
+        stock.parts.append(tube((x, -0.006, z), float(half.min()), 0.007, finish))
     else:
-        found.parts.append(box((x, -0.006, z), (half[0], 0.007, half[1]), finish, yaw=float(rng.normal(0, 0.1))))
+        stock.parts.append(box((x, -0.006, z), (half[0], 0.007, half[1]), finish, yaw=float(rng.normal(0, 0.1))))
 
 
-def _window(found: Furnished, room: Room, way: Array, palette: Palette, rng: np.random.Generator) -> None:
+def _window(stock: Furnished, room: Room, way: Array, palette: Palette, rng: np.random.Generator) -> None:
     """A window with a frame, sometimes with curtains, and its daylight."""
     w, h = rng.uniform(0.45, 0.8), rng.uniform(0.45, 0.6)
     sill = rng.uniform(0.8, 0.95)
@@ -230,17 +230,17 @@ def _window(found: Furnished, room: Room, way: Array, palette: Palette, rng: np.
     piece = Piece("window", parts, 2 * w + 0.55, 0.1, 2 * h + 0.14)
     for _ in range(8):
         spot, yaw = _at_wall(room, piece.width, rng, 0.006)
-        if _place(found, room, way, piece, spot, yaw, 1.0, bottom=sill):
+        if _place(stock, room, way, piece, spot, yaw, 1.0, bottom=sill):
             inward = np.array([np.sin(yaw), 0.0, np.cos(yaw)])
             at = np.array([spot[0], -sill - h, spot[1]]) + 0.35 * inward
-            if len(found.lights) < LIGHTS:
+            if len(stock.lights) < LIGHTS:
                 power = 0.55 * float(rng.uniform(*room.style.brightness))
                 color = np.array([0.88, 0.97, 1.15]) * power
-                found.lights.append(Light(at, color, 0.45 * float((room.upper - room.lower).mean()), 0.5))
+                stock.lights.append(Light(at, color, 0.45 * float((room.upper - room.lower).mean()), 0.5))
             return
 
 
-def _picture(found: Furnished, room: Room, way: Array, palette: Palette, rng: np.random.Generator) -> None:
+def _picture(stock: Furnished, room: Room, way: Array, palette: Palette, rng: np.random.Generator) -> None:
     """A framed picture, or a clock."""
     if rng.random() < 0.15:
         round_ = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -255,5 +255,5 @@ def _picture(found: Furnished, room: Room, way: Array, palette: Palette, rng: np
         piece = Piece("picture", parts, 2 * w, 0.04, 2 * h)
     for _ in range(6):
         spot, yaw = _at_wall(room, piece.width, rng, 0.006)
-        if _place(found, room, way, piece, spot, yaw, 1.0, bottom=float(rng.uniform(1.3, 1.6))):
+        if _place(stock, room, way, piece, spot, yaw, 1.0, bottom=float(rng.uniform(1.3, 1.6))):
             return

@@ -70,9 +70,9 @@ class Door:
 def lay_out(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]]:
     """Draws the rooms; door i joins room i + 1 to an earlier one."""
     while True:
-        found = _try_layout(style, rng)
-        if found is not None:
-            return found
+        layout = _try_layout(style, rng)
+        if layout is not None:
+            return layout
 
 
 def _try_layout(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]] | None:
@@ -148,12 +148,12 @@ def shell(index: int, room: Room, doors: list[Door], palette: Palette) -> Iterat
 def _openings(index: int, room: Room, axis: int, sign: int, doors: list[Door]) -> list[tuple[float, float, float]]:
     """(start, end, height) of the doorways in one wall, in order along it [m]."""
     wall = room.upper[axis] if sign > 0 else room.lower[axis]
-    found = []
+    gaps = []
     for door in doors:
         if index in door.rooms and abs(door.normal[axis]) > 0.5 and abs(door.middle[axis] - wall) < door.thickness:
             s = float(door.middle[1 - axis])
-            found.append((s - door.width / 2, s + door.width / 2, door.height))
-    return sorted(found)
+            gaps.append((s - door.width / 2, s + door.width / 2, door.height))
+    return sorted(gaps)
 
 
 def _wall(

@@ -26,11 +26,11 @@ def ways(rooms: list[Room], doors: list[Door]) -> tuple[Array, ...]:
     Way 2 k + 1 goes round in each of the rooms 0 to k and comes back; way 2 k takes the shorter side of every
     ellipse where it passes through a room. The last one sees the most.
     """
-    found = []
+    routes = []
     for last in range(len(rooms)):
         for full in (False, True):
-            found.append(_sampled(np.array(_circuit(rooms[: last + 1], doors[:last], full))))
-    return tuple(found)
+            routes.append(_sampled(np.array(_circuit(rooms[: last + 1], doors[:last], full))))
+    return tuple(routes)
 
 
 def ring_radii(room: Room) -> Array:

@@ -61,8 +61,8 @@ def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin:
     kinds, rooms = _merged(spans, _TEXTURES), _merged(spans, 4 * _TEXTURES)
     hits = _hits(tour, own, depth[order], direction.index_select(1, order), origin, pixel_angle, kinds)
     light = torch.maximum(_light(tour, hits, rooms), s.look[:, 7][own])
-    found = torch.empty_like(light)
-    return found.index_copy_(1, order, _albedo(tour, hits, spans) * light)
+    radiance = torch.empty_like(light)
+    return radiance.index_copy_(1, order, _albedo(tour, hits, spans) * light)
 
 
 def _merged(spans: list[Span], divisor: int) -> list[Span]:
@@ -152,15 +152,15 @@ def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:
     look = tour.surfaces.look.T.contiguous().index_select(1, hits.surface)
     own = hits.uv / look[6]
     shifted, pixel = own + look[8:10], hits.footprint / look[6]
-    found = []
+    colours = []
     for value, start, end in spans:
         part = slice(start, end)
         first, second = look[:3, part], look[3:6, part]
         u, v = shifted[:, part]
         own_u, own_v = own[:, part]
         patch = Patch(u, v, own_u, own_v, pixel[part], first, second, tour.noise)
-        found.append(albedo(value % _TEXTURES, patch))
-    return torch.cat(found, dim=1)
+        colours.append(albedo(value % _TEXTURES, patch))
+    return torch.cat(colours, dim=1)
 
 
 def _light(tour: Tour, hits: Hits, rooms: list[Span]) -> Tensor:

@@ -141,9 +141,9 @@ def _fill(
     for index, room in enumerate(rooms):
         own = [door for door in doors if index in door.rooms]
         parts += shell(index, room, own, palettes[index])
-        found = furnish(room, own, way, palettes[index], things)
-        parts += [replace(p, rooms=(index, -1)) for p in found.parts]
-        lights.append(found.lights)
+        stock = furnish(room, own, way, palettes[index], things)
+        parts += [replace(p, rooms=(index, -1)) for p in stock.parts]
+        lights.append(stock.lights)
     for door in doors:
         parts += frame(door, palettes[door.rooms[0]].finish("wood"))
     return parts, lights

@@ -27,12 +27,12 @@ def surface_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, wid
     first, second = tour.surfaces.rooms.unbind(1)
     candidates = torch.nonzero(seen[first] | ((second != NOBODY) & seen[second.clamp_min(0)])).flatten()
     outlines = _outlines(tour.surfaces.corners[candidates], T_world_cam, K, height, width)
-    found = []
+    windows = []
     for i, (a, b), outline in zip(candidates.tolist(), tour.surfaces.rooms[candidates].tolist(), outlines, strict=True):
         window = _intersection(outline, rooms[a] if b == NOBODY else _union(rooms[a], rooms[b]))
         if window is not _EMPTY:
-            found.append((i, window))
-    return found
+            windows.append((i, window))
+    return windows
 
 
 def room_windows(tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int) -> list[Window]:

@@ -29,7 +29,7 @@ def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tens
         sizes: [R, L] of the lights [m].
         casts: [N] bool which primitives cast a shadow.
     """
-    found = torch.ones(*lights.shape[:2], *GRID)
+    volume = torch.ones(*lights.shape[:2], *GRID)
     for r, (lower, upper) in enumerate(rooms.float()):
         x, y, z = (lower[k] + (upper[k] - lower[k]) * torch.linspace(0, 1, GRID[n]) for k, n in enumerate((2, 0, 1)))
         points = (x, y[:, None, None], z[:, None])
@@ -41,8 +41,8 @@ def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tens
             for offset in _SAMPLES:
                 lamp = lights[r, k, :3] + 0.5 * sizes[r, k] * torch.tensor(offset)
                 reached += _visible(points, lamp, surfaces, casters)
-            found[r, k] = reached / len(_SAMPLES)
-    return found
+            volume[r, k] = reached / len(_SAMPLES)
+    return volume
 
 
 def _casters(surfaces: Surfaces, casts: Tensor, room: int) -> list[int]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ufmstar_torch.arguments import require_float, require_mask
+from ufmstar_torch.arguments import require_float, require_mask, require_whole
 from ufmstar_torch.fixed_order import apply, product
 from ufmstar_torch.frame import FrameInput
 
@@ -31,12 +31,14 @@ class Anchors:
         depth: [B, N] along the optical axis [m].
         variance: [B, N] of ``depth`` [m^2].
         valid: [B, N] bool, True = use; None = all.
+        confirmed: [B, N] int64, in how many later views each was confirmed; None = unknown.
     """
 
     pixel: Tensor
     depth: Tensor
     variance: Tensor
     valid: Tensor | None = None
+    confirmed: Tensor | None = None
 
     @classmethod
     def from_points(
@@ -105,8 +107,8 @@ class Anchors:
 
     def to(self, device: torch.device | str) -> Anchors:
         """The same on another device."""
-        valid = None if self.valid is None else self.valid.to(device)
-        return Anchors(self.pixel.to(device), self.depth.to(device), self.variance.to(device), valid)
+        moved = (None if part is None else part.to(device) for part in (self.valid, self.confirmed))
+        return Anchors(self.pixel.to(device), self.depth.to(device), self.variance.to(device), *moved)
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ class AnchorInput:
         own_variance: [B, N] what the network itself claims there, A + E as far as they are used [m^2].
         valid: [B, N] bool: finite, depth > 0, 0 <= variance < depth^2, off from the prediction by a factor of at most
             100, on a valid pixel, not masked.
+        confirmed: [B, N] int64, in how many later views each was confirmed; None = unknown.
     """
 
     pixel: Tensor
@@ -130,6 +133,7 @@ class AnchorInput:
     variance: Tensor
     own_variance: Tensor
     valid: Tensor
+    confirmed: Tensor | None = None
 
 
 def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | None) -> AnchorInput:
@@ -158,6 +162,9 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
     valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & pixel.isfinite().all(-1)
     if anchors.valid is not None:
         valid = valid & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
+    confirmed = anchors.confirmed
+    if confirmed is not None:
+        confirmed = require_whole("anchors.confirmed", confirmed, shape, frame.depth).long()
     pixel = torch.where(valid[..., None], pixel, torch.zeros_like(pixel))
     u, v = pixel.round().long().unbind(-1)
     index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
@@ -174,6 +181,7 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
         variance=torch.where(valid, variance, zero),
         own_variance=torch.where(valid, own, zero),
         valid=valid,
+        confirmed=confirmed,
     )
 
 

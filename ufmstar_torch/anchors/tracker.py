@@ -87,13 +87,17 @@ class Landmarks:
         pixel: [N, 2] position (u, v) [px].
         depth: [N] along the optical axis [m].
         variance: [N] of ``depth`` [m^2].
-        tracked: corners followed into this image, of which these N passed all tests.
+        tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
+        confirmed: [N] int64, in how many later views each was confirmed; None = unknown.
+        none: why there is no landmark, where N = 0 and ``tracked`` > 0.
     """
 
     pixel: NDArray[np.float64]
     depth: NDArray[np.float64]
     variance: NDArray[np.float64]
     tracked: int
+    confirmed: NDArray[np.int64] | None = None
+    none: str = "no parallax, or no track that fits the poses"
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
         """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
@@ -111,13 +115,14 @@ class Landmarks:
         if room < n:
             raise ValueError(f"capacity must be at least the number of landmarks, {n}, got {capacity}")
 
-        def padded(values: NDArray) -> Tensor:
-            full = np.zeros((1, room, *values.shape[1:]))
+        def padded(values: NDArray, dtype: type = np.float64) -> Tensor:
+            full = np.zeros((1, room, *values.shape[1:]), dtype)
             full[0, :n] = values
             return torch.from_numpy(full).to(intrinsics.device)
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
-        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid)
+        confirmed = None if self.confirmed is None else padded(self.confirmed, np.int64)
+        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, confirmed)
         return found.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
@@ -135,9 +140,16 @@ class LandmarkTracker:
             out = ufm(depth, T_world_cam, K_map, anchors=landmarks.anchors(K, K_map))
     """
 
+    needs_image = True
+
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = config if config is not None else TrackerConfig()
         self.reset()
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Plain values on which the landmarks depend."""
+        return {"anchors": "tracked", "tracker": self.config.to_dict()}
 
     def reset(self) -> None:
         """Forget everything."""
@@ -171,7 +183,9 @@ class LandmarkTracker:
         self._gray, self._K = (gray, K) if gray.size else (None, None)
         self._view = int(state["view"])
 
-    def update(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64]) -> Landmarks:
+    def update(
+        self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
         """Take in the next image.
 
         Args:
@@ -183,11 +197,12 @@ class LandmarkTracker:
             The landmarks that it shows; none before there is parallax.
 
         Raises:
+            TypeError: ``image`` is no array.
             ValueError: wrong shape or dtype, a pose that is not finite, another size or camera than before (call
                 :meth:`reset` first); the tracker is as it was then.
             ModuleNotFoundError: OpenCV is not installed.
         """
-        gray, T, K = _checked(image, T_world_cam, K)
+        gray, T, K = checked(image, T_world_cam, K)
         if self._gray is not None and self._K is not None:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
                 raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
@@ -251,12 +266,14 @@ class LandmarkTracker:
         return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
 
 
-def _checked(image: NDArray, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
+def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
     """Gray image, pose and intrinsics.
 
     Raises:
-        ValueError: as :meth:`LandmarkTracker.update`.
+        TypeError, ValueError: as :meth:`LandmarkTracker.update`.
     """
+    if not isinstance(image, np.ndarray):
+        raise TypeError(f"image must be a NumPy array [H, W, 3] or [H, W], got {type(image).__name__}")
     if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ValueError(f"image must be uint8 [H, W, 3] or [H, W], got {image.dtype} {image.shape}")
     T, K = np.asarray(T_world_cam, dtype=np.float64), np.asarray(K, dtype=np.float64)

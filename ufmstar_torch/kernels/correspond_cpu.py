@@ -1,4 +1,4 @@
-"""Correspondence on the CPU (numba): candidates first, so that what is out of view costs nothing."""
+"""Correspondence on the CPU (numba) as a list of pairs: what is out of view costs nothing, and no matrix is formed."""
 
 from __future__ import annotations
 
@@ -6,41 +6,67 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 from numba import njit
-from torch import Tensor
 
-from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.gaussian import PIXEL_VARIANCE
-from ufmstar_torch.mixture import GaussianMixture
-
-compiled: Any = njit(cache=True, nogil=True)
+compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 
 
-def correspond(
-    previous_cam: GaussianMixture,
-    current_cam: GaussianMixture,
-    intrinsics: Tensor,
-    size: tuple[int, int],
-    config: UfMStarConfig,
-) -> Correspondence:
-    """As :func:`ufmstar_torch.correspond.correspond`, for CPU tensors."""
-    b, k = previous_cam.weight.shape
-    overlap = np.zeros((b, current_cam.capacity, k))
-    match = np.zeros(overlap.shape, dtype=np.bool_)
+@compiled
+def matches(mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening):
+    """The matched pairs of one stream, as :func:`ufmstar_torch.correspond.correspond` states them.
 
-    def arrays(mixture: GaussianMixture) -> list[np.ndarray]:
-        fields = (mixture.mean, mixture.covariance, mixture.weight)
-        return [value.detach().double().contiguous().numpy() for value in fields]
+    Components k [K] and c [C] are in the camera frame, float64.
 
-    camera = intrinsics.detach().double().contiguous().numpy()
-    thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    previous, current = arrays(previous_cam), arrays(current_cam)
-    for s in range(b):
-        streams = (*(value[s] for value in previous), *(value[s] for value in current), camera[s])
-        _stream(*streams, *size, *thresholds, match[s], overlap[s])
-    return Correspondence(torch.from_numpy(match), torch.from_numpy(overlap))
+    Returns:
+        c [P], k [P] and the overlap beta_ck [P] of every pair, in increasing c and then k.
+    """
+    index_k, image_k = _project(mean_k, cov_k, weight_k, K, height, width, near, widening)
+    index_c, image_c = _project(mean_c, cov_c, weight_c, K, height, width, near, widening)
+    limit, limit_occl = _limit(eta), _limit(eta_occl)
+    members, overlap = np.empty(index_k.size, np.int64), np.empty(index_k.size)
+    c, k, beta = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64)
+    pairs = 0
+    for i in range(index_c.size):
+        n = 0
+        for j in range(index_k.size):
+            if _far(image_c[i], image_k[j], limit):
+                continue
+            overlap[n] = _bhattacharyya(image_c[i], image_k[j])
+            members[n] = j
+            n += overlap[n] >= eta
+        for a in range(n):
+            if _hidden(image_k, members, n, a, eta_occl, limit_occl):
+                continue
+            if pairs == c.size:
+                c, k, beta = _longer(c), _longer(k), _longer(beta)
+            c[pairs], k[pairs], beta[pairs] = index_c[i], index_k[members[a]], overlap[a]
+            pairs += 1
+    return c[:pairs], k[:pairs], beta[:pairs]
+
+
+@compiled
+def _limit(eta):
+    """Of the squared distance from which on the overlap is certainly below eta, with room for rounding."""
+    return -8 * math.log(eta) * (1 + 1e-9) + 1e-9
+
+
+@compiled
+def _longer(values):
+    out = np.empty(2 * values.size, values.dtype)
+    for i in range(values.size):
+        out[i] = values[i]
+    return out
+
+
+@compiled
+def _hidden(image, members, n, a, eta_occl, limit):
+    """Whether a nearer member covers member ``a``."""
+    far = image[members[a]]
+    for b in range(n):
+        near = image[members[b]]
+        if near[5] < far[5] and not _far(near, far, limit) and _bhattacharyya(near, far) > eta_occl:
+            return True
+    return False
 
 
 @compiled
@@ -69,6 +95,13 @@ def _project(mean, covariance, weight, K, height, width, near, widening):
 
 
 @compiled
+def _far(p, q, limit):
+    """Whether two projected Gaussians are too far apart: d^T S^-1 d >= d_x^2 / S_xx, S their mean covariance."""
+    dx, dy = p[0] - q[0], p[1] - q[1]
+    return dx * dx > limit * 0.5 * (p[2] + q[2]) or dy * dy > limit * 0.5 * (p[4] + q[4])
+
+
+@compiled
 def _bhattacharyya(p, q):
     """Overlap of two projected Gaussians."""
     xx, xy, yy = 0.5 * (p[2] + q[2]), 0.5 * (p[3] + q[3]), 0.5 * (p[4] + q[4])
@@ -77,30 +110,3 @@ def _bhattacharyya(p, q):
     dx, dy = p[0] - q[0], p[1] - q[1]
     squared = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det
     return math.exp(-squared / 8) * min(1.0, math.sqrt(math.sqrt(product) / det))
-
-
-@compiled
-def _stream(
-    mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening, match, overlap
-):
-    """One stream: overlaps of all candidate pairs, then the occlusion filter within each set."""
-    index_k, image_k = _project(mean_k, cov_k, weight_k, K, height, width, near, widening)
-    index_c, image_c = _project(mean_c, cov_c, weight_c, K, height, width, near, widening)
-    members = np.empty(index_k.size, np.int64)
-    for i in range(index_c.size):
-        n = 0
-        for j in range(index_k.size):
-            beta = _bhattacharyya(image_c[i], image_k[j])
-            overlap[index_c[i], index_k[j]] = beta
-            if beta >= eta:
-                members[n] = j
-                n += 1
-        for a in range(n):
-            far = image_k[members[a]]
-            hidden = False
-            for b in range(n):
-                near_one = image_k[members[b]]
-                if near_one[5] < far[5] and _bhattacharyya(near_one, far) > eta_occl:
-                    hidden = True
-                    break
-            match[index_c[i], index_k[members[a]]] = not hidden

@@ -1,4 +1,4 @@
-"""Fusion on the CPU (numba): the floor of covariances, and one pass over the matched pairs.
+"""Fusion on the CPU (numba): the floor of covariances, one pass over the matched pairs, and what is appended.
 
 The scalar twins of ``ufmstar_torch.gaussian`` stand here and not in a file of their own: numba's cache of a compiled
 function notices edits in its own file only.
@@ -10,51 +10,12 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 from numba import njit
-from torch import Tensor
-
-from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.mixture import GaussianMixture
 
 compiled: Any = njit(cache=True, nogil=True)
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
-
-
-def fuse(
-    mixture: GaussianMixture,
-    current: GaussianMixture,
-    pairs: Correspondence,
-    config: UfMStarConfig,
-    *,
-    rounds: int | None = None,
-) -> GaussianMixture:
-    """As :func:`ufmstar_torch.fuse.fuse`, for CPU tensors; ``rounds`` is not needed here."""
-    fused = GaussianMixture(**{name: value.detach().clone() for name, value in mixture.tensors().items()})
-    out = [value.numpy() for value in fused.tensors().values()]
-    new = (current.mean, current.covariance, current.weight, current.features)
-    _fuse(
-        *out,
-        *(value.detach().to(torch.float64).contiguous().numpy() for value in new),
-        pairs.match.contiguous().numpy(),
-        pairs.overlap.contiguous().numpy(),
-        pairs.distance is None,
-        (pairs.overlap if pairs.distance is None else pairs.distance).contiguous().numpy(),
-        config.overlap_weighted,
-        float(torch.finfo(mixture.covariance.dtype).eps),
-    )
-    return fused
-
-
-def floor_covariance(covariance: Tensor, floor: Tensor) -> Tensor:
-    """As :func:`ufmstar_torch.gaussian.floor_covariance` for positive semidefinite float64 CPU tensors."""
-    lifted = covariance.detach().to(torch.float64, copy=True).contiguous()
-    limits = floor.detach().double().expand(lifted.shape[:-2]).contiguous()
-    _floor(lifted.view(-1, 3, 3).numpy(), limits.view(-1).numpy())
-    return lifted
 
 
 @compiled
@@ -172,8 +133,8 @@ def _exceeds(S, floor):
 
 
 @compiled
-def _floor(covariance, floor):
-    """Lift the eigenvalues of every covariance [N, 3, 3] to floor [N], in place."""
+def floor_covariance(covariance, floor):
+    """Lift the eigenvalues of every positive semidefinite covariance [N, 3, 3] to floor [N], in place."""
     M, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for n in range(covariance.shape[0]):
         S = covariance[n]
@@ -195,36 +156,77 @@ def _floor(covariance, floor):
 
 
 @compiled
-def _fuse(
+def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance_out):
+    """Write the covariances of occupied slots with the floor that a segment needs (``step``): the variance across one
+    pixel, and ``epsilon`` times the trace for storage."""
+    least = np.empty(1)
+    for n in range(weight.size):
+        if not weight[n] > 0:
+            continue
+        S = covariance_out[n]
+        for i in range(3):
+            for j in range(3):
+                S[i, j] = covariance[n, i, j]
+        across = max(np.float64(mean[n, 2]), near) / focal
+        least[0] = max(across * across * widening, epsilon * (S[0, 0] + S[1, 1] + S[2, 2]))
+        floor_covariance(covariance_out[n : n + 1], least)
+
+
+@compiled
+def fuse_pairs(
     mean, covariance, weight, disagreement, count, features,
-    mean_c, cov_c, weight_c, features_c, match, overlap, wasserstein, given, overlap_weighted, epsilon,
+    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon, changed,
 ):  # fmt: skip
-    """Apply every pair in place; after each one the values take the precision they are stored in."""
+    """Fuse the pairs [P] of one stream in their order, in place, and set ``changed`` [K] at every k.
+
+    After each pair the values take the precision they are stored in. ``distance`` [P] takes the place of W2^2 where it
+    is not empty; with ``weighted``, pi_c is multiplied by the overlap [P].
+    """
     work = np.empty((6, 3, 3))
     mean_k, cov_k, least = np.empty(3), np.empty((3, 3)), np.empty(1)
-    for b in range(match.shape[0]):
-        for c in range(match.shape[1]):
-            for k in range(match.shape[2]):
-                if not match[b, c, k]:
-                    continue
-                pi_k = np.float64(weight[b, k])
-                pi_c = weight_c[b, c] * (overlap[b, c, k] if overlap_weighted else 1.0)
-                lam = pi_c / (pi_k + pi_c)
-                for i in range(3):  # no slice assignments: see _floor
-                    mean_k[i] = mean[b, k, i]
-                    for j in range(3):
-                        cov_k[i, j] = covariance[b, k, i, j]
-                distance = geodesic(mean_k, cov_k, mean_c[b, c], cov_c[b, c], lam, work)
-                if not wasserstein:
-                    distance = given[b, c, k]
-                least[0] = 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2])
-                _floor(cov_k[None], least)
-                for i in range(3):
-                    mean[b, k, i] = mean_k[i]
-                    for j in range(3):
-                        covariance[b, k, i, j] = cov_k[i, j]
-                weight[b, k] = pi_k + pi_c
-                disagreement[b, k] = (1 - lam) * np.float64(disagreement[b, k]) + lam * distance
-                for g in range(features.shape[2]):
-                    features[b, k, g] = (1 - lam) * np.float64(features[b, k, g]) + lam * features_c[b, c, g]
-                count[b, k] += 1
+    for p in range(pair_c.size):
+        c, k = pair_c[p], pair_k[p]
+        changed[k] = True
+        pi_k = np.float64(weight[k])
+        pi_c = weight_c[c] * (overlap[p] if weighted else 1.0)
+        lam = pi_c / (pi_k + pi_c)
+        for i in range(3):  # no slice assignments: see floor_covariance
+            mean_k[i] = mean[k, i]
+            for j in range(3):
+                cov_k[i, j] = covariance[k, i, j]
+        squared = geodesic(mean_k, cov_k, mean_c[c], cov_c[c], lam, work)
+        if distance.size > 0:
+            squared = distance[p]
+        least[0] = 8 * epsilon * (cov_k[0, 0] + cov_k[1, 1] + cov_k[2, 2])
+        floor_covariance(cov_k[None], least)
+        for i in range(3):
+            mean[k, i] = mean_k[i]
+            for j in range(3):
+                covariance[k, i, j] = cov_k[i, j]
+        weight[k] = pi_k + pi_c
+        disagreement[k] = (1 - lam) * np.float64(disagreement[k]) + lam * squared
+        for g in range(features.shape[1]):
+            features[k, g] = (1 - lam) * np.float64(features[k, g]) + lam * features_c[c, g]
+        count[k] += 1
+
+
+@compiled
+def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_c, weight_c, features_c, new, occupied):
+    """Add the components c where ``new`` [C] from slot ``occupied`` on, in place; return how many found no free one."""
+    slot = occupied
+    dropped = 0
+    for c in range(weight_c.size):
+        if not new[c]:
+            continue
+        if slot == weight.size:
+            dropped += 1
+            continue
+        for i in range(3):
+            mean[slot, i] = mean_c[c, i]
+            for j in range(3):
+                covariance[slot, i, j] = cov_c[c, i, j]
+        for g in range(features.shape[1]):
+            features[slot, g] = features_c[c, g]
+        weight[slot], disagreement[slot], count[slot] = weight_c[c], 0.0, 1
+        slot += 1
+    return dropped

@@ -42,64 +42,73 @@ def prepare(mean, covariance, weight):
 
 
 @compiled
-def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
-    """Regress m [B, K] and features [B, K, F] at points [B, P, 3] into out [B, P] and out_f [B, P, F]; NaN where a
-    point is not finite."""
-    for b in range(points.shape[0]):
-        index, whitening, log_peak = prepare(mean[b], covariance[b], weight[b])
-        limit = math.log(epsilon * prior_weight / max(index.size, 1))
-        boxes = _boxes(mean[b], covariance[b], index, log_peak, limit)
-        everyone = np.arange(points.shape[1])
-        near = _touched(points[b], everyone, np.arange(index.size), boxes)
-        order, leaf = _by_place(points[b], everyone, near.size)
-        sums = np.zeros(features.shape[2])
-        for first in range(0, order.size, leaf):
-            kept = _touched(points[b], order[first : first + leaf], near, boxes)
-            for p in order[first : first + leaf]:
-                x, y, z = np.float64(points[b, p, 0]), np.float64(points[b, p, 1]), np.float64(points[b, p, 2])
-                evidence, total = prior_weight, prior_weight * prior_mean
-                sums[:] = 0
-                for j in kept:
-                    k, W = index[j], whitening[j]
-                    dx, dy, dz = x - mean[b, k, 0], y - mean[b, k, 1], z - mean[b, k, 2]
-                    y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
-                    exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
-                    if exponent < limit:
-                        continue
-                    w = math.exp(exponent)
-                    evidence += w
-                    total += w * m[b, k]
-                    for g in range(sums.size):
-                        sums[g] += w * features[b, k, g]
-                known = x + y + z
-                out[b, p] = total / evidence if known - known == 0 else np.nan
-                for g in range(sums.size):
-                    out_f[b, p, g] = sums[g] / evidence if known - known == 0 else np.nan
+def unprojected(depth, valid, K, pixels, points):
+    """Points [P, 3] of pixels [P] in the dtype of depth [H, W] (``camera.unproject_at``); NaN where not valid."""
+    real = depth.dtype.type
+    fx, fy, cx, cy = real(K[0, 0]), real(K[1, 1]), real(K[0, 2]), real(K[1, 2])
+    for i in range(pixels.size):
+        v, u = pixels[i] // depth.shape[1], pixels[i] % depth.shape[1]
+        z = depth[v, u] if valid[v, u] else real(np.nan)
+        points[i, 0], points[i, 1], points[i, 2] = (real(u) - cx) / fx * z, (real(v) - cy) / fy * z, z
 
 
 @compiled
-def distribute_points(points, values, mean, covariance, weight, prior_weight, epsilon, out):
-    """Add values [B, P, C] at points [B, P, 3] to the components [B, K, C] that explain them, by their shares."""
-    for b in range(points.shape[0]):
-        index, whitening, log_peak = prepare(mean[b], covariance[b], weight[b])
-        limit = math.log(epsilon * prior_weight / max(index.size, 1))
-        chosen, density = np.empty(index.size, np.int64), np.empty(index.size)
-        for p in range(points.shape[1]):
-            x, y, z = points[b, p, 0], points[b, p, 1], points[b, p, 2]
-            evidence, n = prior_weight, 0
-            for j in range(index.size):
+def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
+    """Regress m [K] and features [K, F] at points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not
+    finite."""
+    index, whitening, log_peak = prepare(mean, covariance, weight)
+    limit = math.log(epsilon * prior_weight / max(index.size, 1))
+    boxes = _boxes(mean, covariance, index, log_peak, limit)
+    everyone = np.arange(points.shape[0])
+    near = _touched(points, everyone, np.arange(index.size), boxes)
+    order, leaf = _by_place(points, everyone, near.size)
+    sums = np.zeros(features.shape[1])
+    for first in range(0, order.size, leaf):
+        kept = _touched(points, order[first : first + leaf], near, boxes)
+        for p in order[first : first + leaf]:
+            x, y, z = np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])
+            evidence, total = prior_weight, prior_weight * prior_mean
+            sums[:] = 0
+            for j in kept:
                 k, W = index[j], whitening[j]
-                dx, dy, dz = x - mean[b, k, 0], y - mean[b, k, 1], z - mean[b, k, 2]
+                dx, dy, dz = x - mean[k, 0], y - mean[k, 1], z - mean[k, 2]
                 y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
                 exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
                 if exponent < limit:
                     continue
-                chosen[n], density[n] = k, math.exp(exponent)
-                evidence += density[n]
-                n += 1
-            for j in range(n):
-                for c in range(values.shape[2]):
-                    out[b, chosen[j], c] += density[j] / evidence * values[b, p, c]
+                w = math.exp(exponent)
+                evidence += w
+                total += w * m[k]
+                for g in range(sums.size):
+                    sums[g] += w * features[k, g]
+            known = x + y + z
+            out[p] = total / evidence if known - known == 0 else np.nan
+            for g in range(sums.size):
+                out_f[g, p] = sums[g] / evidence if known - known == 0 else np.nan
+
+
+@compiled
+def distribute_points(points, values, mean, covariance, weight, prior_weight, epsilon, out):
+    """Add values [P, C] at points [P, 3] to the components [K, C] that explain them, by their shares."""
+    index, whitening, log_peak = prepare(mean, covariance, weight)
+    limit = math.log(epsilon * prior_weight / max(index.size, 1))
+    chosen, density = np.empty(index.size, np.int64), np.empty(index.size)
+    for p in range(points.shape[0]):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        evidence, n = prior_weight, 0
+        for j in range(index.size):
+            k, W = index[j], whitening[j]
+            dx, dy, dz = x - mean[k, 0], y - mean[k, 1], z - mean[k, 2]
+            y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
+            exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
+            if exponent < limit:
+                continue
+            chosen[n], density[n] = k, math.exp(exponent)
+            evidence += density[n]
+            n += 1
+        for j in range(n):
+            for c in range(values.shape[1]):
+                out[chosen[j], c] += density[j] / evidence * values[p, c]
 
 
 @compiled

@@ -81,52 +81,51 @@ def _exp2_overload(t):
 def exact(
     depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
 ):
-    """All streams; of their blocks every ``shares``-th, from ``first`` on.
+    """One stream; of its blocks every ``shares``-th, from ``first`` on.
 
-    depth [B, H, W], valid [B, H, W], K [B, 3, 3] and the mixture [B, K, ...] into out [B, H, W] and out_f
-    [B, H, W, F]; NaN where not valid.
+    depth [H, W], valid [H, W], K [3, 3] and the mixture [K, ...] into out [H, W] and out_f [F, H, W]; NaN where not
+    valid.
     """
-    height, width = depth.shape[1:]
+    height, width = depth.shape
     side = _TILE * _SIDE
     rows, columns = (height + side - 1) // side, (width + side - 1) // side
     points, boxes = np.empty((_SIDE * _SIDE, 3, _PIXELS)), np.empty((_SIDE * _SIDE, 2, 3))
     seen = np.empty(_SIDE * _SIDE, np.bool_)
-    buffer, sums = np.empty(7 * _PIXELS, out.dtype), np.empty((features.shape[2], _PIXELS), out.dtype)
+    buffer, sums = np.empty(7 * _PIXELS, out.dtype), np.empty((features.shape[1], _PIXELS), out.dtype)
     coefficient, least = np.empty(22, out.dtype), math.log2(_PRIOR * prior_weight)
-    for b in range(depth.shape[0]):
-        index, whitening, log_peak = prepare(mean[b], covariance[b], weight[b])
-        limit = _limit(epsilon, index.size) + least
-        index, fields = _visible(mean[b], covariance[b], index, whitening, log_peak, K[b], height, width, limit)
-        rays = _rays(K[b], height, width)
-        everyone, near = np.empty((_FIELDS, index.size), out.dtype), np.empty((_FIELDS, index.size), out.dtype)
-        bounds = np.empty((2, index.size), out.dtype)
-        in_block, in_tile = np.empty(index.size, np.int64), np.empty(index.size, np.int64)
+    index, whitening, log_peak = prepare(mean, covariance, weight)
+    limit = _limit(epsilon, index.size) + least
+    index, fields = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit)
+    rays = _rays(K, height, width)
+    everyone, near = np.empty((_FIELDS, index.size), out.dtype), np.empty((_FIELDS, index.size), out.dtype)
+    bounds = np.empty((2, index.size), out.dtype)
+    in_block, in_tile = np.empty(index.size, np.int64), np.empty(index.size, np.int64)
+    for i in range(_FIELDS):
+        for k in range(index.size):
+            everyone[i, k] = fields[k, i]
+    for block in range(first, rows * columns, shares):
+        v0, u0 = block // columns * side, block % columns * side
+        if not _points(depth, valid, rays, v0, u0, points, boxes, seen):
+            _blank(v0, u0, side, out, out_f)
+            continue
+        low, high = _union(boxes, seen)
+        n = _cull(everyone, index.size, low, high, epsilon, least, bounds, in_block)
         for i in range(_FIELDS):
-            for k in range(index.size):
-                everyone[i, k] = fields[k, i]
-        for block in range(first, rows * columns, shares):
-            v0, u0 = block // columns * side, block % columns * side
-            if not _points(depth[b], valid[b], rays, v0, u0, points, boxes, seen):
-                _blank(v0, u0, side, out[b], out_f[b])
+            for j in range(n):
+                near[i, j] = everyone[i, in_block[j]]
+        for tile in range(_SIDE * _SIDE):
+            v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
+            if not seen[tile]:
+                _blank(v, u, _TILE, out, out_f)
                 continue
-            low, high = _union(boxes, seen)
-            n = _cull(everyone, index.size, low, high, epsilon, least, bounds, in_block)
-            for i in range(_FIELDS):
-                for j in range(n):
-                    near[i, j] = everyone[i, in_block[j]]
-            for tile in range(_SIDE * _SIDE):
-                v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
-                if not seen[tile]:
-                    _blank(v, u, _TILE, out[b], out_f[b])
-                    continue
-                count = _cull(near, n, boxes[tile, 0], boxes[tile, 1], epsilon, least, bounds, in_tile)
-                for j in range(count):
-                    in_tile[j] = in_block[in_tile[j]]
-                _sum(
-                    points[tile], boxes[tile, 0, 2], in_tile, count, index, fields, m[b], features[b],
-                    prior_weight, prior_mean, buffer, sums, coefficient,
-                )  # fmt: skip
-                _finish(valid[b], v, u, buffer, sums, out[b], out_f[b])
+            count = _cull(near, n, boxes[tile, 0], boxes[tile, 1], epsilon, least, bounds, in_tile)
+            for j in range(count):
+                in_tile[j] = in_block[in_tile[j]]
+            _sum(
+                points[tile], boxes[tile, 0, 2], in_tile, count, index, fields, m, features,
+                prior_weight, prior_mean, buffer, sums, coefficient,
+            )  # fmt: skip
+            _finish(valid, v, u, buffer, sums, out, out_f)
 
 
 @compiled
@@ -262,8 +261,8 @@ def _blank(v_low, u_low, side, out, out_f):
     for v in range(v_low, min(v_low + side, out.shape[0])):
         for u in range(u_low, min(u_low + side, out.shape[1])):
             out[v, u] = np.nan
-            for g in range(out_f.shape[2]):
-                out_f[v, u, g] = np.nan
+            for g in range(out_f.shape[0]):
+                out_f[g, v, u] = np.nan
 
 
 @contracted
@@ -409,4 +408,4 @@ def _finish(valid, v0, u0, buffer, sums, out, out_f):
             i = (v - v0) * _TILE + u - u0
             out[v, u] = buffer[_TOTAL + i] if valid[v, u] else nan
             for g in range(sums.shape[0]):
-                out_f[v, u, g] = sums[g, i] / buffer[_EVIDENCE + i] if valid[v, u] else nan
+                out_f[g, v, u] = sums[g, i] / buffer[_EVIDENCE + i] if valid[v, u] else nan

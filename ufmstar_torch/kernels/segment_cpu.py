@@ -89,7 +89,7 @@ def _limits(given: SegmentInput, before_pruning: bool) -> _Limits:
         noise_thresh=float(c.noise_thresh),
         line_thresh=float(c.line_thresh),
         angle2=float(c.angle_cosine) ** 2,
-        max_depth=float(c.max_depth),
+        max_depth=float(c.depth_limit),
         shortest_bin=float(c.min_gaussian_length),
         longest_bin=float(c.frame_max_scale * c.min_gaussian_length),
         depth_bins=given.depth_bins,

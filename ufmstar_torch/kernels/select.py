@@ -9,42 +9,89 @@ from typing import Any
 
 from torch import Tensor
 
+from ufmstar_torch.frame import CheckKernel, check_values
+from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
+from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
 from ufmstar_torch.posterior.update import PosteriorKernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
 
+_TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
+
 
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device; arguments and errors as :func:`select_kernels`."""
-    return functools.partial(step, kernels=select_kernels(name, device_type))
-
-
-def select_kernels(name: str, device_type: str) -> Kernels:
-    """The kernels for a device.
+    """The step for a device.
 
     Args:
         name: "torch": the reference on every device; it waits for the device only where the mixture may
-            have to grow. "numba": compiled CPU kernels, CPU tensors only. "auto": numba on the CPU where it can be
-            imported; on an accelerator the torch reference, except that the segmentation, a long chain of
-            tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
+            have to grow. "numba": compiled for the CPU, CPU tensors only. "triton": for a GPU; of CPU tensors only in
+            Triton's interpreter (``TRITON_INTERPRET=1``). "auto": numba on the CPU, Triton on CUDA, ROCm and XPU, each
+            where it can be imported; on another accelerator the torch reference, except that the segmentation, a long
+            chain of tiny steps there, runs on the host: the depth map is copied over, which waits for the device.
         device_type: ``torch.device.type`` of the depth.
 
     Raises:
-        ValueError: "numba" for tensors of another device.
-        ImportError: "numba" by name where it cannot be imported.
+        ValueError: "numba" or "triton" for tensors of another device.
+        ImportError: "numba" or "triton" by name where it cannot be imported.
     """
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import step_cpu
+
+        return step_cpu.step
+    return functools.partial(step, kernels=select_kernels(name, device_type))
+
+
+def select_check(name: str, device_type: str) -> CheckKernel:
+    """The check of a frame's values; arguments and errors as :func:`select_step`."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import check_cpu
+
+        return check_cpu.check_values
+    return check_values
+
+
+def select_merge(name: str, device_type: str) -> MergeKernels:
+    """The parts of merging; arguments and errors as :func:`select_step`."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import merge_cpu
+
+        return MergeKernels(merge_cpu.partition, merge_cpu.own_shares)
+    return MERGE_REFERENCE
+
+
+def select_kernels(name: str, device_type: str) -> Kernels:
+    """The parts of the step where it is the reference's; arguments as :func:`select_step`."""
+    if _on_gpu(name, device_type):
+        return _triton()
+    if name == "torch" or device_type in ("cpu", "meta") or not _has_numba():
+        return REFERENCE
+    from ufmstar_torch.kernels import segment_cpu
+
+    return replace(REFERENCE, spgf=_on_host(segment_cpu.segment))
+
+
+def _compiled(name: str, device_type: str) -> bool:
+    """Whether the step is compiled for the CPU."""
     if name == "numba":
         if device_type != "cpu":
             raise ValueError(f"backend='numba' needs CPU tensors, got device type {device_type!r}")
-        return _numba()
-    if name == "torch" or device_type == "meta":
-        return REFERENCE
-    compiled = _numba_or_none()
-    if compiled is None or device_type == "cpu":
-        return compiled or REFERENCE
-    return replace(REFERENCE, spgf=_on_host(compiled.spgf))
+        import numba as numba  # an ImportError for who asked for it by name
+
+        return True
+    return name == "auto" and device_type == "cpu" and _has_numba()
+
+
+def _on_gpu(name: str, device_type: str) -> bool:
+    """Whether the kernels are Triton's."""
+    if name == "triton":
+        from ufmstar_torch.kernels.triton.launch import interpreted
+
+        if device_type not in _TRITON_DEVICES and not (device_type == "cpu" and interpreted()):
+            raise ValueError(f"backend='triton' needs tensors of a GPU, got device type {device_type!r}")
+        return True
+    return name == "auto" and device_type in _TRITON_DEVICES and _has_triton()
 
 
 def select_posterior(name: str, device_type: str) -> PosteriorKernels:
@@ -58,28 +105,40 @@ def select_posterior(name: str, device_type: str) -> PosteriorKernels:
 
 
 @functools.cache
-def _numba() -> Kernels:
-    from ufmstar_torch.kernels import correspond_cpu, fuse_cpu, regress_cpu, segment_cpu
+def _triton() -> Kernels:
+    from ufmstar_torch.kernels.triton import correspond, distribute, fuse, regress, segment
 
     return Kernels(
-        spgf=segment_cpu.segment,
-        floor_covariance=fuse_cpu.floor_covariance,
-        correspond=correspond_cpu.correspond,
-        fuse=fuse_cpu.fuse,
-        regress_image=regress_cpu.regress_image,
-        smooth=regress_cpu.smooth,
-        distribute=regress_cpu.distribute,
+        spgf=segment.segment,
+        floor_covariance=fuse.floor_covariance,
+        correspond=correspond.correspond,
+        fuse=fuse.fuse,
+        regress_image=regress.regress_image,
+        smooth=regress.smooth,
+        distribute=distribute.distribute,
     )
 
 
 @functools.cache
-def _numba_or_none() -> Kernels | None:
-    """The compiled kernels, or None with one warning where numba cannot be imported."""
+def _has_triton() -> bool:
+    """Whether triton can be imported; one warning where it cannot."""
     try:
-        return _numba()
+        import triton as triton
+    except ImportError as error:
+        warnings.warn(f"triton cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
+        return False
+    return True
+
+
+@functools.cache
+def _has_numba() -> bool:
+    """Whether numba can be imported; one warning where it cannot."""
+    try:
+        import numba as numba
     except ImportError as error:
         warnings.warn(f"numba cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
-        return None
+        return False
+    return True
 
 
 def _on_host(kernel: SegmentKernel) -> SegmentKernel:

@@ -1,0 +1,124 @@
+"""``ufmstar recalibrate``: its options, the fit, and what is printed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ufmstar_torch.eval.commands.options import UsageError, option, parse, positional
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.methods.row import Row
+    from ufmstar_torch.eval.metrics.recalibration import Array
+    from ufmstar_torch.eval.report.data import Results
+    from ufmstar_torch.recalibrate import Recalibration
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecalibrateOptions:
+    """A monotone map of the variance, fitted to frames with ground truth.
+
+    Fits the map to the sequences of an evaluation (`ufmstar eval`) and writes it to a file, which `ufmstar run` uses
+    where it lies beside the weights, and `ufmstar eval --recalibration FILE` on other sequences. The printed figures
+    are of each sequence under the map that was fitted to the others.
+
+    Attributes:
+        out: folder of `ufmstar eval`
+        row: the row, as the table names it: UfM*-DepthOnly, say
+        to: file of the map; WEIGHTS.recalibration.json beside the weights is used without being named
+        kind: isotonic, monotone in the variance; or scalar, one factor
+        debug: show tracebacks
+    """
+
+    out: Path = positional()
+    row: str
+    to: Path
+    kind: str = option("isotonic", choices=("isotonic", "scalar"))
+    debug: bool = False
+
+
+def read(words: Sequence[str]) -> RecalibrateOptions:
+    """The options of a command line; errors as :func:`parse`."""
+    return parse(RecalibrateOptions, words, "ufmstar recalibrate")
+
+
+def main(options: RecalibrateOptions) -> int:
+    """Fit, write the file, and print how well it fits sequences that it was not fitted to; the exit code."""
+    from ufmstar_torch.eval.metrics.recalibration import fit
+    from ufmstar_torch.eval.report.data import load_results
+    from ufmstar_torch.eval.report.text import aligned
+
+    try:
+        results = load_results(options.out, with_sums=False)
+        row = _row(results, options.row)
+        counts = _counts(results, row)
+        fitted = fit(list(counts.values()), options.kind)
+        _about(fitted, results, row).save(options.to)
+    except ValueError as error:
+        raise UsageError(error) from error
+    print("\n".join(aligned(_table(counts, options.kind))))
+    if len(counts) == 1:
+        print("fitted to a single sequence, on which it is not judged: evaluate more of them")
+    print(f"{options.to}: {len(fitted.variance)} knots, fitted to {len(counts)} sequences")
+    return 0
+
+
+def _row(results: Results, name: str) -> Row:
+    """The row of this name.
+
+    Raises:
+        ValueError: the evaluation has no such row, or a method other than UfM*.
+    """
+    from ufmstar_torch.eval.methods.method import UFM_STAR
+
+    rows = {row.label: row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration}
+    if name not in rows:
+        raise ValueError(f"--row must be one of {', '.join(rows) or '(none: no row of UfM*)'}, got {name!r}")
+    return rows[name]
+
+
+def _counts(results: Results, row: Row) -> dict[str, Array]:
+    """[V, e] pixels of every sequence by variance and squared error, by "DATASET/SEQUENCE"."""
+    from ufmstar_torch.eval.engine.judge import METRICS
+    from ufmstar_torch.eval.report.data import read_sums
+    from ufmstar_torch.eval.results.worklist import WorkItem
+
+    counts = {}
+    for record in results.of(row):
+        item = WorkItem(record.dataset, record.sequence, path="", layout="")
+        path = results.out / "records" / item.folder / f"{row.slug}.pt"
+        counts[item.label] = read_sums(path)[METRICS]["metrics.SpearmanCorrelation.joint"].double().numpy()
+    return counts
+
+
+def _table(counts: Mapping[str, Array], kind: str) -> list[list[str]]:
+    """Figures of every sequence as it is, and under the map that was fitted to the others."""
+    from ufmstar_torch.eval.metrics.recalibration import figures, fit
+    from ufmstar_torch.eval.report.text import number
+
+    lines = [["", "coverage error", "recalibrated", "NLL", "recalibrated"]]
+    for name, joint in counts.items():
+        others = [other for label, other in counts.items() if label != name]
+        before = figures(joint, None)
+        after = figures(joint, fit(others, kind)) if others else dict.fromkeys(before)
+        lines.append([name, *(number(of[key]) for key in ("coverage_error", "nll") for of in (before, after))])
+    return lines
+
+
+def _about(fitted: Recalibration, results: Results, row: Row) -> Recalibration:
+    """The map with what it was fitted to."""
+    from ufmstar_torch.eval.engine.estimators import ufm_star_config
+
+    records = results.of(row)
+    network: Mapping[str, object] = results.about["networks"][row.method.base]
+    files = network.get("files")
+    return replace(
+        fitted,
+        row=row.label,
+        ufm=ufm_star_config(row).to_dict(),
+        weights=tuple(file["sha256"] for file in files) if isinstance(files, list) else (),
+        sequences=tuple(f"{record.dataset}/{record.sequence}" for record in records),
+        digests=tuple(str(record.provenance["sequence"]) for record in records),
+    )

@@ -1,0 +1,46 @@
+"""Frames that are read ahead: decoded in a thread while the frames before them are computed."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+
+_AHEAD = 2  # frames; decoding releases Python's lock
+
+
+class FramesAhead:
+    """The frames of a sequence one after the other, read by one thread that is at most two frames ahead.
+
+    Use it as a context; the thread ends with the block.
+
+    Args:
+        sequence: whose frames.
+        indices: which of them, in order.
+    """
+
+    def __init__(self, sequence: FrameSequence, indices: Iterable[int]) -> None:
+        self._sequence, self._left = sequence, iter(indices)
+        self._thread = ThreadPoolExecutor(1)
+        self._reading: deque[Future[Frame]] = deque()
+
+    def __enter__(self) -> FramesAhead:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown(cancel_futures=True)
+
+    def next(self) -> Frame:
+        """The next frame.
+
+        Raises:
+            FrameError: it cannot be read.
+            StopIteration: the last one was read before.
+        """
+        while len(self._reading) <= _AHEAD and (index := next(self._left, None)) is not None:
+            self._reading.append(self._thread.submit(self._sequence.__getitem__, index))
+        if not self._reading:
+            raise StopIteration
+        return self._reading.popleft().result()

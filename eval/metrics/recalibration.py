@@ -1,0 +1,143 @@
+"""Fits of a :class:`Recalibration` to the joint counts of variance and squared error, and their figures.
+
+``SpearmanCorrelation`` counts the pixels of a sequence by variance and squared error, 512 bins each, which is all that
+a map of the variance can be fitted to. Every sequence has the same weight, however many pixels it has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
+from ufmstar_torch.recalibrate import ISOTONIC, SCALAR, Recalibration
+
+Array = NDArray[np.float64]
+# Of |z| of a standard normal variable: the levels at which errors are compared with it. The outer tenth is left out:
+# gross errors of the depth would set the variance of all other pixels.
+LEVELS = np.arange(0.1, 0.91, 0.1)
+GROUPS = 32
+
+
+def centres(bins: int) -> Array:
+    """[bins + 2] the bins' values [m^2]: the geometric centre of each; 0 below the range, ``HIGH`` above it."""
+    inner = LOW * (HIGH / LOW) ** ((np.arange(bins) + 0.5) / bins)
+    return np.concatenate([[0.0], inner, [HIGH]])
+
+
+def fit(joints: Sequence[Array], kind: str = ISOTONIC, groups: int = GROUPS) -> Recalibration:
+    """The map that fits some sequences.
+
+    scalar: s such that the errors' quantiles at ``LEVELS`` agree best, in the logarithm, with those of N(0, s V).
+    isotonic: the pixels are divided by V into ``groups`` groups of one size; each group's V' is the scale at which
+    its errors' quantiles agree with a normal distribution, and an isotonic regression of log V' (Barlow and Brunk
+    1972) over the groups makes it monotone.
+
+    Args:
+        joints: of each sequence, [V, e] pixels by variance and squared error (``SpearmanCorrelation.joint``).
+        kind: "isotonic" or "scalar".
+        groups: at most; fewer where many pixels have one variance.
+
+    Raises:
+        ValueError: no pixel, or (scalar) more than a tenth of the pixels with V = 0, which no factor changes.
+    """
+    joint = _weighted(joints)
+    value = centres(joint.shape[0] - 2)
+    if kind == SCALAR:
+        return Recalibration((1.0,), (_scale_of_ratio(joint, value),), SCALAR)
+    from scipy.optimize import isotonic_regression
+
+    mass, knots, scales = [], [], []
+    for weight in _groups(joint.sum(1), groups):
+        errors = weight @ joint
+        share = weight * joint.sum(1)
+        mass.append(share.sum())
+        knots.append(float(np.exp((share @ np.log(np.maximum(value, LOW))) / share.sum())))
+        scales.append(_scale(errors, value))
+    fitted = isotonic_regression(np.log(scales), weights=np.array(mass)).x
+    kept = [0, *(i for i in range(1, len(knots)) if knots[i] > knots[i - 1] * 1.0001)]
+    return Recalibration(tuple(knots[i] for i in kept), tuple(float(np.exp(fitted[i])) for i in kept))
+
+
+def figures(joint: Array, recalibration: Recalibration | None) -> dict[str, float]:
+    """How well N(d, V) fits a sequence, under a map or as it is (None), from its counts.
+
+    Returns:
+        "coverage_error": mean over nine central intervals of |share of errors inside - the interval's level|;
+        "nll" [nats], the mean over the pixels with V > 0 (within .03 nats of the exact one, by the bins' width);
+        "zero_share": of the pixels, those with V = 0.
+
+    Raises:
+        ValueError: no pixel.
+    """
+    import torch
+
+    joint = _weighted([joint])
+    value = centres(joint.shape[0] - 2)
+    variance = value if recalibration is None else recalibration(torch.from_numpy(value)).numpy()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(value[None] == 0, 0.0, value[None] / variance[:, None])
+        nll = 0.5 * (ratio + np.log(2 * math.pi * variance)[:, None])
+    inside = [(joint[ratio <= z**2]).sum() for z in _normal(LEVELS)]
+    positive = variance > 0
+    share = joint[positive].sum()
+    return {
+        "coverage_error": float(np.abs(np.array(inside) - LEVELS).mean()),
+        "nll": float((joint[positive] * nll[positive]).sum() / share) if share else math.nan,
+        "zero_share": float(1 - share),
+    }
+
+
+def _weighted(joints: Sequence[Array]) -> Array:
+    """Sum of the sequences' shares, 1 in all."""
+    if not joints or any(joint.sum() == 0 for joint in joints):
+        raise ValueError("a recalibration needs pixels with ground truth of every sequence")
+    total: Array = np.sum([joint / joint.sum() for joint in joints], axis=0) / len(joints)
+    return total
+
+
+def _groups(mass: Array, count: int) -> list[Array]:
+    """Weights [V] in [0, 1] of each of ``count`` groups of equal mass, in order; a bin may be divided."""
+    upto = np.concatenate([[0.0], np.cumsum(mass)])
+    edges = np.linspace(0, upto[-1], count + 1)
+    weights = []
+    for low, high in pairwise(edges):
+        part = np.clip(np.minimum(upto[1:], high) - np.maximum(upto[:-1], low), 0, None)
+        weights.append(np.divide(part, mass, out=np.zeros_like(mass), where=mass > 0))
+    return weights
+
+
+def _normal(levels: Array) -> Array:
+    """|z| below which the share ``levels`` of a standard normal variable lies."""
+    from scipy.stats import norm
+
+    quantiles: Array = norm.ppf(0.5 + levels / 2)
+    return quantiles
+
+
+def _scale(mass: Array, value: Array) -> float:
+    """The variance of the normal distribution whose |z| quantiles agree best with those of squared errors.
+
+    Args:
+        mass: [N] of the bins of the squared error.
+        value: [N] of the bins, ascending; 0 counts as the smallest positive one.
+    """
+    at = np.searchsorted(np.cumsum(mass), LEVELS * mass.sum())
+    quantiles = np.maximum(value[np.minimum(at, len(value) - 1)], value[value > 0].min())
+    return float(np.exp(np.mean(np.log(quantiles) - 2 * np.log(_normal(LEVELS)))))
+
+
+def _scale_of_ratio(joint: Array, value: Array) -> float:
+    """The factor s of V: :func:`_scale` of e / V, whose bins are the diagonals of the joint counts."""
+    if joint[0].sum() > 1 - LEVELS[-1]:
+        raise ValueError(f"{100 * joint[0].sum():.0f} % of the pixels have V = 0, which no factor changes")
+    bins = len(value) - 2
+    offset = np.arange(-bins, bins + 1)
+    mass = np.array([np.trace(joint[1:-1, 1:-1], k) for k in offset])
+    mass[0] += joint[1:, 0].sum() + joint[-1, 1:-1].sum()  # no error, or V beyond the range
+    mass[-1] += joint[:-1, -1].sum() + joint[0, 1:-1].sum()  # an error beyond the range, or V = 0
+    return _scale(mass, (HIGH / LOW) ** (offset / bins))

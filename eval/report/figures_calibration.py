@@ -1,0 +1,198 @@
+"""The diagrams of calibration: delta and quantile curves, sparsification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ufmstar_torch.eval.methods.method import BASES, UFM_STAR
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.report.colours import FAINT
+from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.means import value_of
+from ufmstar_torch.eval.report.style import (
+    Style,
+    counted,
+    finish,
+    hidden_panels,
+    label_ends,
+    new_figure,
+    save_figure,
+    short_name,
+    style_of,
+)
+from ufmstar_torch.eval.results.record import Record
+
+Curves = Mapping[str, Sequence[float]]
+PER_LINE, MOST_SEQUENCES = 3, 12
+# The looks of methods that are known by name alone, as the demo's.
+_BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
+
+
+def draw_calibration(results: Results, dataset: str) -> Any | None:
+    """Both curves over all pixels of a data set, a column per network; None where no row has a variance."""
+    merged = {row: results.merged.get((dataset, row)) for row in results.default_rows()}
+    curves = {row: sums.curves for row, sums in merged.items() if sums is not None and _has_curves(sums.curves)}
+    bases = list(dict.fromkeys(row.method.base for row in curves))
+    if not bases:
+        return None
+    columns = min(len(bases), PER_LINE)
+    lines = -(-len(bases) // columns)
+    title = f"Calibration on {dataset}, all pixels of {counted(len(results.sequences(dataset)))}"
+    axes = hidden_panels(new_figure(0.5 + 3.4 * columns, 0.4 + 6.0 * lines, title), 2 * lines, columns)
+    for number, base in enumerate(bases):
+        line, column = divmod(number, columns)
+        of_base = {row: values for row, values in curves.items() if row.method.base == base}
+        _draw_calibration(axes[2 * line : 2 * line + 2, column], of_base, (BASES[base][0], ""), ends=True)
+    return axes[0][0].figure
+
+
+def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:
+    """Both curves of single sequences, from the one on which UfM* is best to that on which it is worst."""
+    names = chosen_sequences(results, dataset, base)
+    if not names:
+        return None
+    columns = min(len(names), 4)
+    lines = -(-len(names) // columns)
+    title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}; errors alone → UfM*, from best to worst"
+    figure = new_figure(0.4 + 2.45 * columns, 0.7 + 4.9 * lines, title)
+    axes = hidden_panels(figure, 2 * lines, columns)
+    for number, name in enumerate(names):
+        line, column = divmod(number, columns)
+        of = {row: [r for r in results.of(row, dataset) if r.sequence == name] for row in results.default_rows(base)}
+        shown = {row: records[0] for row, records in of.items() if records and _has_curves(records[0].curves)}
+        curves = {row: record.curves for row, record in shown.items()}
+        titles = (f"{name}\n{_errors(shown, 'ece_delta', 'δ')}", _errors(shown, "ece_q", "q"))
+        _draw_calibration(axes[2 * line : 2 * line + 2, column], curves, titles, named=column == 0)
+    from matplotlib.lines import Line2D
+
+    rows = {short_name(row.method): row for row in results.default_rows(base)}
+    judged = {name: row for name, row in rows.items() if any(_has_curves(r.curves) for r in results.of(row))}
+    handles = [Line2D([], [], label=name, **style_of(row.method).line) for name, row in judged.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8)
+    return figure
+
+
+def chosen_sequences(results: Results, dataset: str, base: str) -> list[str]:
+    """At most ``MOST_SEQUENCES``, evenly over the order of the ECE_delta of a base's UfM* (or last row)."""
+    of = {row: [r for r in results.of(row, dataset) if _has_curves(r.curves)] for row in results.default_rows(base)}
+    rows = [row for row, records in of.items() if records]
+    if not rows:
+        return []
+    judge = next((row for row in rows if row.method.fusion == UFM_STAR and not row.method.full), rows[-1])
+    names = [r.sequence for r in sorted(of[judge], key=lambda r: (value_of(r, "ece_delta"), r.sequence))]
+    if len(names) <= MOST_SEQUENCES:
+        return names
+    return [names[i] for i in np.linspace(0, len(names) - 1, MOST_SEQUENCES).round().astype(int)]
+
+
+def _draw_calibration(
+    axes: Sequence[Any],
+    curves: Mapping[Row, Curves],
+    titles: tuple[str, str],
+    *,
+    named: bool = True,
+    ends: bool = False,
+) -> None:
+    """Both curves of some rows of one base, UfM* last and so on top.
+
+    Args:
+        axes: two panels: delta and quantile calibration.
+        curves: by row.
+        titles: of the panels.
+        named: with words at the y axes.
+        ends: with the rows' names at the right.
+    """
+    ordered = sorted(curves.items(), key=lambda item: (item[0].method.fusion == UFM_STAR, item[0].method.full))
+    lines = {short_name(row.method): (style_of(row.method), values) for row, values in ordered}
+    draw_delta(axes[0], lines, titles[0], "true share" if named else "", ends)
+    draw_quantiles(axes[1], lines, titles[1], "share of truth below" if named else "", ends)
+
+
+def draw_delta(
+    axes: Any, lines: Mapping[str, tuple[Style, Curves]], title: str, y: str = "true share", ends: bool = False
+) -> None:
+    """Confidence that the depth is within 25 %, and how often it is; bins with hardly a pixel are left out."""
+    shown = {}
+    for name, (style, values) in lines.items():
+        confidence, accuracy, pixels = (
+            np.array(values[f"ece_delta_{what}"], float) for what in ("confidence", "accuracy", "pixels")
+        )
+        kept = pixels > 0.001 * pixels.sum()
+        shown[name] = (style, confidence[kept], accuracy[kept])
+    _draw_shares(axes, shown, title, ("predicted share within 25 %", y), ends)
+
+
+def draw_quantiles(
+    axes: Any,
+    lines: Mapping[str, tuple[Style, Curves]],
+    title: str,
+    y: str = "share of truth below",
+    ends: bool = False,
+) -> None:
+    """Predicted quantiles of the depth, and the share of the truth below them."""
+    shown = {n: (s, np.array(v["ece_q_levels"]), np.array(v["ece_q_observed"])) for n, (s, v) in lines.items()}
+    _draw_shares(axes, shown, title, ("predicted quantile", y), ends)
+
+
+def _draw_shares(
+    axes: Any, lines: Mapping[str, tuple[Style, Any, Any]], title: str, words: tuple[str, str], ends: bool
+) -> None:
+    """Lines in the unit square with its diagonal."""
+    axes.set_visible(True)
+    axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT)
+    for name, (style, x, y) in lines.items():
+        axes.plot(x, y, label=name, clip_on=False, **style.line)
+    axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
+    finish(axes, title=title, x=words[0], y=words[1])
+    if ends:
+        last = [(y[-1], name, style.colour) for name, (style, _, y) in lines.items() if len(y)]
+        label_ends(axes, [*last, (1.0, "exactly right", FAINT)])
+
+
+def _has_curves(curves: Mapping[str, Any]) -> bool:
+    """Whether a variance was judged, on any pixel at all (a curve without one is NaN, None in a record)."""
+    levels = curves.get("ece_q_observed") or ()
+    return len(levels) > 0 and all(value is not None and value == value for value in levels)
+
+
+def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
+    """The calibration errors of the base alone and of UfM*, or of the first and the last row."""
+    rows = list(records)
+    ours = next((row for row in rows if row.method.fusion == UFM_STAR and not row.method.full), rows[-1])
+    values = (f"{value_of(records[row], key):.3f}" for row in dict.fromkeys((rows[0], ours)))
+    return f"ECE_{letter} {' → '.join(values)}"
+
+
+def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -> None:
+    """Draw delta calibration, quantile calibration and sparsification side by side and write the picture (PNG).
+
+    Args:
+        path: the file; its folder must exist.
+        curves: ``SequenceMetrics.curves()`` by the name that the legend shows.
+        title: over the picture.
+
+    Raises:
+        ValueError: there are no curves, or more than have a look of their own.
+        ImportError: matplotlib is missing.
+    """
+    if not 1 <= len(curves) <= len(_BY_ORDER):
+        raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
+    figure = new_figure(12.6, 4.6, title)
+    delta, quantiles, sparse = figure.subplots(1, 3)
+    lines = {name: (Style(*look), curves[name]) for name, look in zip(curves, _BY_ORDER, strict=False)}
+    draw_delta(delta, lines, "δ calibration")
+    draw_quantiles(quantiles, lines, "quantile calibration")
+    for style, values in lines.values():
+        x = np.arange(len(values["sparsification_rmse"])) / len(values["sparsification_rmse"])
+        sparse.plot(x, values["sparsification_rmse"], markevery=10, **style.line)
+        sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=style.colour)
+    sparse.set_xlim(0, 1)
+    sparse.set_ylim(bottom=0)
+    words = ("sparsification (dotted: best possible)", "share of pixels left out, largest σ first", "RMSE [m]")
+    finish(sparse, title=words[0], x=words[1], y=words[2])
+    figure.legend(*delta.get_legend_handles_labels(), loc="outside lower center", ncols=len(curves) + 1, frameon=False)
+    save_figure(figure, path)

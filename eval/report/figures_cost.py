@@ -1,0 +1,163 @@
+"""The diagrams of cost: time by method and by stage, calibration against memory and time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ufmstar_torch.eval.methods.method import BASES
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.report.colours import FAINT, INK, plain
+from ufmstar_torch.eval.report.data import Results
+from ufmstar_torch.eval.report.means import Mean, mean_of
+from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
+from ufmstar_torch.eval.report.style import (
+    TICK,
+    finish,
+    new_figure,
+    short_name,
+    spread_apart,
+    style_of,
+)
+
+NETWORK_COLOUR = "#bdbdbd"
+MOST_NAMES = 10  # more points have a legend instead
+# The stages of a step of UfM*, from dark to light, as a print in grey needs it.
+STAGES = {
+    "check": "#4d4d4d", "segment": "#0072B2", "correspond": "#009E73", "fuse": "#D55E00", "append": "#CC79A7",
+    "regress": "#E69F00", "average": "#56B4E9",
+}  # fmt: skip
+_BASE_MARKERS = dict(zip(BASES, "osD^vP", strict=True))
+
+
+def draw_latency(results: Results) -> Any | None:
+    """Time per frame of every method: the network's, and what uncertainty takes; None where nothing was timed."""
+    timed: list[tuple[Row, Mean, Mean]] = []
+    for row in results.default_rows():
+        network, uncertainty = (mean_of(results.of(row), quantity) for quantity in (NETWORK_MS, UNCERTAINTY_MS))
+        if network.sequences or uncertainty.sequences:
+            timed.append((row, network, uncertainty))
+    if not timed:
+        return None
+    figure = new_figure(7.6, 1.2 + 0.27 * len(timed), "Time per frame")
+    axes = figure.subplots()
+    longest = 0.0
+    for y, (row, network, uncertainty) in enumerate(timed):
+        n, u = (mean.value if mean.sequences else 0.0 for mean in (network, uncertainty))
+        axes.barh(y, n, color=NETWORK_COLOUR, height=0.66)
+        axes.barh(y, u, left=n, color=style_of(row.method).colour, height=0.66)
+        words = f"  {f'{n:.1f}' if network.sequences else 'network not timed'} + {u:.1f} ms"
+        axes.text(n + u, y, words, size=TICK, va="center", color=INK)
+        longest = max(longest, n + u)
+    axes.set(xlim=(0, 1.3 * longest), ylim=(len(timed) - 0.4, -0.6))
+    axes.set_yticks(range(len(timed)), [row.method.name for row, _, _ in timed])
+    finish(axes, x="network (grey) + uncertainty (coloured) [ms], mean over sequences of the median frame")
+    axes.grid(visible=False, axis="y")
+    return figure
+
+
+def draw_stages(results: Results) -> Any | None:
+    """Where UfM*'s time goes, stage by stage, as in the paper's figure; None unless ``efficiency.json`` has it."""
+    staged = [row for row in (results.efficiency or {}).get("rows", ()) if row.get("stages")]
+    if not staged:
+        return None
+    figure = new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")
+    axes = figure.subplots()
+    for y, row in enumerate(staged):
+        times = {name: row["stages"]["stages"][name]["median_ms"] for name in STAGES if name in row["stages"]["stages"]}
+        _draw_stages(axes, y, times)
+    axes.set_yticks(range(len(staged)), [plain(f"{row['row']}\n{row['network']}") for row in staged])
+    finish(axes, x="share of the step [%], medians of its stages")
+    axes.grid(visible=False)
+    axes.set(xlim=(0, 100), ylim=(len(staged) - 0.4, -0.6))
+    from matplotlib.patches import Patch
+
+    handles = [Patch(color=colour, label=name) for name, colour in STAGES.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=TICK)
+    return figure
+
+
+def _draw_stages(axes: Any, y: int, times: Mapping[str, float]) -> None:
+    """One bar of shares, with their numbers where there is room, and the sum behind."""
+    total, left = math.fsum(times.values()), 0.0
+    for name, ms in times.items():
+        share = 100 * ms / total
+        axes.barh(y, share, left=left, color=STAGES[name], height=0.62, edgecolor="white", linewidth=0.5)
+        if share >= 6:
+            letters = INK if name in ("regress", "average") else "white"  # dark on the light colours
+            words = {"size": TICK, "color": letters, "ha": "center", "va": "center"}
+            axes.text(left + share / 2, y, f"{share:.0f} %", **words)
+        left += share
+    axes.text(101, y, f"{total:.1f} ms", size=TICK, color=INK, va="center")
+
+
+def draw_tradeoff(results: Results, dataset: str | None = None) -> Any | None:
+    """ECE_delta against the bytes that are kept between frames, and against the time per frame; None without points."""
+    points = {row: mean_of(results.of(row, dataset), ECE_DELTA) for row in results.default_rows()}
+    points = {row: mean for row, mean in points.items() if mean.sequences}
+    kept = {row: mean_of(results.of(row, dataset), STATE).value for row in points}
+    kept = {row: 0.0 if math.isnan(x) else x for row, x in kept.items()}  # a method alone keeps nothing
+    took = {row: mean_of(results.of(row, dataset), TOTAL_MS).value for row in points}
+    took = {row: x for row, x in took.items() if not math.isnan(x)}
+    if not any(kept.values()):
+        return None
+    figure = new_figure(11.0, 4.8, f"Calibration against cost on {dataset or 'all sequences'}")
+    words = ("kept between frames [MB]", "time per frame [ms]")
+    for axes, panel, word in zip(figure.subplots(1, 2, sharey=True), (kept, took), words, strict=True):
+        for row, x in panel.items():
+            mean = points[row]
+            axes.errorbar(
+                x, mean.value, yerr=np.nan_to_num(mean.half), color=style_of(row.method).colour, markersize=6,
+                marker=_BASE_MARKERS[row.method.base], linewidth=1, elinewidth=0.5, capsize=0,
+            )  # fmt: skip
+        _cost_axis(axes, list(panel.values()))
+        finish(axes, x=word, y="ECE_δ ↓ (bar: 95 % interval)")
+        if len(points) <= MOST_NAMES:
+            _name_points(axes, [(x, points[row].value, row) for row, x in panel.items()])
+    if len(points) > MOST_NAMES:
+        figure.legend(handles=_legend(list(points)), loc="outside right upper", frameon=False, fontsize=TICK)
+    return figure
+
+
+def _legend(rows: Sequence[Row]) -> list[Any]:
+    """Colours are methods, marks are networks."""
+    from matplotlib.lines import Line2D
+
+    look: dict[str, Any] = {"linestyle": "", "markersize": 6}
+    methods = {short_name(row.method): style_of(row.method).colour for row in rows}
+    bases = dict.fromkeys(row.method.base for row in rows)
+    return [
+        *(Line2D([], [], marker="o", color=colour, label=name, **look) for name, colour in methods.items()),
+        *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **look) for base in bases),
+    ]
+
+
+def _cost_axis(axes: Any, values: Sequence[float]) -> None:
+    """Logarithmic, with room for 0 at the left (methods alone keep nothing)."""
+    positive = [value for value in values if value > 0]
+    if positive and max(positive) > 8 * min(positive):
+        if min(values) > 0:
+            axes.set_xscale("log")
+        else:
+            axes.set_xscale("symlog", linthresh=min(positive) / 2, linscale=0.8)
+    else:
+        axes.set_xlim(left=0)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.set_ylim(bottom=0)
+
+
+def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:
+    """Each point's name in a column right of the panel, apart from each other, with a thin line to its point."""
+    height = axes.get_position().height * axes.figure.get_figheight()
+    high = axes.get_ylim()[1]
+    places = spread_apart([y / high for _, y, _ in points], 1.2 * TICK / 72 / height, 0, 1)
+    for (x, y, row), place in zip(points, places, strict=True):
+        name = f"{BASES[row.method.base][1]} {short_name(row.method)}"
+        axes.annotate(
+            name, (x, y), (1.04, place), textcoords="axes fraction", size=TICK, va="center",
+            color=style_of(row.method).colour,
+            arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.4, "relpos": (0, 0.5), "shrinkB": 3},
+        )  # fmt: skip

@@ -1,0 +1,95 @@
+"""Merging in NumPy float64 loops, from the derivation in docs/results/growth.md; imports neither torch nor the package.
+
+Components are dicts as in ``oracle`` with one more entry, "sums": the sums over anchors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def joint(g, h):
+    """The component with the common moments of two."""
+    weight = g["weight"] + h["weight"]
+    a, b = g["weight"] / weight, h["weight"] / weight
+    d = g["mean"] - h["mean"]
+    return {
+        "mean": a * g["mean"] + b * h["mean"],
+        "cov": a * g["cov"] + b * h["cov"] + a * b * np.outer(d, d),
+        "weight": weight,
+        "m": a * g["m"] + b * h["m"],
+        "count": g["count"] + h["count"] - 1,
+        "features": a * g["features"] + b * h["features"],
+        "sums": g["sums"] + h["sums"],
+    }
+
+
+def loss(g, h):
+    """Bound on the divergence per pixel of the lighter one [nat]; infinite where the two may not join."""
+    lighter, heavier = (g, h) if g["weight"] < h["weight"] else (h, g)
+    if lighter["count"] > 1 and heavier["count"] == 1:
+        return np.inf
+    weight = g["weight"] + h["weight"]
+    volume = [np.linalg.slogdet(x["cov"])[1] for x in (joint(g, h), g, h)]
+    whole = 0.5 * (weight * volume[0] - g["weight"] * volume[1] - h["weight"] * volume[2])
+    return whole / lighter["weight"]
+
+
+def join(components, limit):
+    """Rounds in which those join who are each other's best."""
+    while True:
+        n = len(components)
+        table = np.array(
+            [[np.inf if i == j else loss(components[i], components[j]) for j in range(n)] for i in range(n)]
+        ).reshape(n, n)
+        best = [int(np.argmin(row)) for row in table]
+        pairs = [(i, best[i]) for i in range(n) if i < best[i] and best[best[i]] == i and table[i, best[i]] <= limit]
+        if not pairs:
+            return components
+        gone = {j for _, j in pairs}
+        stays = dict(pairs)
+        components = [
+            joint(g, components[stays[i]]) if i in stays else g for i, g in enumerate(components) if i not in gone
+        ]
+
+
+def points(g):
+    L = np.linalg.cholesky(g["cov"])
+    return [g["mean"] + sign * np.sqrt(3) * L[:, i] for sign in (1, -1) for i in range(3)]
+
+
+def density(x, g):
+    d = x - g["mean"]
+    return np.exp(-d @ np.linalg.solve(g["cov"], d) / 2) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(g["cov"]))
+
+
+def mean_shares(g, components, prior_weight):
+    """Of every component, its share in explaining the points of g, on average."""
+    table = []
+    for x in points(g):
+        each = np.array([h["weight"] * density(x, h) for h in components])
+        table.append(each / (each.sum() + prior_weight))
+    return np.mean(table, axis=0)
+
+
+def dissolve(components, least, prior_weight):
+    """Without the components whose own share is below ``least``, where those that stay explain the rest."""
+    table = [mean_shares(g, components, prior_weight) for g in components]
+    weak = [row[k] < least for k, row in enumerate(table)]
+    after = [dict(g) for g in components]
+    kept = []
+    for k, g in enumerate(components):
+        given = np.where(weak, 0.0, table[k])
+        if not weak[k] or given.sum() < 1 - least:
+            kept.append(k)
+            continue
+        for h, share in zip(after, given / given.sum(), strict=True):
+            weight = h["weight"] + share * g["weight"]
+            for name in ("m", "features"):
+                h[name] = (h["weight"] * h[name] + share * g["weight"] * g[name]) / weight
+            h["weight"], h["sums"] = weight, h["sums"] + share * g["sums"]
+    return [after[k] for k in kept]
+
+
+def merge(components, limit, least, prior_weight):
+    return dissolve(join(components, limit), least, prior_weight)

@@ -1,0 +1,132 @@
+"""Frames read ahead and sinks behind the loop: order, what is through when it ends, and where errors are raised."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+from layouts import write_generic
+from runs import Brightness, networks
+
+from ufmstar_torch import UfMStarConfig
+from ufmstar_torch.eval.engine.ahead import FramesAhead
+from ufmstar_torch.eval.engine.behind import Behind
+from ufmstar_torch.eval.engine.estimators import Gaussians
+from ufmstar_torch.eval.engine.rows import RowRunner
+from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream
+from ufmstar_torch.eval.sequences import FrameError, open_sequence
+
+FRAMES = 9
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    return open_sequence(write_generic(tmp_path_factory.mktemp("behind"), frames=FRAMES)[0])
+
+
+class Slow(FrameSink):
+    """Takes its time, in a thread that is not the loop's; breaks at a frame."""
+
+    def __init__(self, at=None, error=None, stage="writing"):
+        self.stage, self.at, self.error = stage, at, error
+        self.results, self.threads, self.ended = [], set(), False
+
+    def take(self, result):
+        if result.number == self.at:
+            raise self.error
+        time.sleep(0.01)
+        self.threads.add(threading.get_ident())
+        self.results.append(result)
+
+    def end(self):
+        self.ended = True
+
+
+def stream_of(sequence, network=None):
+    row = RowRunner("row", networks(network or Brightness()), Gaussians(UfMStarConfig(), torch.device("cpu")))
+    return FrameStream(sequence, range(FRAMES), [row])
+
+
+def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
+    """The states are those that a loop without a thread has after the same frames."""
+    expected = []
+
+    class States(FrameSink):
+        def take(self, result):
+            expected.append({name: value.clone() for name, value in plain.state().items()})
+
+    plain = stream_of(sequence)
+    plain.drive([States()])
+    first, second = Slow(), Slow(stage="saving")
+    with Behind([first, second]) as behind:
+        stream_of(sequence).drive([behind])
+    assert [r.number for r in first.results] == [r.number for r in second.results] == list(range(FRAMES))
+    assert len(first.threads | second.threads) == 1
+    assert threading.get_ident() not in first.threads
+    assert first.ended
+    assert second.ended
+    for result, state in zip(first.results, expected, strict=True):
+        assert result.state.keys() == state.keys()
+        assert all(torch.equal(value, state[name]) for name, value in result.state.items())
+        assert result.ms.keys() == {"read", "predict", "truth", "cycle", "writing", "saving"}
+        assert result.ms["writing"] >= 10
+
+
+@pytest.mark.parametrize("error", [OSError("full"), ValueError("a mistake")], ids=["disk", "program"])
+def test_an_error_of_a_sink_ends_the_loop_and_no_later_frame_is_taken(sequence, error):
+    sink, after = Slow(at=2, error=error), Slow()
+    with pytest.raises(type(error), match=str(error)), Behind([sink, after]) as behind:
+        stream_of(sequence).drive([behind])
+    assert [result.number for result in after.results] == [0, 1]
+    assert not sink.ended
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_whatever_ends_the_loop_all_frames_that_were_computed_are_through(sequence, error):
+    def fail():
+        raise error
+
+    sink = Slow()
+    with pytest.raises(error), Behind([sink]) as behind:
+        stream_of(sequence, Brightness(at=6, then=fail)).drive([behind])
+    assert [result.number for result in sink.results] == list(range(6))
+    assert not sink.ended
+
+
+def test_only_a_few_frames_wait(sequence):
+    """The loop waits for sinks that are too far behind, so that memory is bounded."""
+    behind_by = []
+
+    class Count(FrameSink):
+        def take(self, result):
+            behind_by.append(result.number + 1 - len(slow.results))
+
+    slow = Slow()
+    with Behind([slow]) as behind:
+        stream_of(sequence).drive([behind, Count()])
+    assert max(behind_by) <= 6  # 5 that wait, and one in hand
+
+
+def test_frames_are_read_ahead_in_order_by_one_thread(sequence):
+    read = []
+
+    def load(i, entry):
+        read.append((i, threading.get_ident()))
+        if i == 3:
+            raise FrameError(entry.name, "cannot be decoded")
+        return entry.load_image()
+
+    entries = [replace(e, load_image=lambda i=i, e=e: load(i, e)) for i, e in enumerate(sequence.entries)]
+    with FramesAhead(replace(sequence, entries=tuple(entries)), [1, 3, 4, 6]) as frames:
+        assert frames.next().index == 1
+        with pytest.raises(FrameError, match="cannot be decoded"):
+            frames.next()
+        assert [frames.next().index, frames.next().index] == [4, 6]
+        with pytest.raises(StopIteration):
+            frames.next()
+    assert [i for i, _ in read] == [1, 3, 4, 6]
+    assert {thread for _, thread in read} != {threading.get_ident()}
+    assert len({thread for _, thread in read}) == 1

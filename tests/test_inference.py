@@ -1,0 +1,198 @@
+"""Networks as ``run`` and ``eval`` run them: which runtime, what it changes, and what the records say of it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from layouts import write_tum
+from onnx_files import small_network, write_fastdepth
+from runs import job_of, outputs, read_summary
+from shared_data import require_shared
+from torch import Tensor
+
+from ufmstar_torch.eval.commands.run import run
+from ufmstar_torch.eval.engine.load import NetworkChoice, network_source
+from ufmstar_torch.eval.results.folder import FolderError
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, load_network, save_trained
+from ufmstar_torch.models.heads import with_head
+from ufmstar_torch.models.inference import Inference
+from ufmstar_torch.models.onnx_network import OnnxNetwork
+from ufmstar_torch.models.trained import NetworkSpec, build_network
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_fastdepth(tmp_path_factory.mktemp("onnx") / "small.onnx", small_network(), 224)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    spec = NetworkSpec(widths=0.25, positive="softplus", method="aleatoric")
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("trained") / "trained.safetensors"
+    save_trained(path, [build_network(spec).eval()], spec)
+    return path
+
+
+def frame(height: int = 60, width: int = 80) -> Frame:
+    image = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    K = np.array([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]])
+    return Frame(0, "a", image, None, np.eye(4), K)
+
+
+def predicted(model: str, file: Path, inference: Inference) -> tuple[Tensor, dict[str, Any]]:
+    source = network_source(model, [file], inference=inference)
+    return source.one(frame(), 0).depth, {**source.runtime, "identity": source.identity}
+
+
+def test_onnx_weights_run_in_onnx_runtime_and_agree_with_torch(weights: Path) -> None:
+    depth, about = predicted("fastdepth", weights, Inference(threads=1))
+    expected, other = predicted("fastdepth", weights, Inference("torch"))
+    assert (about["name"], about["threads"], about["provider"]) == ("onnxruntime", 1, "CPUExecutionProvider")
+    assert (other["name"], other["version"]) == ("torch", torch.__version__)
+    assert about["identity"] != other["identity"]
+    assert depth.std() > 1e-3
+    assert (depth - expected).abs().max() < 1e-3 * expected.max()  # 1e-4 observed
+
+
+def test_published_weights_agree_between_the_runtimes() -> None:
+    weights = require_shared("weights/fastdepth_nyu.onnx")
+    depth, expected = (predicted("fastdepth", weights, Inference(name, threads=1))[0] for name in ("onnx", "torch"))
+    torch.testing.assert_close(depth, expected, rtol=1e-4, atol=1e-4)  # [m]; 2e-5 observed
+
+
+def test_threads_wait_without_spinning(weights: Path) -> None:
+    """As many as torch's where none are asked for."""
+    for threads, expected in ((None, torch.get_num_threads()), (2, 2)):
+        network = Inference(threads=threads).ready(load_network("fastdepth", weights), weights, CPU)
+        assert isinstance(network, OnnxNetwork)
+        options = network.session.get_session_options()
+        assert options.intra_op_num_threads == expected
+        assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
+
+
+def test_without_onnx_runtime_torch_runs_and_says_so(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected, _ = predicted("fastdepth", weights, Inference("torch"))
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.warns(UserWarning, match=r"without onnxruntime, .*small.onnx runs in torch, more slowly"):
+        depth, about = predicted("fastdepth", weights, Inference())
+    assert about["name"] == "torch"
+    assert torch.equal(depth, expected)
+    with (
+        pytest.warns(UserWarning, match="without"),
+        pytest.raises(ModuleNotFoundError, match="onnxruntime"),
+    ):
+        predicted("fastdepth", weights, Inference("onnx"))
+
+
+def test_a_graph_of_another_size_runs_in_torch(tmp_path: Path) -> None:
+    """FastDepth's input is 224 x 224, whatever size the graph was exported for."""
+    small = write_fastdepth(tmp_path / "small.onnx", small_network(), 64)
+    depth, about = predicted("fastdepth", small, Inference())
+    assert (about["name"], depth.shape) == ("torch", (224, 224))
+    with pytest.raises(ValueError, match="runtime onnx needs weights in an ONNX file, of the input's size"):
+        predicted("fastdepth", small, Inference("onnx"))
+
+
+def test_dropout_needs_torch(weights: Path) -> None:
+    sampling = FastDepth.from_onnx(weights, dropout=0.2)
+    assert not isinstance(Inference().ready(sampling, weights, CPU), OnnxNetwork)
+    with pytest.raises(ValueError, match=r"needs weights in an ONNX file, .* without dropout"):
+        Inference("onnx").ready(sampling, weights, CPU)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        small_network(),
+        with_head(small_network(), "aleatoric").eval(),
+        with_head(FastDepth(FastDepthWidths.scaled(0.1), dropout=0.3), "evidential").eval(),
+        MonodepthResNet(18).eval(),
+    ],
+    ids=["folded", "head", "dropout", "resnet"],
+)
+def test_torch_gets_its_faster_form(network: torch.nn.Module) -> None:
+    """Channels last, and the same function; the network that was given stays as it was."""
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    fast = Inference().ready(network, Path("net.pth"), CPU)
+    x = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        got, expected = fast(x), network(x)
+    torch.testing.assert_close(got.depth, expected.depth, rtol=1e-4, atol=1e-4)
+    if expected.variance is not None:
+        torch.testing.assert_close(got.variance, expected.variance, rtol=1e-3, atol=1e-4)
+    kernels = [p for p in fast.parameters() if p.dim() == 4 and min(p.shape[1:]) > 1]
+    assert kernels
+    assert all(p.is_contiguous(memory_format=torch.channels_last) for p in kernels)
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+    assert all(p.is_contiguous() for p in network.parameters())
+
+
+def test_bf16_is_near_single_precision(trained: Path) -> None:
+    """Predictions stay in single precision, of about 8 bits; digests tell the two apart."""
+    depth, about = predicted("trained", trained, Inference(precision="bf16"))
+    expected, _ = predicted("trained", trained, Inference())
+    assert about["precision"] == "bf16"
+    assert depth.dtype == torch.float32
+    assert 0 < (depth / expected - 1).abs().max() < 0.05
+    choice = NetworkChoice("aleatoric", "trained", (str(trained),))
+    loaded = [choice.load(CPU, inference=Inference(precision=p)) for p in ("float32", "bf16")]
+    assert loaded[0].digest != loaded[1].digest
+
+
+@pytest.mark.parametrize(
+    ("model", "inference", "message"),
+    [
+        ("trained", {"runtime": "onnx"}, "runtime onnx needs weights in an ONNX file"),
+        ("onnx", {"runtime": "torch"}, "a graph that only ONNX Runtime runs, not runtime torch in float32"),
+        ("onnx", {"precision": "bf16"}, "a graph that only ONNX Runtime runs, not runtime auto in bf16"),
+    ],
+)
+def test_refusals(
+    tmp_path: Path, weights: Path, trained: Path, model: str, inference: dict[str, str], message: str
+) -> None:
+    spec = tmp_path / "spec.json"
+    spec.write_text(json.dumps({"outputs": {"kind": "metric"}}))
+    with pytest.raises(ValueError, match=message):
+        network_source(
+            model,
+            [trained if model == "trained" else weights],
+            spec=spec if model == "onnx" else None,
+            inference=Inference(**inference),
+        )
+
+
+def test_impossible_settings() -> None:
+    with pytest.raises(ValueError, match="precision bf16 is torch's"):
+        Inference("onnx", "bf16")
+    with pytest.raises(ValueError, match=r"Inference.runtime must be one of \('auto', 'torch', 'onnx'\)"):
+        Inference("tensorrt")
+
+
+def test_a_resumed_run_is_the_same_and_needs_the_same_runtime(tmp_path: Path, weights: Path) -> None:
+    write_tum(tmp_path / "seq")
+    sequence = open_sequence(tmp_path / "seq" / "rgbd_dataset_freiburg2_desk")
+
+    def job(inference: Inference) -> Any:
+        return job_of(sequence, network_source("fastdepth", [weights], inference=inference))
+
+    run(job(Inference()), tmp_path / "whole")
+    stops = iter([False, True])
+    run(job(Inference()), tmp_path / "out", stop=lambda: next(stops))
+    with pytest.raises(FolderError, match="runtime"):
+        run(job(Inference("torch")), tmp_path / "out", resume=True)
+    run(job(Inference()), tmp_path / "out", resume=True)
+    assert outputs(tmp_path / "out") == outputs(tmp_path / "whole")
+    about = read_summary(tmp_path / "out")["runtime"]
+    assert about["name"] == "onnxruntime"
+    assert about["version"] == read_summary(tmp_path / "out")["versions"]["onnxruntime"]

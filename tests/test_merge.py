@@ -1,0 +1,238 @@
+"""Merging against the oracle and its closed forms: what it keeps, and what it may not touch."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import oracle_merge
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_gaussians import covariances, mixture
+from test_correspond import as_lists
+
+import scenes
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.kernels.select import select_merge
+from ufmstar_torch.merge import merge, merged
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import regress
+
+pytestmark = pytest.mark.numerics
+
+BACKENDS = ["torch", "numba"]
+CONFIG = UfMStarConfig(merge=1.0, merge_share=0.2, features=2, anchored=True)
+ALL = torch.tensor([True, True])
+
+
+def crowd(seed: int, capacity: int = 14) -> tuple[GaussianMixture, torch.Tensor]:
+    """Two streams of components that overlap, with features, and sums of anchors beside them."""
+    m = mixture(2, capacity, seed, features=2)
+    generator = torch.Generator().manual_seed(seed)
+    shape = covariances(2 * capacity, seed, decades=1.0, largest=0.3).view(2, capacity, 3, 3)
+    m = m.replace(
+        mean=0.3 * m.mean,
+        covariance=shape * m.valid[..., None, None],
+        weight=m.weight ** torch.tensor([[1.0], [1.4]]),
+        count=torch.randint(1, 4, m.count.shape, generator=generator) * m.valid,
+    )
+    return m, torch.rand(2, capacity, 3, generator=generator, dtype=torch.float64) * m.valid[..., None]
+
+
+def as_dicts(m: GaussianMixture, sums: torch.Tensor, stream: int) -> list[dict]:
+    return [g | {"sums": sums[stream, k].numpy()} for k, g in enumerate(as_lists(m, stream))]
+
+
+def one(mean: list[list[float]], spread: list[float], weight: list[float], m: list[float], count: list[int]):
+    """One stream of round components with the variances ``spread``."""
+    cov = torch.tensor(spread, dtype=torch.float64)[:, None, None] * torch.eye(3, dtype=torch.float64)
+    values = [torch.tensor([v], dtype=torch.float64) for v in (mean, weight, m)]
+    return GaussianMixture(
+        values[0], cov[None], values[1], values[2], torch.tensor([count]), values[1].new_zeros(1, len(m), 0)
+    )
+
+
+def merge_one(m: GaussianMixture, backend: str = "torch", **changes: float) -> GaussianMixture:
+    config = UfMStarConfig(merge=1.0).replace(**changes)
+    kernels = select_merge(backend, "cpu")
+    return merge(m, m.mean.new_zeros(1, 0, 3), torch.tensor([True]), config, kernels)[0]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=10)
+def test_agrees_with_the_oracle(backend, seed):
+    before, sums = crowd(seed)
+    after, left = merge(before, sums, ALL, CONFIG, select_merge(backend, "cpu"))
+    for b in range(2):
+        given_ = as_dicts(before, sums, b)
+        expected = oracle_merge.merge(given_, CONFIG.merge, CONFIG.merge_share, CONFIG.prior_weight)
+        ours = as_dicts(after, left, b)
+        assert len(ours) == len(expected)
+        for mine, theirs in zip(ours, expected, strict=True):
+            assert mine["count"] == theirs["count"]
+            for name in ("mean", "cov", "weight", "m", "features", "sums"):
+                np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-9, atol=1e-11)
+
+
+def test_the_kernel_takes_the_same_decisions_in_a_large_mixture():
+    before, sums = crowd(3, capacity=300)
+    before = before.replace(mean=before.mean * torch.tensor([8.0, 4.0, 8.0]))
+    reference, fast = (merge(before, sums, ALL, CONFIG, select_merge(name, "cpu")) for name in BACKENDS)
+    assert 20 < int(reference[0].components.sum()) < 500
+    assert torch.equal(fast[0].components, reference[0].components)
+    for name, value in reference[0].tensors().items():
+        torch.testing.assert_close(getattr(fast[0], name), value, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(fast[1], reference[1], rtol=1e-12, atol=1e-14)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=10)
+def test_sums_over_the_mixture_stay(seed):
+    """Both rules keep the sums of pi, pi m, pi h and of the anchors' evidence; joining those of the moments too."""
+    before, sums = crowd(seed)
+    kernels = select_merge("torch", "cpu")
+    after, left = merge(before, sums, ALL, CONFIG, kernels)
+    assert int(after.components.sum()) < int(before.components.sum())
+    joined, _ = merge(before, sums, ALL, CONFIG.replace(merge_share=0.0), kernels)
+
+    def zeroth(m: GaussianMixture) -> torch.Tensor:
+        w = m.weight[..., None]
+        return (w * torch.cat([torch.ones_like(w), m.disagreement[..., None], m.features], -1)).sum(1)
+
+    def moments(m: GaussianMixture) -> torch.Tensor:
+        second = m.covariance + m.mean[..., :, None] * m.mean[..., None, :]
+        return (m.weight[..., None] * torch.cat([m.mean, second.flatten(2)], -1)).sum(1)
+
+    torch.testing.assert_close(zeroth(after), zeroth(before), rtol=1e-12, atol=1e-9)
+    torch.testing.assert_close(moments(joined), moments(before), rtol=1e-11, atol=1e-9)
+    torch.testing.assert_close(left.sum(1), sums.sum(1), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("step", [-1e-3, 1e-3])
+def test_the_limit_is_the_divergence_of_the_lighter_from_the_heavier(backend, step):
+    """A vanishing weight at distance d of an equal shape: l -> d^2 / (2 sigma^2), 1 nat at sqrt(2) sigma."""
+    d = (math.sqrt(2) + step) * 0.1
+    two = one([[0.0, 0.0, 2.0], [d, 0.0, 2.0]], [0.01, 0.01], [1e9, 1.0], [0.5, 0.5], [3, 3])
+    assert int(merge_one(two, backend, merge_share=0.0).components) == (1 if step < 0 else 2)
+
+
+def test_equal_weights_have_a_closed_form():
+    """Two equal shapes at distance d: |Sigma| = (1 + d^2 / 4 sigma^2) |Sigma_i|, l = log(1 + d^2 / 4 sigma^2)."""
+    for factor, left in ((0.999, 1), (1.001, 2)):
+        d = factor * 0.1 * 2 * math.sqrt(math.e - 1)
+        two = one([[0.0, 0.0, 2.0], [d, 0.0, 2.0]], [0.01, 0.01], [50.0, 50.0], [0.1, 0.3], [2, 3])
+        after = merge_one(two, merge_share=0.0)
+        assert int(after.components) == left
+        if left == 1:
+            assert after.count[0, 0] == 4
+            assert after.disagreement[0, 0] == pytest.approx(0.2)
+            assert after.covariance[0, 0, 0, 0] == pytest.approx(0.01 + d**2 / 4)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_was_seen_from_one_view_stays_unmeasured(backend):
+    """Two first views that join were compared with nothing, and a measured component does not join a heavier one of
+    one view, which would read as measured."""
+    place = [[0.0, 0.0, 2.0], [0.01, 0.0, 2.0]]
+    firsts = merge_one(one(place, [0.01, 0.01], [50.0, 40.0], [0.0, 0.0], [1, 1]), backend)
+    assert firsts.components.tolist() == [1]
+    assert firsts.count[0, 0] == 1
+    assert int(merge_one(one(place, [0.01, 0.01], [50.0, 40.0], [0.0, 0.2], [1, 2]), backend).components) == 2
+    assert int(merge_one(one(place, [0.01, 0.01], [40.0, 50.0], [0.0, 0.2], [1, 2]), backend).components) == 1
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_superseded_component_is_dissolved_and_a_lonely_one_is_not(backend):
+    """A thin fragment inside of a wide component: its share falls as the wide one is observed, but far from it the
+    fragment is all there is, however light."""
+    for weight, distance, left in ((2e4, 0.0, 2), (1e9, 0.0, 1), (1e9, 9.0, 2)):
+        two = one([[0.0, 0.0, 2.0], [distance, 0.0, 2.0]], [0.25, 0.001], [weight, 100.0], [0.1, 0.0], [9, 1])
+        after = merge_one(two, backend)
+        assert int(after.components) == left, (weight, distance)
+        if left == 1:
+            assert torch.equal(after.mean[0, 0], two.mean[0, 0])
+            assert after.weight[0, 0] == weight + 100.0
+            assert after.count[0, 0] == 9
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=8)
+def test_the_map_stays_within_the_stated_bound_where_components_are_dissolved(seed):
+    """At a dissolved component's own point a feature in [0, 1] moves by little more than its share; joining is off."""
+    before, _ = crowd(seed)
+    config = UfMStarConfig(merge=1e-9, merge_share=0.05, features=2)
+    after, _ = merge(before, before.mean.new_zeros(2, 0, 3), ALL, config, select_merge("torch", "cpu"))
+    for b in range(2):
+        gone = [k for k in range(12) if not (after.mean[b] == before.mean[b, k]).all(1).any()]
+        points = before.mean[:, gone]
+        old, new = (regress(m, points, config).features[b] for m in (before, after))
+        assert ((old - new).abs() <= 0.05 * (len(gone) + 1)).all()
+
+
+def test_nothing_else_is_touched():
+    """A stream that is not due, and components that take no part, keep their bits; the caller's tensors too."""
+    before, sums = crowd(5)
+    before = before.to(torch.float32)
+    copy = {name: value.clone() for name, value in before.tensors().items()}
+    lonely = before.replace(mean=before.mean + torch.tensor([1e3, 0, 0]) * (torch.arange(14) == 2)[:, None])
+    after, left = merge(lonely, sums, torch.tensor([True, False]), CONFIG, select_merge("numba", "cpu"))
+    assert int(after.components[0]) < 12
+    for name, value in lonely.tensors().items():
+        assert torch.equal(getattr(after, name)[1], value[1]), name
+        assert torch.equal(getattr(before, name), copy[name]), name
+    k = int((after.mean[0, :, 0] > 500).nonzero()[0, 0])
+    assert torch.equal(after.covariance[0, k], lonely.covariance[0, 2])
+    assert torch.equal(left[1], sums[1])
+    occupied = after.weight > 0
+    assert not (occupied[:, 1:] & ~occupied[:, :-1]).any()
+
+
+def test_a_thin_plate_stays_positive_definite_in_float32():
+    """Two tilted plates at the floor of float32, side by side: the joint covariance must survive the rounding."""
+    tilt = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.5, 0.3], [0.5, 0.0, -0.8], [-0.3, 0.8, 0.0]]).double())
+    plate = (tilt * torch.tensor([1.0, 1.0, 2e-6]).double()) @ tilt.T
+    two = one([[0.0, 0.0, 2.0], [0.9, 0.9, 2.0]], [1.0, 1.0], [50.0, 50.0], [0.1, 0.1], [2, 2])
+    two = two.replace(covariance=plate.expand(1, 2, 3, 3), mean=two.mean @ tilt.T).to(torch.float32)
+    after = merge_one(two)
+    assert int(after.components) == 1
+    assert torch.linalg.eigvalsh(after.covariance.double())[0, 0, 0] > 0
+
+
+def walk(config: UfMStarConfig, first: int = 0, last: int = 24, state: dict | None = None) -> UfMStar:
+    """Frames ``first`` to ``last`` of one walk, from a saved state."""
+    depths, poses, K = scenes.sequence(24, 48, 64)
+    ufm = UfMStar(config)
+    if state is not None:
+        ufm.load_state_dict(state)
+    for i in range(first, last):
+        ufm(torch.tensor(depths[i])[None], torch.tensor(poses[i]), torch.tensor(K))
+    return ufm
+
+
+def test_a_walk_merges_when_due_and_goes_on_from_a_saved_state():
+    config = UfMStarConfig(merge=1.0, merge_every=8)
+    plain, merging = walk(UfMStarConfig()), walk(config)
+    assert int(merging.mixture.components) < int(plain.mixture.components)
+    again = walk(config, 12, 24, walk(config, 0, 12).state_dict())
+    for name, value in merging.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value), name
+
+
+def test_off_is_off():
+    """Off by default and in the paper's settings, and then the very same state comes back."""
+    state = walk(UfMStarConfig(), 0, 3).state
+    for config in (UfMStarConfig(), UfMStarConfig.paper()):
+        assert config.merge == 0
+        assert merged(state, torch.tensor([True]), config, select_merge("torch", "cpu")) is state
+
+
+def test_a_skipped_frame_merges_nothing():
+    state = walk(UfMStarConfig(), 0, 4).state
+    config = UfMStarConfig(merge=1.0, merge_every=4)
+    kernels = select_merge("torch", "cpu")
+    assert merged(state, torch.tensor([False]), config, kernels) is state
+    assert merged(state, torch.tensor([True]), config, kernels) is not state

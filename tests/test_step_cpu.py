@@ -1,0 +1,195 @@
+"""The compiled step and the compiled check of a frame against the reference, as wholes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import scenes
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.frame import FrameMaps, check_values
+from ufmstar_torch.kernels import check_cpu
+
+pytestmark = pytest.mark.numerics
+
+SIZE = (48, 64)
+K = torch.tensor(scenes.intrinsics(*SIZE))
+SMALL = SPGFConfig(min_pixels=100, min_rows=8)
+CONFIGS = {
+    "default": UfMStarConfig(segment=SMALL),
+    "paper": UfMStarConfig.paper().replace(segment=SMALL),
+    "overlap": UfMStarConfig(segment=SMALL, disagreement="overlap", overlap_weighted=True, unmeasured="relative"),
+    "full": UfMStarConfig(
+        segment=SMALL, features=2, max_components=12, initial_capacity=3, unmeasured="nan", aleatoric_in_moments=True
+    ),
+    "anchored": UfMStarConfig(segment=SMALL, anchored=True, unmeasured="prior", prior_mean=0.2),
+}
+
+
+def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int = 1):
+    """Arguments of ``UfMStar.forward``: streams that start at different places of one tour, with holes and faults."""
+    depths, poses, _ = scenes.sequence(count + streams, *SIZE, 0.05)
+    generator = torch.Generator().manual_seed(0)
+    for i in range(count):
+        depth = torch.stack([torch.tensor(depths[i + s]) for s in range(streams)]).to(dtype)
+        pose = torch.stack([torch.tensor(poses[i + s]) for s in range(streams)]).double()
+        depth[:, 5, 7], depth[:, 9], depth[:, 10, :30] = torch.nan, 30.0, 1e-9
+        if i == 2:
+            pose[-1, 0, 0] += 0.5
+        more: dict = {}
+        if config.features:
+            more["features"] = torch.rand(streams, 2, *SIZE, generator=generator, dtype=dtype)
+            more["features"][:, 1, 20, 20] = torch.inf
+        if config.aleatoric_in_moments:
+            more["aleatoric"] = 0.01 * torch.rand(depth.shape, generator=generator, dtype=dtype)
+            more["aleatoric"][:, 3, 3], more["epistemic"] = -1.0, torch.full_like(depth, 0.1)
+            more["valid"] = torch.rand(depth.shape, generator=generator) > 0.1
+        if config.anchored:
+            at = torch.randint(0, 48, (streams, 20, 2), generator=generator)
+            there = torch.stack([depth[s, at[s, :, 1], at[s, :, 0]] for s in range(streams)]).double()
+            more["anchors"] = Anchors(at.double(), 1.1 * there, 1e-4 * there.square())
+        yield (depth, pose, K), more
+
+
+def tensors(out) -> dict[str, torch.Tensor]:
+    """What a frame returned, by name."""
+    found = {f"statistics.{name}": value for name, value in vars(out.statistics).items()}
+    found |= {f"current_cam.{name}": value for name, value in out.current_cam.tensors().items()}
+    return found | {k: v for k, v in vars(out).items() if isinstance(v, torch.Tensor)}
+
+
+def assert_same(one, other, rows=slice(None)) -> None:
+    """Equal to the last bit, C_i up to its padding."""
+    a, b = tensors(one), tensors(other)
+    for name, value in a.items():
+        there = b[name][rows]
+        if name.startswith("current_cam"):
+            there = there[:, : value.shape[1]]
+        assert torch.equal(value.double().nan_to_num(-1), there.double().nan_to_num(-1)), name
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 3e-5)])
+def test_agrees_with_the_reference(name, dtype, tolerance):
+    config = CONFIGS[name].replace(on_bad_frame="skip")
+    fast, slow = (UfMStar(config.replace(backend=backend), dtype=dtype) for backend in ("numba", "torch"))
+    for arguments, more in frames(4, config, dtype):
+        a, b = tensors(fast(*arguments, **more)), tensors(slow(*arguments, **more))
+        assert a.keys() == b.keys()
+        for key, value in b.items():
+            if value.is_floating_point():
+                scale = value.nan_to_num(0).abs().max().item() if value.numel() else 0.0
+                torch.testing.assert_close(a[key], value, rtol=tolerance, atol=tolerance * scale, equal_nan=True)
+            else:
+                assert torch.equal(a[key], value), key
+    assert fast.skipped.item() == 1
+    assert fast.mixture.components.item() > 3
+    for key, value in slow.state.tensors().items():
+        same = getattr(fast, key)
+        assert same.shape == value.shape
+        assert same.dtype == value.dtype
+        torch.testing.assert_close(same, value, rtol=10 * tolerance, atol=10 * tolerance, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", ["default", "full", "anchored"])
+def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(name):
+    config = CONFIGS[name].replace(on_bad_frame="skip")
+    together = [UfMStar(config) for _ in range(3)]
+    alone = [UfMStar(config) for _ in range(3)]
+    before = torch.get_num_threads()
+    try:
+        for arguments, more in frames(4, config, torch.float32, streams=3):
+            outs = []
+            for threads, ufm in enumerate(together, start=1):
+                torch.set_num_threads(threads)
+                outs.append(ufm(*arguments, **more))
+            for other in outs[1:]:
+                assert_same(outs[0], other)
+            for s, ufm in enumerate(alone):
+                one = {key: value[s : s + 1] for key, value in more.items() if key != "anchors"}
+                if "anchors" in more:
+                    one["anchors"] = Anchors(*(v[s : s + 1] for v in vars(more["anchors"]).values() if v is not None))
+                depth, pose, _ = arguments
+                assert_same(ufm(depth[s : s + 1], pose[s : s + 1], K, **one), outs[0], slice(s, s + 1))
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_the_state_before_is_not_modified():
+    config = CONFIGS["full"]
+    ufm = UfMStar(config)
+    given = list(frames(2, config, torch.float32))
+    ufm(*given[0][0], **given[0][1])
+    before = ufm.state
+    kept = {name: value.clone() for name, value in before.tensors().items()}
+    ufm(*given[1][0], **given[1][1])
+    for name, value in before.tensors().items():
+        assert torch.equal(value.nan_to_num(-1), kept[name].nan_to_num(-1)), name
+
+
+def hostile_cameras():
+    """Poses and intrinsics with every fault, several at once, and none."""
+    eye, camera = torch.eye(4, dtype=torch.float64), K.double()
+
+    def changed(value: torch.Tensor, i: int, j: int, entry: float) -> torch.Tensor:
+        value = value.clone()
+        value[i, j] = entry
+        return value
+
+    entries = [(0, 0, torch.nan), (1, 3, torch.inf), (3, 0, 0.5), (0, 0, 1.004), (0, 0, 1.2), (2, 2, -1.0)]
+    entries += [(2, 3, 1e10), (1, 3, -1e9), (0, 1, 1e-3)]
+    poses = [eye, *(changed(eye, *entry) for entry in entries)]
+    entries = [(0, 0, torch.nan), (0, 0, -30.0), (0, 1, 0.1), (2, 2, 2.0), (0, 0, 1e8), (1, 1, 1e-3), (0, 2, 80.0)]
+    entries += [(1, 2, -0.5), (1, 2, -0.6), (0, 2, 16.5)]
+    cameras = [changed(changed(camera, 0, 2, 8.0), 1, 2, 4.0)]
+    cameras += [changed(cameras[0], *entry) for entry in entries]
+    return torch.stack([p for p in poses for _ in cameras]), torch.stack([c for _ in poses for c in cameras])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_check_agrees_with_the_reference_to_the_last_bit(dtype):
+    poses, cameras = hostile_cameras()
+    b, generator = len(poses), torch.Generator().manual_seed(1)
+
+    def hostile(*shape: int) -> torch.Tensor:
+        special = [
+            torch.nan,
+            torch.inf,
+            -torch.inf,
+            0.0,
+            -1.0,
+            1e-7,
+            1e-6,
+            1e6,
+            2e6,
+            1e12,
+            1.1e12,
+            3e38,
+            20.3,
+            20.300001,
+        ]
+        values = torch.rand(shape, generator=generator, dtype=torch.float64) * 30
+        pick = torch.randint(0, 3 * len(special), shape, generator=generator)
+        return torch.where(pick < len(special), torch.tensor(special).double()[pick % len(special)], values).to(dtype)
+
+    size = (9, 17)
+    full = FrameMaps(hostile(b, *size), hostile(b, *size), hostile(b, *size), hostile(b, 2, *size),
+                     torch.rand(b, *size, generator=generator) > 0.2)  # fmt: skip
+    plain = FrameMaps(full.depth, None, None, None, None)
+    for maps in (full, plain, replace(plain, epistemic=full.epistemic, mask=full.mask)):
+        given = (maps, poses, cameras)
+        slow = check_values(*given, rotation_tolerance=0.01, max_depth=20.3)
+        fast = check_cpu.check_values(*given, rotation_tolerance=0.01, max_depth=20.3)
+        for name, value in vars(slow).items():
+            same = getattr(fast, name)
+            if value is None:
+                assert same is None
+            else:
+                assert same.dtype == value.dtype, name
+                assert torch.equal(same.double().nan_to_num(-7), value.double().nan_to_num(-7)), name
+        assert set(range(10)) == set(slow.fault.tolist())
+        assert slow.beyond.sum() > 0
+        assert slow.out_of_range.sum() > 0

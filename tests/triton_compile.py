@@ -1,0 +1,77 @@
+"""Every Triton kernel compiled for an H100 without one: a program of its own, started by tests/test_triton_compile.py.
+
+The Python functions run on CPU tensors, with launches replaced by compilation: a kernel is compiled for the very
+arguments that it would be launched with. Nothing runs, so the results hold no values.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import torch
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from triton.runtime.jit import KernelInterface
+
+TARGET = GPUTarget("cuda", 90, 32)
+TYPES = {
+    torch.float32: "*fp32", torch.float64: "*fp64", torch.int32: "*i32", torch.int64: "*i64", torch.bool: "*i1",
+    torch.uint8: "*u8", torch.int16: "*i16",
+}  # fmt: skip
+OPTIONS = ("num_warps", "enable_fp_fusion")
+
+
+def compiled(kernel: Any, arguments: tuple[Any, ...], known: dict[str, Any]) -> Any:
+    """The kernel compiled for a launch with these arguments."""
+    options = {name: known.pop(name) for name in OPTIONS if name in known}
+    names = [p.name for p in kernel.params]
+    given = dict(zip(names, arguments, strict=False))
+    signature = {n: TYPES[v.dtype] if isinstance(v, torch.Tensor) else "i32" for n, v in given.items()}
+    assert all(isinstance(v, torch.Tensor | int) for v in given.values()), "a float would arrive as float32"
+    signature |= dict.fromkeys(known, "constexpr")
+    source = ASTSource(fn=kernel, signature={n: signature[n] for n in names}, constexprs=known)
+    return triton.compile(source, target=TARGET, options=options)
+
+
+def usage(cubin: bytes) -> str:
+    """Registers and stack of a kernel [bytes]; a stack means that registers were spilled."""
+    tool = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(cubin)
+        file.flush()
+        command = [str(tool), "-res-usage", file.name]
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return " ".join(re.findall(r"(?:REG|STACK|SHARED):\d+", said))
+
+
+def main() -> None:
+    seen = {}
+
+    def compile_instead(kernel: Any, grid: tuple[int, ...]) -> Any:
+        def launch(*arguments: Any, **known: Any) -> None:
+            dtypes = tuple(a.dtype if isinstance(a, torch.Tensor) else int for a in arguments)
+            key = (kernel.__name__, dtypes, tuple(sorted(known.items())))
+            if key not in seen:
+                seen[key] = compiled(kernel, arguments, known)
+                note = usage(seen[key].asm["cubin"]) if "-v" in sys.argv else ""
+                print("compiled", kernel.__name__, note, flush=True)
+
+        return launch
+
+    KernelInterface.__getitem__ = compile_instead
+    from triton_cases import cases
+
+    chosen = [a for a in sys.argv[1:] if a != "-v"]
+    for name, case in cases().items():
+        if not chosen or name in chosen:
+            case()
+
+
+if __name__ == "__main__":
+    main()

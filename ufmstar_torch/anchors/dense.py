@@ -1,0 +1,234 @@
+"""Dense anchors from the images themselves: in every cell of the image one pixel, measured against earlier keyframes.
+
+Where :class:`~ufmstar_torch.anchors.tracker.LandmarkTracker` follows corners, this searches along epipolar lines: edges
+give depths too, on most surfaces, and what has little parallax is kept with a large variance. Inverse depth is what is
+measured, rho = 1/depth with a standard deviation sigma: an anchor has the depth 1/rho and the variance sigma^2 depth^4.
+
+Needs OpenCV and numba, on the CPU. One a camera; what it keeps is of fixed size: the keyframes and some numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.anchors.dense_keyframes import Keyframes
+from ufmstar_torch.anchors.tracker import Landmarks, checked
+from ufmstar_torch.checked import Checked, number
+
+if TYPE_CHECKING:
+    from ufmstar_torch.kernels.dense_cpu import Measured, Views
+
+# Baselines of the keyframes that a frame is compared with, as shares of the median depth.
+_BASELINES = (0.04, 0.1, 0.22, 0.45)
+# Range of the first search of inverse depth, over 1/median depth.
+_NEAREST, _FARTHEST = 6.0, -0.03
+# Views that must agree; anchors on which running estimates of noise are based.
+_AGREE, _ENOUGH = 2, 10
+# Median of the square of a standard normal variable.
+_MEDIAN_SQUARE = 0.4549
+# [px] Standard deviation of a position by errors of the poses, before it is estimated.
+_FIRST_NOISE = 0.3
+
+
+@dataclass(frozen=True)
+class DenseConfig(Checked):
+    """How dense anchors are measured and believed.
+
+    Attributes:
+        width: largest width of the image that is searched [px]; larger images are reduced to it.
+        keyframes: how many are kept.
+        start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
+        least_score: of a match, zero-mean normalised cross-correlation (ZNCC).
+        rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
+        sigmas: standard deviations by which measurements may differ, and half width of the search in them.
+        match_noise: variance of a match, over that which its residual would make of independent pixels.
+        min_share: least share of the pixels with a match on which the views agree. Where fewer do, poses and images
+            contradict each other, and none is believed.
+        memory: share of the running estimates that remains after a frame.
+
+    Raises:
+        ValueError: an impossible value.
+    """
+
+    width: int = number(320, "", "px", 80, 1280)
+    keyframes: int = number(50, "", "1", 2)
+    start_depth: float = number(2.0, "", "m", 0, open_low=True)
+    least_score: float = number(0.85, "", "1", 0, 1)
+    rival: float = number(1.5, "", "1", 1)
+    sigmas: float = number(3.5, "", "1", 0, open_low=True)
+    match_noise: float = number(1.0, "", "1", 0, open_low=True)
+    min_share: float = number(0.2, "", "1", 0, 1)
+    memory: float = number(0.8, "", "1", 0, 1, open_high=True)
+
+
+class DenseEvidence:
+    """Measures the depth of a pixel in every cell of the image.
+
+    Args:
+        config: see :class:`DenseConfig`; None = its defaults.
+
+    Example::
+
+        evidence = DenseEvidence()
+        for image, T_world_cam in video:
+            landmarks = evidence.update(image, T_world_cam, K)
+            out = ufm(depth, T_world_cam, K_map, anchors=landmarks.anchors(K, K_map))
+    """
+
+    needs_image = True
+
+    def __init__(self, config: DenseConfig | None = None) -> None:
+        self.config = config if config is not None else DenseConfig()
+        self._keyframes = Keyframes(self.config.keyframes)
+        self.reset()
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Plain values on which the anchors depend."""
+        return {"anchors": "dense", "dense": self.config.to_dict()}
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._keyframes.reset()
+        self._camera: tuple[tuple[int, ...], NDArray[np.float64]] | None = None
+        self._depth = self.config.start_depth
+        self._noise = np.full(len(_BASELINES), _FIRST_NOISE**2)
+        self._disagreement = 1.0
+
+    def state(self) -> dict[str, Tensor]:
+        """A copy of all that is remembered, for :meth:`load_state`."""
+        size, K = ((0, 0), np.eye(3)) if self._camera is None else self._camera
+        numbers = np.array([self._depth, self._disagreement])
+        held = {"size": np.array(size), "K": K, "noise": self._noise, "numbers": numbers}
+        return {name: torch.tensor(value) for name, value in held.items()} | self._keyframes.state()
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where :meth:`state` was taken, with the same anchors to the last bit.
+
+        Raises:
+            ValueError: another number of keyframes.
+        """
+        self._keyframes.load_state(state)
+        K, self._noise = (np.array(state[name].numpy()) for name in ("K", "noise"))
+        height, width = state["size"].tolist()
+        self._camera = ((height, width), K) if height else None
+        self._depth, self._disagreement = state["numbers"].tolist()
+
+    def update(
+        self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
+    ) -> Landmarks:
+        """Take in the next image.
+
+        Args:
+            image: [H, W, 3] RGB or [H, W] gray, uint8, undistorted.
+            T_world_cam: [4, 4] camera-to-world [m].
+            K: [3, 3] of the image [px]; the same for all images.
+
+        Returns:
+            The depths measured in it; none before there is parallax. ``tracked`` counts the pixels that were searched.
+
+        Raises:
+            TypeError: ``image`` is no array.
+            ValueError: wrong shape or dtype, a pose that is not finite, another size or camera than before (call
+                :meth:`reset` first); everything is as it was then.
+            ModuleNotFoundError: OpenCV is not installed.
+        """
+        gray, T, K = checked(image, T_world_cam, K)
+        if self._camera is None:
+            self._camera = gray.shape, K
+        elif gray.shape != self._camera[0] or not np.array_equal(K, self._camera[1]):
+            raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
+        small, scale = _reduced(gray, self.config.width)
+        found = self._measured(small, scale, T, K)
+        self._keyframes.add(small, T, self._depth)
+        return found
+
+    def _measured(self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray) -> Landmarks:
+        """The depths of a reduced image; the running estimates follow."""
+        from ufmstar_torch.kernels.dense_cpu import Search, measure  # compiles when it is first needed
+
+        K_small = scale @ K
+        chosen = self._keyframes.choose(T, K_small, self._depth, _BASELINES)
+        if len(chosen) < _AGREE:
+            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), 0, np.zeros(0, np.int64))
+        shares = np.array([share for share, _ in chosen])
+        views = self._views([keyframe for _, keyframe in chosen], shares, T, K_small)
+        pixel = _pixels(small)
+        config, over = self.config, 1 / self._depth
+        search = Search(
+            start=over,
+            low=_FARTHEST * over,
+            high=_NEAREST * over,
+            sigmas=config.sigmas,
+            least_score=config.least_score,
+            rival=config.rival,
+            match=config.match_noise,
+        )
+        found = measure(small, pixel, views, search)
+        self._learn(found, shares)
+        variance = found.variance * max(self._disagreement, 1)
+        matched, agreed = found.agreed > 0, (found.agreed >= _AGREE) & (found.contradicted == 0)
+        fine = agreed & (found.rho > np.sqrt(variance)) & (agreed.sum() >= config.min_share * matched.sum())
+        if fine.sum() >= _ENOUGH:
+            step = (1 - config.memory) * np.log(np.median(1 / found.rho[fine]) / self._depth)
+            self._depth *= float(np.exp(step))
+        depth = 1 / found.rho[fine]
+        position = (pixel[fine] - scale[:2, 2]) / scale.diagonal()[:2]
+        return Landmarks(position, depth, variance[fine] * depth**4, len(pixel), np.zeros(len(depth), np.int64))
+
+    def _views(self, keyframes: list[int], shares: NDArray, T: NDArray, K: NDArray) -> Views:
+        """The chosen keyframes, and how pixels of the camera T [4, 4] get into them."""
+        from ufmstar_torch.kernels.dense_cpu import Views
+
+        image, pose = self._keyframes.images(keyframes), self._keyframes.poses(keyframes)
+        into = pose[:, :3, :3].transpose(0, 2, 1)
+        H = K @ into @ T[:3, :3] @ np.linalg.inv(K)
+        b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
+        return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), self._noise[shares])
+
+    def _learn(self, found: Measured, shares: NDArray) -> None:
+        """Running estimates of the poses' noise by baseline, and of how far keyframes disagree."""
+        memory = self.config.memory
+        for column, share in enumerate(shares):
+            shown = np.isfinite(found.across[:, column]) & (found.agreed >= _AGREE)
+            if shown.sum() >= _ENOUGH:
+                seen = np.median(np.square(found.across[shown, column])) / _MEDIAN_SQUARE
+                noise = max(seen - np.median(found.across_noise[shown, column]), 0.0)
+                self._noise[share] = memory * self._noise[share] + (1 - memory) * noise
+        differ = found.differ[np.isfinite(found.differ)]
+        if len(differ) >= _ENOUGH:
+            seen = float(np.median(differ)) / _MEDIAN_SQUARE
+            self._disagreement = memory * self._disagreement + (1 - memory) * seen
+
+
+def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """An image no wider than ``width``, and [3, 3] its pixels from those of ``gray``."""
+    if gray.shape[1] <= width:
+        return gray, np.eye(3)
+    import cv2
+
+    size = (width, max(round(gray.shape[0] * width / gray.shape[1]), 1))
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    along, down = size[0] / gray.shape[1], size[1] / gray.shape[0]
+    scale = np.array([[along, 0, 0.5 * along - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1]])
+    return np.asarray(small, dtype=np.uint8), scale
+
+
+def _pixels(small: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """[N, 2] the pixel (u, v) of the largest gradient in every cell that has one: 8 px wide in an image 160 wide, 10 in
+    one of 320."""
+    from ufmstar_torch.kernels.dense_cpu import best_pixels
+
+    height, width = small.shape
+    cell = max(round(8 * 1.25 ** np.log2(width / 160)), 4)
+    shape = (-(-height // cell), -(-width // cell))
+    pixel, strength = np.zeros((*shape, 2)), np.zeros(shape)
+    best_pixels(small, cell, pixel, strength)
+    return pixel[strength > 0]

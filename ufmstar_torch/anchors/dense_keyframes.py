@@ -1,0 +1,125 @@
+"""Keyframes of a camera, a ring of fixed size: kept where the camera has moved, chosen by their baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+# A frame becomes a keyframe where the camera has moved by this share of the median depth, or turned so far [rad].
+_MOVED, _TURNED = 0.015, np.deg2rad(4.0)
+# A baseline may be off from the one that is asked for by a factor of at most _OFF.
+_OFF = 2.5
+# What a view must show of the present one: this share of a grid of points at the median depth.
+_OVERLAP = 0.5
+
+
+class Keyframes:
+    """The last ``count`` keyframes: images in gray, and poses."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._image = np.zeros((self._count, 0, 0), np.uint8)
+        self._pose = np.tile(np.eye(4), (self._count, 1, 1))
+        self._added = 0
+
+    @property
+    def number(self) -> int:
+        """How many are kept."""
+        return min(self._added, self._count)
+
+    def add(self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], depth: float) -> None:
+        """Keep a frame if the camera has moved or turned since the last one that was kept.
+
+        Args:
+            image: [H, W], of one size for all.
+            T_world_cam: [4, 4] [m].
+            depth: median of the scene [m].
+        """
+        if self._image.shape[1:] != image.shape:
+            self._image = np.zeros((self._count, *image.shape), np.uint8)
+        if self._added:
+            last = self._pose[(self._added - 1) % self._count]
+            moved = np.linalg.norm(last[:3, 3] - T_world_cam[:3, 3])
+            turned = np.arccos(np.clip((np.trace(last[:3, :3].T @ T_world_cam[:3, :3]) - 1) / 2, -1, 1))
+            if moved < _MOVED * depth and turned < _TURNED:
+                return
+        slot = self._added % self._count
+        self._image[slot], self._pose[slot] = image, T_world_cam
+        self._added += 1
+
+    def choose(
+        self, T_world_cam: NDArray[np.float64], K: NDArray[np.float64], depth: float, shares: tuple[float, ...]
+    ) -> list[tuple[int, int]]:
+        """The keyframes to compare a view with, the shortest baseline first.
+
+        Args:
+            T_world_cam: [4, 4] of the view [m].
+            K: [3, 3] [px].
+            depth: median of the scene [m].
+            shares: baselines that are wanted, as shares of ``depth``.
+
+        Returns:
+            (index of the share, keyframe), none twice.
+        """
+        n = self.number
+        if n == 0:
+            return []
+        pose = self._pose[:n]
+        baseline = np.linalg.norm(pose[:, :3, 3] - T_world_cam[:3, 3], axis=1) / depth
+        seen = self._overlap(pose, T_world_cam, K, depth) >= _OVERLAP
+        age = (self._added - 1 - np.arange(n)) % self._count
+        chosen: list[tuple[int, int]] = []
+        for index, share in enumerate(shares):
+            off = np.abs(np.log(np.maximum(baseline, 1e-9) / share))
+            off = np.where(seen & (off < np.log(_OFF)), off + 0.002 * age, np.inf)
+            off[[keyframe for _, keyframe in chosen]] = np.inf
+            best = int(off.argmin())
+            if np.isfinite(off[best]):
+                chosen.append((index, best))
+        return sorted(chosen, key=lambda pair: baseline[pair[1]])
+
+    def _overlap(
+        self, pose: NDArray[np.float64], T: NDArray[np.float64], K: NDArray[np.float64], depth: float
+    ) -> NDArray[np.float64]:
+        """[n] share of a grid of points at a depth before the camera T that the views show."""
+        height, width = self._image.shape[1:]
+        u, v = np.meshgrid((np.arange(4) + 0.5) * width / 4, (np.arange(4) + 0.5) * height / 4)
+        rays = np.stack([u.ravel(), v.ravel(), np.ones(16)], -1) @ np.linalg.inv(K).T
+        world = depth * rays @ T[:3, :3].T + T[:3, 3]
+        cam = np.einsum("nji,npj->npi", pose[:, :3, :3], world[None] - pose[:, None, :3, 3])
+        z = np.maximum(cam[..., 2], 1e-6)
+        pu, pv = (cam @ K[:2].T / z[..., None]).transpose(2, 0, 1)
+        inside = (cam[..., 2] > 0.2 * depth) & (pu > 0) & (pv > 0) & (pu < width - 1) & (pv < height - 1)
+        return np.asarray(inside.mean(1))
+
+    def images(self, keyframes: list[int]) -> NDArray[np.uint8]:
+        """[V, H, W] of some."""
+        return self._image[keyframes]
+
+    def poses(self, keyframes: list[int]) -> NDArray[np.float64]:
+        """[V, 4, 4] camera-to-world of some [m]."""
+        return self._pose[keyframes]
+
+    def state(self) -> dict[str, Tensor]:
+        """A copy of all that is remembered, for :meth:`load_state`."""
+        held = {"image": self._image, "pose": self._pose, "added": np.array(self._added)}
+        return {name: torch.tensor(value) for name, value in held.items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where :meth:`state` was taken.
+
+        Raises:
+            ValueError: another number of keyframes.
+        """
+        if len(state["pose"]) != self._count:
+            raise ValueError(f"state must be of {self._count} keyframes, got {len(state['pose'])}")
+        self._image, self._pose = (np.array(state[name].numpy()) for name in ("image", "pose"))
+        self._added = int(state["added"])

@@ -1,0 +1,121 @@
+"""The landmarks of several cameras at once, as the anchors of a batch of images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.landmarks import LandmarkSource, landmark_source
+
+Given = str | Path | LandmarkSource
+_PARTS = ("pixel", "depth", "variance", "valid")
+
+
+class StreamLandmarks:
+    """One source of landmarks for each stream of a batch.
+
+    Args:
+        sources: what :func:`landmark_source` takes; a sequence of them, one for each stream.
+
+    Raises:
+        FileNotFoundError, ValueError: as :func:`landmark_source`.
+    """
+
+    def __init__(self, sources: Given | list[Given] | tuple[Given, ...]) -> None:
+        given = sources if isinstance(sources, list | tuple) else [sources]
+        self._sources = [landmark_source(one) for one in given]
+        self._before = self._states()
+
+    def update(self, image: Tensor, pose: Tensor, intrinsics: Tensor) -> Anchors:
+        """Anchors of the next image of every stream, in its pixels. Where it raises, no source has changed.
+
+        Args:
+            image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1].
+            pose: [B, 4, 4] or [4, 4] camera-to-world [m].
+            intrinsics: [B, 3, 3] or [3, 3] of ``image`` [px].
+
+        Returns:
+            [B, N], padded and masked, on the image's device.
+
+        Raises:
+            ValueError: another number of streams than sources, an image of another kind, or as
+                :meth:`LandmarkSource.update`.
+        """
+        b = len(image)
+        if b != len(self._sources):
+            raise ValueError(f"anchors must name a source for each of the {b} streams, got {len(self._sources)}")
+        pictures = _bytes(image).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+        T = pose.detach().double().expand(b, 4, 4).cpu().numpy()
+        K = intrinsics.detach().double().expand(b, 3, 3).cpu()
+        before = self._states()
+        try:
+            found = [s.update(pictures[i], T[i], K[i].numpy()) for i, s in enumerate(self._sources)]
+        except BaseException:
+            self._restore(before, range(b))
+            raise
+        self._before = before
+        room = max(len(landmarks.depth) for landmarks in found)
+        each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(found)]
+        known = [one.confirmed for one in each if one.confirmed is not None]
+        parts = {name: torch.cat([getattr(one, name) for one in each]) for name in _PARTS}
+        return Anchors(**parts, confirmed=torch.cat(known) if len(known) == b else None).to(image.device)
+
+    def undo(self, streams: Sequence[int] | None = None) -> None:
+        """Forget the last image of these streams (None: of all): it was not used."""
+        self._restore(self._before, range(len(self._sources)) if streams is None else streams)
+
+    def reset(self, streams: Sequence[int] | None = None) -> None:
+        """Forget all images of these streams (None: of all)."""
+        for i in range(len(self._sources)) if streams is None else streams:
+            self._sources[i].reset()
+
+    def state(self) -> dict[str, Tensor]:
+        """All on which the next anchors depend, as "STREAM.NAME"."""
+        states = enumerate(self._states())
+        return {f"{i}.{name}": value for i, state in states for name, value in state.items()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Continue where :meth:`state` was taken.
+
+        Raises:
+            ValueError: it is of other sources; they are as they were then.
+        """
+        before, parts = self._states(), [dict[str, Tensor]() for _ in self._sources]
+        for key, value in state.items():
+            stream, _, name = key.partition(".")
+            if not stream.isdigit() or int(stream) >= len(parts):
+                raise ValueError(f"anchors: the state holds {key!r}, but the streams are 0 to {len(parts) - 1}")
+            parts[int(stream)][name] = value
+        try:
+            for source, own, part in zip(self._sources, before, parts, strict=True):
+                if part.keys() != own.keys():
+                    raise ValueError(f"anchors: the state must hold {sorted(own)}, got {sorted(part)}")
+                source.load_state(part)
+        except BaseException:
+            self._restore(before, range(len(before)))
+            raise
+
+    def _states(self) -> list[dict[str, Tensor]]:
+        return [source.state() for source in self._sources]
+
+    def _restore(self, states: Sequence[Mapping[str, Tensor]], streams: Sequence[int]) -> None:
+        for i in streams:
+            self._sources[i].load_state(states[i])
+
+
+def _bytes(image: Tensor) -> Tensor:
+    """[B, 3, H, W] as uint8.
+
+    Raises:
+        ValueError: neither uint8 nor floating-point in [0, 1], so that the range is not known.
+    """
+    if image.dtype == torch.uint8:
+        return image
+    low, high = torch.aminmax(image.detach()) if image.is_floating_point() and image.numel() else (-1.0, -1.0)
+    if not (low >= -1e-3 and high <= 1 + 1e-3):
+        raise ValueError("image must be uint8, or floating-point in [0, 1], for landmarks to be tracked in it")
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8)

@@ -1,0 +1,371 @@
+"""Inverse depths of pixels from keyframes: a search along the epipolar line by ZNCC, refined to a fraction of a pixel.
+
+On the CPU (numba). A pixel x of the image and an inverse depth rho [1/m] project into a keyframe at
+p(rho) = (H x + rho b)/(.)_z, with H = K R K^-1 and b = K t of the relative pose. The patch around x, warped by dp/dx,
+is compared with windows of the keyframe along the line, a pixel apart; from the best one, Gauss-Newton steps along the
+line refine the position. Windows have an even side: their centres lie between pixels, and eight values are what a
+processor multiplies at once. ``tests/oracle_dense.py`` is the same in NumPy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# NumPy's error model: no test for zero before every division. Sums may be taken in any order.
+compiled: Any = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+
+# [px] Side of the windows that are compared, and where the first of their pixels lies from the centre.
+SIDE, FIRST = 8, -3.5
+COUNT = SIDE * SIDE
+# [gray levels] Least standard deviation of a window that is compared: below it, there is noise and nothing else.
+LEAST_CONTRAST = 2.0
+# [px] Pixels nearer to the border are not measured.
+MARGIN = 6
+# Steps of a search at most, steps of the refinement at most, and how short the last of them is [px].
+LONGEST, STEPS, CONVERGED = 192, 5, 0.01
+# [px] The refined position lies at most so far from the best window; a rival at least as far as _APART steps.
+FARTHEST, APART = 1.5, 2
+# Largest change of scale between the patch and its image in the keyframe.
+LARGEST_SCALE = 2.0
+# [px^2] Variance of a match where the residual is none: what interpolation leaves.
+LEAST_MATCH = 0.03**2
+# [px] Across the line, a match shows errors of the poses where its own noise is less than this.
+SHOWS = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Keyframes that are searched, the shortest baseline first.
+
+    Attributes:
+        image: [V, H, W] uint8.
+        H: [V, 3, 3] of a pixel at infinity into the view.
+        b: [V, 3] [px m].
+        noise: [V] variance of a position by errors of the poses [px^2].
+    """
+
+    image: NDArray[np.uint8]
+    H: NDArray[np.float64]
+    b: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Search:
+    """How a depth is searched and believed.
+
+    Attributes:
+        start: inverse depth at which the first patch is warped [1/m].
+        low, high: range of the first search [1/m].
+        sigmas: half width of the searches that follow, and largest difference between views.
+        least_score: of a match, ZNCC.
+        rival: the best match elsewhere on the first line has this many times the best one's 1 - ZNCC, or more.
+        match: variance of a match, over that which its residual would make of independent pixels.
+    """
+
+    start: float
+    low: float
+    high: float
+    sigmas: float
+    least_score: float
+    rival: float
+    match: float
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Inverse depths of N pixels.
+
+    Attributes:
+        rho: [N] [1/m].
+        variance: [N] of ``rho`` [1/m^2]: the smallest of the views that agree. They share the patch: it does not
+            become less with their number.
+        agreed: [N] views that agree; 0 = not measured.
+        contradicted: [N] views that do not.
+        across: [N, V] residual across the line [px], NaN where the patch does not show it.
+        across_noise: [N, V] its variance without errors of the poses [px^2].
+        differ: [N, V] squared difference from the views before, over its variance; NaN where there is none.
+    """
+
+    rho: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    agreed: NDArray[np.int64]
+    contradicted: NDArray[np.int64]
+    across: NDArray[np.float64]
+    across_noise: NDArray[np.float64]
+    differ: NDArray[np.float64]
+
+
+def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, search: Search) -> Measured:
+    """Inverse depths along the optical axis.
+
+    Args:
+        image: [H, W] uint8.
+        pixel: [N, 2] (u, v).
+        views: in the same pixels.
+        search: see there.
+    """
+    n, v = len(pixel), len(views.image)
+    found = Measured(
+        *(np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)),
+        *(np.full((n, v), np.nan) for _ in range(3)),
+    )
+    numbers = (search.start, search.low, search.high, search.sigmas, search.least_score, search.rival, search.match)
+    _measure(
+        *(image, pixel, views.image, views.H, views.b, views.noise, numbers),
+        *(found.rho, found.variance, found.agreed, found.contradicted),
+        *(found.across, found.across_noise, found.differ),
+    )
+    return found
+
+
+@compiled
+def best_pixels(image, cell, pixel, strength):
+    """In every cell [C, R] the pixel (u, v) [C, R, 2] of the largest squared gradient, and that gradient [C, R], 0
+    where there is none. Cells are ``cell`` px wide."""
+    height, width = image.shape
+    for j in range(strength.shape[0]):
+        for i in range(strength.shape[1]):
+            best, at_u, at_v = 0, 0, 0
+            for v in range(max(j * cell, MARGIN), min((j + 1) * cell, height - MARGIN)):
+                for u in range(max(i * cell, MARGIN), min((i + 1) * cell, width - MARGIN)):
+                    du = np.int32(image[v, u + 1]) - np.int32(image[v, u - 1])
+                    dv = np.int32(image[v + 1, u]) - np.int32(image[v - 1, u])
+                    if du * du + dv * dv > best:
+                        best, at_u, at_v = du * du + dv * dv, u, v
+            pixel[j, i, 0], pixel[j, i, 1], strength[j, i] = at_u, at_v, best
+
+
+@compiled
+def _measure(
+    image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, contradicted, across, across_noise, differ
+):
+    start, first_low, first_high, sigmas, least_score, least_rival, match = numbers
+    template, patch = np.empty((SIDE + 2, SIDE + 2), np.float32), np.empty((SIDE, SIDE), np.float32)
+    along_u, along_v = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.float32)
+    scores, place, out = np.empty(LONGEST + 1, np.float32), np.empty(4), np.empty(6)
+    for n in range(len(pixel)):
+        u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
+        for k in range(len(keys)):
+            first = agreed[n] == 0
+            at = start if first else rho[n]
+            x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]
+            z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2]
+            low, high = first_low, first_high
+            if not first:
+                speed = _speed(x, y, z, b[k], at)[2]
+                half = max(sigmas * np.sqrt(variance[n] + noise[k] / speed**2), 1 / speed)
+                low, high = at - half, at + half
+            if not (
+                _warped(image, u, v, H[k], b[k], at, template)
+                and _normalised(template, patch, along_u, along_v)
+                and _search(patch, keys[k], x, y, z, b[k], low, high, scores, place)
+            ):
+                continue
+            if place[2] < least_score or (first and 1 - place[3] < least_rival * (1 - place[2])):
+                continue
+            eu, ev, speed = _speed(x, y, z, b[k], _inverse_depth(x, y, z, b[k], place[0], place[1]))
+            if not _refined(patch, along_u, along_v, keys[k], place[0], place[1], eu, ev, out) or out[5] < least_score:
+                continue
+            # Of the normalised window: G along and across the line; the variance of a pixel from what is left over.
+            g_ee, g_ep, g_pp, pixel_noise = out[1], out[2], out[3], match * 2 * (1 - out[5]) / (COUNT - 4)
+            slope = g_ep / g_ee
+            schur = g_pp - g_ep * slope
+            if schur > 0 and pixel_noise < SHOWS * SHOWS * schur:
+                across[n, k], across_noise[n, k] = -out[4] / schur, pixel_noise / schur
+            spread = (pixel_noise / g_ee + LEAST_MATCH + noise[k] * (1 + slope * slope)) / (speed * speed)
+            value = _inverse_depth(x, y, z, b[k], place[0] + out[0] * eu, place[1] + out[0] * ev)
+            if not first:
+                differ[n, k] = (value - rho[n]) ** 2 / (spread + variance[n])
+                if differ[n, k] > sigmas * sigmas:
+                    contradicted[n] += 1
+                    continue
+            agreed[n] += 1
+            variance[n] = spread if first else min(variance[n], spread)
+            rho[n] = (rho[n] * weight + value / spread) / (weight + 1 / spread)
+            weight += 1 / spread
+
+
+@compiled
+def _speed(x, y, z, b, rho):
+    """Direction in which a point moves with its inverse depth, and how fast [px m]."""
+    over = 1 / (z + rho * b[2])
+    u, v = (x + rho * b[0]) * over, (y + rho * b[1]) * over
+    du, dv = (b[0] - u * b[2]) * over, (b[1] - v * b[2]) * over
+    speed = max(np.sqrt(du * du + dv * dv), 1e-12)
+    return du / speed, dv / speed, speed
+
+
+@compiled
+def _inverse_depth(x, y, z, b, u, v):
+    """Of a position near the line, by the axis along which the line moves faster."""
+    du, dv = b[0] - u * b[2], b[1] - v * b[2]
+    return (u * z - x) / du if abs(du) > abs(dv) else (v * z - y) / dv
+
+
+@compiled
+def _warped(image, u, v, H, b, rho, template):
+    """The patch around (u, v) as a view sees it at inverse depth rho, a pixel wider than the window on each side. False
+    where it leaves the image or changes its scale too much."""
+    z = H[2, 0] * u + H[2, 1] * v + H[2, 2] + rho * b[2]
+    if z <= 1e-6:
+        return False
+    pu = (H[0, 0] * u + H[0, 1] * v + H[0, 2] + rho * b[0]) / z
+    pv = (H[1, 0] * u + H[1, 1] * v + H[1, 2] + rho * b[1]) / z
+    a, b_, c, d = H[0, 0] - pu * H[2, 0], H[0, 1] - pu * H[2, 1], H[1, 0] - pv * H[2, 0], H[1, 1] - pv * H[2, 1]
+    determinant = a * d - b_ * c
+    if not z * z / LARGEST_SCALE**2 < determinant < z * z * LARGEST_SCALE**2:
+        return False
+    over = z / determinant
+    a, b_, c, d = d * over, -b_ * over, -c * over, a * over
+    height, width = image.shape
+    far_u, far_v = (abs(a) + abs(b_)) * (1 - FIRST), (abs(c) + abs(d)) * (1 - FIRST)
+    if not (far_u <= u < width - 1 - far_u and far_v <= v < height - 1 - far_v):
+        return False
+    one = np.float32(1)
+    for j in range(SIDE + 2):
+        for i in range(SIDE + 2):
+            right, down = i + FIRST - 1, j + FIRST - 1
+            su, sv = u + a * right + b_ * down, v + c * right + d * down
+            iu, iv = int(su), int(sv)
+            fu, fv = np.float32(su - iu), np.float32(sv - iv)
+            upper = (one - fu) * np.float32(image[iv, iu]) + fu * np.float32(image[iv, iu + 1])
+            lower = (one - fu) * np.float32(image[iv + 1, iu]) + fu * np.float32(image[iv + 1, iu + 1])
+            template[j, i] = (one - fv) * upper + fv * lower
+    return True
+
+
+@compiled
+def _normalised(template, patch, along_u, along_v):
+    """The window of a template with mean 0 and length 1; its gradients, of mean 0 [1/px]. False without contrast."""
+    mean = mean_u = mean_v = squares = np.float32(0)
+    half = np.float32(0.5)
+    for j in range(SIDE):
+        for i in range(SIDE):
+            patch[j, i] = template[j + 1, i + 1]
+            along_u[j, i] = half * (template[j + 1, i + 2] - template[j + 1, i])
+            along_v[j, i] = half * (template[j + 2, i + 1] - template[j, i + 1])
+            mean += patch[j, i]
+            mean_u += along_u[j, i]
+            mean_v += along_v[j, i]
+    mean, mean_u, mean_v = mean / np.float32(COUNT), mean_u / np.float32(COUNT), mean_v / np.float32(COUNT)
+    for j in range(SIDE):
+        for i in range(SIDE):
+            patch[j, i] -= mean
+            squares += patch[j, i] * patch[j, i]
+    if squares <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
+        return False
+    over = np.float32(1 / np.sqrt(squares))
+    for j in range(SIDE):
+        for i in range(SIDE):
+            patch[j, i] *= over
+            along_u[j, i] = (along_u[j, i] - mean_u) * over
+            along_v[j, i] = (along_v[j, i] - mean_v) * over
+    return True
+
+
+@compiled
+def _search(patch, key, x, y, z, b, low, high, scores, place):
+    """The best window between two inverse depths; its centre on the line (u, v), its ZNCC, and the ZNCC of its rival,
+    the best one more than APART steps away, in ``place``. False where there is none."""
+    height, width = key.shape
+    z_low, z_high = z + low * b[2], z + high * b[2]
+    if z_low <= 1e-3 or z_high <= 1e-3:
+        return False
+    u_low, v_low = (x + low * b[0]) / z_low, (y + low * b[1]) / z_low
+    du, dv = (x + high * b[0]) / z_high - u_low, (y + high * b[1]) / z_high - v_low
+    longest = max(abs(du), abs(dv))
+    if not longest <= LONGEST:
+        return False
+    steps = max(int(np.ceil(longest)), 1)
+    du, dv = du / steps, dv / steps
+    best, at = np.float32(-2), -1
+    for s in range(steps + 1):
+        left, top = int(np.floor(u_low + s * du + FIRST + 0.5)), int(np.floor(v_low + s * dv + FIRST + 0.5))
+        scores[s] = -2
+        if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
+            scores[s] = _score(patch, key, left, top)
+            if scores[s] > best:
+                best, at = scores[s], s
+    if at < 0:
+        return False
+    rival = np.float32(-1)
+    for s in range(steps + 1):
+        if abs(s - at) > APART and scores[s] > rival:
+            rival = scores[s]
+    place[0], place[1], place[2], place[3] = u_low + at * du, v_low + at * dv, best, rival
+    return True
+
+
+@compiled
+def _score(patch, key, left, top):
+    """ZNCC of the patch with a window; -1 where the window has no contrast."""
+    total = squares = cross = np.float32(0)
+    for j in range(SIDE):
+        for i in range(SIDE):
+            value = np.float32(key[top + j, left + i])
+            total += value
+            squares += value * value
+            cross += patch[j, i] * value
+    deviation = squares - total * total / np.float32(COUNT)
+    if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
+        return np.float32(-1)
+    return cross / np.sqrt(deviation)
+
+
+@compiled
+def _refined(patch, along_u, along_v, key, u, v, eu, ev, out):
+    """Gauss-Newton steps along (eu, ev) from the centre (u, v). ``out``: the way gone [px]; G along, between and across
+    the line [1/px^2]; gradient across times residual [1/px]; ZNCC. False where it leaves the image or the match."""
+    height, width = key.shape
+    cu, cv = np.float32(eu), np.float32(ev)
+    g_ee = g_ep = g_pp = own_e = own_p = np.float32(0)
+    for j in range(SIDE):
+        for i in range(SIDE):
+            e, p = cu * along_u[j, i] + cv * along_v[j, i], cu * along_v[j, i] - cv * along_u[j, i]
+            g_ee += e * e
+            g_ep += e * p
+            g_pp += p * p
+            own_e += e * patch[j, i]
+            own_p += p * patch[j, i]
+    if g_ee <= 1e-9:
+        return False
+    gone, one = 0.0, np.float32(1)
+    for step in range(STEPS + 1):
+        left, top = u + gone * eu + FIRST, v + gone * ev + FIRST
+        iu, iv = int(np.floor(left)), int(np.floor(top))
+        if iu < 0 or iv < 0 or iu + SIDE >= width or iv + SIDE >= height:
+            return False
+        fu, fv = np.float32(left - iu), np.float32(top - iv)
+        w00, w01, w10, w11 = (one - fv) * (one - fu), (one - fv) * fu, fv * (one - fu), fv * fu
+        total = squares = cross = down_u = down_v = np.float32(0)
+        for j in range(SIDE):
+            for i in range(SIDE):
+                upper = w00 * np.float32(key[iv + j, iu + i]) + w01 * np.float32(key[iv + j, iu + i + 1])
+                lower = w10 * np.float32(key[iv + j + 1, iu + i]) + w11 * np.float32(key[iv + j + 1, iu + i + 1])
+                value = upper + lower
+                total += value
+                squares += value * value
+                cross += patch[j, i] * value
+                down_u += along_u[j, i] * value
+                down_v += along_v[j, i] * value
+        deviation = squares - total * total / np.float32(COUNT)
+        if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
+            return False
+        # The gradients' mean is 0: that of the values drops out. The patch's own part of them is not residual.
+        over = one / np.sqrt(deviation)
+        score = cross * over
+        change = -((cu * down_u + cv * down_v) * over - score * own_e) / g_ee
+        if step == STEPS or abs(change) < CONVERGED:
+            break
+        gone += change
+        if abs(gone) > FARTHEST:
+            return False
+    right_p = (cu * down_v - cv * down_u) * over - score * own_p
+    out[0], out[1], out[2], out[3], out[4], out[5] = gone, g_ee, g_ep, g_pp, right_p, score
+    return True

@@ -1,0 +1,96 @@
+"""The paper's neighbourhood regression on the CPU (numba), at every pixel and at points."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ufmstar_torch.kernels.regress_points_cpu import compiled, prepare
+
+
+@compiled
+def near_image(
+    depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
+    first, shares,
+):  # fmt: skip
+    """One stream, depth [H, W] into out [H, W] and out_f [F, H, W]; of the rows every ``shares``-th, from ``first``."""
+    index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
+    gaps, kept, sums = np.empty(index.size), np.empty(index.size, np.int64), np.empty(features.shape[1])
+    for v in range(first, depth.shape[0], shares):
+        for u in range(depth.shape[1]):
+            if valid[v, u]:
+                z = np.float64(depth[v, u])
+                x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
+                out[v, u] = _point(
+                    x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps,
+                    kept, sums,
+                )  # fmt: skip
+            else:
+                out[v, u] = np.nan
+            for g in range(sums.size):
+                out_f[g, v, u] = sums[g] if valid[v, u] else np.nan
+
+
+@compiled
+def near_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f):
+    """At points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not finite."""
+    index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
+    gaps, kept, sums = np.empty(index.size), np.empty(index.size, np.int64), np.empty(features.shape[1])
+    for p in range(points.shape[0]):
+        x, y, z = np.float64(points[p, 0]), np.float64(points[p, 1]), np.float64(points[p, 2])
+        known = x + y + z
+        finite = known - known == 0
+        value = _point(
+            x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums
+        )
+        out[p] = value if finite else np.nan
+        for g in range(sums.size):
+            out_f[g, p] = sums[g] if finite else np.nan
+
+
+@compiled
+def _components(mean, covariance, weight, sigmas):
+    """Occupied components: index, log peak density, mean and whitening [K, 9], and half the sides of their boxes."""
+    index, whitening, log_peak = prepare(mean, covariance, weight)
+    local, extent = np.empty((index.size, 9)), np.empty((index.size, 3))
+    for k in range(index.size):
+        for i in range(3):
+            local[k, i] = mean[index[k], i]
+            extent[k, i] = sigmas * math.sqrt(covariance[index[k], i, i])
+        for i in range(6):
+            local[k, 3 + i] = whitening[k, i]
+    return index, log_peak, local, extent
+
+
+@compiled
+def _point(x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums):
+    """The regression at one point; its features are left in ``sums`` [F]."""
+    count, least = 0, np.inf
+    for k in range(index.size):
+        gap = abs(z - local[k, 2]) - extent[k, 2]
+        gap = max(gap, abs(x - local[k, 0]) - extent[k, 0], abs(y - local[k, 1]) - extent[k, 1])
+        if gap <= far:
+            gaps[count], kept[count] = gap, k
+            count += 1
+            least = min(least, gap)
+    radius = near if least <= near else far
+    evidence, total = prior_weight, prior_weight * prior_mean
+    for g in range(sums.size):
+        sums[g] = 0.0
+    for j in range(count):
+        if gaps[j] > radius:
+            continue
+        k = kept[j]
+        dx, dy, dz = x - local[k, 0], y - local[k, 1], z - local[k, 2]
+        y0 = local[k, 3] * dx
+        y1 = local[k, 4] * dx + local[k, 5] * dy
+        y2 = local[k, 6] * dx + local[k, 7] * dy + local[k, 8] * dz
+        w = math.exp(log_peak[k] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2))
+        evidence += w
+        total += w * m[index[k]]
+        for g in range(sums.size):
+            sums[g] += w * features[index[k], g]
+    for g in range(sums.size):
+        sums[g] /= evidence
+    return total / evidence

@@ -1,0 +1,239 @@
+"""First half of SPGF on a GPU: the rows of all streams in parallel, a lane each, columns in order.
+
+The open segments of a row are a few registers of its lane. Formulas stand in the torch reference's order of operations
+and are never contracted, so that every decision agrees to the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ufmstar_torch.kernels.triton.launch import interpreted, launch, power_of_two
+from ufmstar_torch.segment_input import SegmentInput
+
+MOMENTS, WHOLE = 7, 4  # of a finished segment: mean x, z; scatter xx, xz, zz; line x, z | N, nearest bin, interval
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Finished segments of B H rows of W pixels, at most M in a row.
+
+    Attributes:
+        camera: [B, 3, 3] float64 [px].
+        lengths2: [B, bins] float64, squared length of every depth bin [m^2].
+        moments: [B H, M, 7] float64.
+        whole: [B H, M, 4] int32.
+        count: [B H] int32.
+        owner: [B H, W] int32, which of the row's starts a pixel belongs to, -1 = none; None without labels.
+        place: [B H, W] int32, the finished segment of every start, -1 = too sparse; None likewise.
+    """
+
+    camera: Tensor
+    lengths2: Tensor
+    moments: Tensor
+    whole: Tensor
+    count: Tensor
+    owner: Tensor | None
+    place: Tensor | None
+
+
+def scanlines(given: SegmentInput, *, labels: bool) -> Rows:
+    """Cut every row into segments (``segment_scanline.scanlines``), in two launches."""
+    b, height, width = given.depth.shape
+    device, limits = given.depth.device, given.config
+    most, rows = given.segments_per_row, b * height
+
+    def whole(*shape: int) -> Tensor:
+        return torch.empty(*shape, dtype=torch.int32, device=device)
+
+    camera, depth = given.intrinsics.to(torch.float64).contiguous(), given.depth.contiguous()
+    valid = depth if given.valid is None else given.valid.contiguous()
+    spread = depth if given.variance is None else given.variance.contiguous()
+    lengths2 = torch.empty(b, given.depth_bins, dtype=torch.float64, device=device)
+    bins = torch.empty(b, height, width, dtype=torch.int16, device=device)
+    launch(
+        _bins, (triton.cdiv(height * width, 1024), b), depth, camera, lengths2, bins, height, width,
+        number=given.depth_bins, shortest=float(limits.min_gaussian_length),
+        longest=float(limits.frame_max_scale * limits.min_gaussian_length), chunk=1024,
+    )  # fmt: skip
+    moments = torch.empty(rows, most, MOMENTS, dtype=torch.float64, device=device)
+    found = Rows(
+        camera, lengths2, moments, whole(rows, most, WHOLE), whole(rows),
+        whole(rows, width) if labels else None, whole(rows, width) if labels else None,
+    )  # fmt: skip
+    lanes = min(power_of_two(rows), 256) if interpreted() else 32  # the interpreter takes as long for one as for many
+    launch(
+        _scanline, (triton.cdiv(rows, lanes),), depth, valid, spread, camera, lengths2, bins,
+        found.moments, found.whole, found.count, _or(found.owner, bins), _or(found.place, bins), rows, height, width,
+        most,
+        masked=given.valid is not None, spread_out=given.variance is not None, labels=labels,
+        scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
+        scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
+        line_thresh=float(limits.line_thresh), max_depth=float(limits.max_depth), gap=limits.occlusion_gap,
+        n_check=limits.n_check, sparse=limits.sparse, max_open=limits.max_open, places=power_of_two(limits.max_open),
+        number=given.depth_bins, lanes=lanes, warps=1,
+    )  # fmt: skip
+    return found
+
+
+def _or(value: Tensor | None, other: Tensor) -> Tensor:
+    return other if value is None else value
+
+
+@triton.jit
+def slope_of(focal, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr):
+    """a/f [1/m] (``SPGFConfig.slope``)."""
+    return scale * (focal / reference) / focal if scaled else scale / focal
+
+
+@triton.jit
+def _bins(
+    depth, camera, lengths2, bins, height, width,
+    number: tl.constexpr, shortest: tl.constexpr, longest: tl.constexpr, chunk: tl.constexpr,
+):  # fmt: skip
+    """The depth bin of every pixel, and the table of the bins' lengths, which every program walks through."""
+    b = tl.program_id(1).to(tl.int64)
+    i = tl.program_id(0) * chunk + tl.arange(0, chunk)
+    inside = i < height * width
+    z = tl.load(depth + b * height * width + i, mask=inside, other=0.0).to(tl.float64)
+    fx, fy = tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4)
+    s = 0.5 * tl.minimum(width.to(tl.float64) / fx, height.to(tl.float64) / fy)
+    length = s * 0.0 + shortest
+    edge = s * 0.0
+    k = tl.zeros([chunk], tl.int32)
+    for j in range(number):
+        edge += length
+        if tl.program_id(0) == 0:
+            tl.store(lengths2 + b * number + j, length * length)
+        k += (edge < z).to(tl.int32)
+        length = tl.minimum(tl.maximum(s * edge, shortest), longest)
+    tl.store(bins + b * height * width + i, tl.minimum(k, number - 1).to(tl.int16), mask=inside)
+
+
+@triton.jit
+def _finish(
+    done, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole, place, count, r,
+    most, width, labels: tl.constexpr, sparse: tl.constexpr,
+):  # fmt: skip
+    """Write the segments of the mask ``done`` [R, Q], one a row; returns the new number of the rows' segments."""
+    keep = done & (n > sparse)
+    pixels = tl.maximum(n, 1).to(tl.float64)
+    at = r[:, None] * most + count[:, None] + n * 0
+    out = moments + 7 * at
+    tl.store(out, x_left + dx / pixels, mask=keep)
+    tl.store(out + 1, z_left + dz / pixels, mask=keep)
+    tl.store(out + 2, dxx - dx * dx / pixels, mask=keep)
+    tl.store(out + 3, dxz - dx * dz / pixels, mask=keep)
+    tl.store(out + 4, dzz - dz * dz / pixels, mask=keep)
+    tl.store(out + 5, dx, mask=keep)
+    tl.store(out + 6, dz, mask=keep)
+    out = whole + 4 * at
+    tl.store(out, n, mask=keep)
+    tl.store(out + 1, nearest, mask=keep)
+    tl.store(out + 2, u_left, mask=keep)
+    tl.store(out + 3, u_right, mask=keep)
+    if labels:
+        tl.store(place + r[:, None] * width + born, tl.where(keep, count[:, None], -1), mask=done)
+    return count + tl.sum(keep.to(tl.int32), 1)
+
+
+@triton.jit
+def _scanline(
+    depth, valid, spread, camera, lengths2, bins, moments, whole, counts, owner, place, rows, height, width, most,
+    masked: tl.constexpr, spread_out: tl.constexpr, labels: tl.constexpr,
+    scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr, noise_floor: tl.constexpr,
+    noise_thresh: tl.constexpr, line_thresh: tl.constexpr, max_depth: tl.constexpr, gap: tl.constexpr,
+    n_check: tl.constexpr, sparse: tl.constexpr, max_open: tl.constexpr, places: tl.constexpr,
+    number: tl.constexpr, lanes: tl.constexpr,
+):  # fmt: skip
+    r = (tl.program_id(0) * lanes + tl.arange(0, lanes)).to(tl.int64)
+    real_row = r < rows
+    b, v = r // height, r % height
+    fx = tl.load(camera + 9 * b, mask=real_row, other=1.0)
+    fy = tl.load(camera + 9 * b + 4, mask=real_row, other=1.0)
+    cx = tl.load(camera + 9 * b + 2, mask=real_row, other=0.0)
+    cy = tl.load(camera + 9 * b + 5, mask=real_row, other=0.0)
+    ry = (v.to(tl.float64) - cy) / fy
+    y_factor = (1.0 + ry * ry)[:, None]
+    focal = tl.minimum(fx, fy)
+    slope = slope_of(focal, scale, reference, scaled)
+
+    q = tl.arange(0, places)[None, :]
+    empty = tl.zeros([lanes, places], tl.float64)
+    x_left, z_left, x_right, z_right, w2 = empty, empty, empty, empty, empty
+    dx, dz, dxx, dxz, dzz = empty, empty, empty, empty, empty
+    n = tl.zeros([lanes, places], tl.int32)
+    u_left, u_right, nearest, born = n, n, n, n
+    started, count = tl.zeros([lanes], tl.int32), tl.zeros([lanes], tl.int32)
+    for u in range(width):
+        at = r * width + u
+        z = tl.load(depth + at, mask=real_row, other=0.0).to(tl.float64)
+        use = (z > 0) & (z <= max_depth)
+        if masked:
+            use = use & (tl.load(valid + at, mask=real_row, other=0) != 0)
+        if spread_out:
+            s2 = tl.load(spread + at, mask=real_row, other=0.0).to(tl.float64)
+            use = use & (s2 >= 0) & (s2 < float("inf"))
+            s2 = tl.where(use, s2, 0.0)[:, None]
+        z = tl.where(use, z, 0.0)
+        rx = (u - cx) / fx
+        x = rx * z
+        k = tl.load(bins + at, mask=use, other=0).to(tl.int32)
+        length2 = tl.load(lengths2 + b * number + k, mask=use, other=0.0)
+        t = slope * z * z
+        tau_z = tl.minimum(tl.maximum(6.0 * t, noise_floor), noise_thresh)[:, None]
+        tau_x = tl.minimum(tl.maximum(t, noise_floor), line_thresh)[:, None]
+        rx, x, z, k, taken = rx[:, None], x[:, None], z[:, None], k[:, None], use[:, None]
+
+        near = (n > 0) & (u - u_right <= gap) & (w2 < length2[:, None])
+        close = (tl.abs(z - z_right) < tau_z) & (tl.abs(x - x_right) < tau_x)
+        flat = dx == 0
+        line = z_left + dz * (x - x_left) / tl.where(flat, 1.0, dx)
+        straight = (tl.abs(line - z) < tau_z) & ~flat
+        fits = near & ((close & (n <= n_check)) | (straight & (n > n_check))) & taken
+        newest = tl.max(tl.where(fits, born, -1), 1)
+        start = use & (newest < 0)
+        # A new segment takes a free place, or that of the oldest one, which is finished.
+        age = tl.where(q < max_open, tl.where(n > 0, born, -1 - q), 2147483647)
+        opened = start[:, None] & (age == tl.min(age, 1)[:, None])
+        pushed = opened & (n > 0)
+        if tl.max(tl.max(pushed.to(tl.int32), 1), 0) > 0:
+            count = _finish(
+                pushed, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
+                place, count, r, most, width, labels, sparse,
+            )  # fmt: skip
+        target = opened | (fits & (born == newest[:, None]))
+        n, u_left, nearest = tl.where(opened, 0, n), tl.where(opened, u, u_left), tl.where(opened, k, nearest)
+        born = tl.where(opened, started[:, None], born)
+        x_left, z_left = tl.where(opened, x, x_left), tl.where(opened, z, z_left)
+        dx, dz = tl.where(opened, 0.0, dx), tl.where(opened, 0.0, dz)
+        dxx, dxz, dzz = tl.where(opened, 0.0, dxx), tl.where(opened, 0.0, dxz), tl.where(opened, 0.0, dzz)
+        started += start.to(tl.int32)
+
+        ex, ez = x - x_left, z - z_left
+        xx, xz, zz = dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
+        if spread_out:
+            xx, xz, zz = xx + s2 * (rx * rx), xz + s2 * rx, zz + s2
+        n, u_right = tl.where(target, n + 1, n), tl.where(target, u, u_right)
+        nearest = tl.where(target, tl.minimum(nearest, k), nearest)
+        x_right, z_right = tl.where(target, x, x_right), tl.where(target, z, z_right)
+        w2 = tl.where(target, ex * ex + y_factor * (ez * ez), w2)
+        dx, dz = tl.where(target, dx + ex, dx), tl.where(target, dz + ez, dz)
+        dxx, dxz, dzz = tl.where(target, xx, dxx), tl.where(target, xz, dxz), tl.where(target, zz, dzz)
+        if labels:
+            of = tl.sum(tl.where(target, born, 0), 1)
+            tl.store(owner + at, tl.where(use, of, -1), mask=real_row)
+    for _ in range(max_open):
+        newest = tl.max(tl.where(n > 0, born, -1), 1)
+        last = (n > 0) & (born == newest[:, None])
+        count = _finish(
+            last, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
+            place, count, r, most, width, labels, sparse,
+        )  # fmt: skip
+        n = tl.where(last, 0, n)
+    tl.store(counts + r, count, mask=real_row)

@@ -1,0 +1,284 @@
+"""SPGF on a GPU: rows (``scanline``), then a program per stream joins the segments of successive rows.
+
+The active Gaussians are the lanes of one block, at most two for every segment that a row can hold: those that go on
+and those that a row adds. A segment is tested against all lanes at once. A Gaussian is pruned as soon as it ends, so
+what is kept goes straight to its slot of the mixture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from ufmstar_torch.gaussian import PIXEL_VARIANCE
+from ufmstar_torch.kernels.triton.launch import launch, power_of_two
+from ufmstar_torch.kernels.triton.matrices import floored, store_symmetric
+from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.segment import _most_kept
+from ufmstar_torch.segment_input import SegmentInput
+
+_PRUNE = {"none": 0, "both": 1, "either": 2}
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Lifts the eigenvalues of what is segmented, as ``step._segment`` does.
+
+    Attributes:
+        near_plane: [m].
+        epsilon: share of the trace, 8 eps of the dtype in which the mixture is stored.
+    """
+
+    near_plane: float
+    epsilon: float
+
+
+def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
+    """As :func:`ufmstar_torch.segment.segment`, float64 inside, with its capacity on an accelerator."""
+    mixture, labels = fit(given, before_pruning=before_pruning)
+    assert labels is not None
+    return mixture, labels.to(torch.int64)
+
+
+def fit(
+    given: SegmentInput, *, before_pruning: bool = False, labels: bool = True, floor: Floor | None = None
+) -> tuple[GaussianMixture, Tensor | None]:
+    """The Gaussians of B depth maps.
+
+    Args:
+        given: checked.
+        before_pruning: keep every Gaussian.
+        labels: whether to label the pixels.
+        floor: of the covariances; the mixture is float64 then. None = none, in the dtype that ``given`` asks for.
+
+    Returns:
+        The mixture [B, C] and labels [B, H, W] int32 or None.
+    """
+    b, height, _ = given.depth.shape
+    device = given.depth.device
+    most = given.segments_per_row
+    total = most * height
+    capacity = total if before_pruning else min(total, _most_kept(given))
+    channels = 0 if given.features is None else given.features.shape[1]
+    rows = scanlines(given, labels=labels or channels > 0)
+    dtype = given.dtype if floor is None else torch.float64
+    mixture = GaussianMixture.empty(b, capacity, features=channels, dtype=dtype, device=device)
+    member = torch.empty(b * height, most, dtype=torch.int32, device=device)
+    slot_of = torch.empty(b, total, dtype=torch.int32, device=device)
+    limits = given.config
+    lanes = power_of_two(2 * most)
+    launch(
+        _join, (b,),
+        rows.camera, rows.lengths2, rows.moments, rows.whole, rows.count,
+        mixture.mean, mixture.covariance, mixture.weight, mixture.count, member, slot_of, height, most, capacity, total,
+        rounded=given.dtype == torch.float32, scale=float(limits.adaptive_thresh_scale),
+        reference=float(limits.reference_focal), scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor),
+        angle2=float(limits.angle_cosine) ** 2, min_pixels=limits.min_pixels, min_rows=limits.min_rows,
+        prune=0 if before_pruning else _PRUNE[limits.prune], number=given.depth_bins, lifted=floor is not None,
+        near_plane=floor.near_plane if floor else 0.0, epsilon=floor.epsilon if floor else 0.0,
+        pixel_variance=PIXEL_VARIANCE, lanes=lanes, warps=max(1, min(8, lanes // 32)),
+    )  # fmt: skip
+    if rows.owner is None:
+        return mixture, None
+    slots = _labelled(rows, member, slot_of, given)
+    if given.features is not None:
+        _average(given.features, slots, mixture)
+    return mixture, slots if labels else None
+
+
+def _labelled(rows: Rows, member: Tensor, slot_of: Tensor, given: SegmentInput) -> Tensor:
+    """[B, H, W] int32 the slot of every pixel, -1 = none."""
+    b, height, width = given.depth.shape
+    out = torch.empty(b, height, width, dtype=torch.int32, device=member.device)
+    launch(
+        _label, (triton.cdiv(height * width, 1024), b), rows.owner, rows.place, member, slot_of, out, height, width,
+        member.shape[1], slot_of.shape[1], chunk=1024,
+    )  # fmt: skip
+    return out
+
+
+def _average(features: Tensor, slots: Tensor, mixture: GaussianMixture) -> None:
+    """Write the means of the features [B, F, H, W] over the pixels of every Gaussian into a mixture of zeros."""
+    b, channels, height, width = features.shape
+    launch(
+        _feature_means, (mixture.capacity, b), features.contiguous(), slots, mixture.weight, mixture.features,
+        height * width, mixture.capacity, channels, chunk=1024,
+    )  # fmt: skip
+
+
+@triton.jit
+def _label(owner, place, member, slot_of, out, height, width, most, total, chunk: tl.constexpr):
+    b = tl.program_id(1).to(tl.int64)
+    i = tl.program_id(0) * chunk + tl.arange(0, chunk)
+    inside = i < height * width
+    row = b * height + i // width
+    start = tl.load(owner + b * height * width + i, mask=inside, other=-1)
+    piece = tl.load(place + row * width + start, mask=inside & (start >= 0), other=-1)
+    gaussian = tl.load(member + row * most + piece, mask=piece >= 0, other=0)
+    slot = tl.load(slot_of + b * total + gaussian, mask=piece >= 0, other=-1)
+    tl.store(out + b * height * width + i, slot, mask=inside)
+
+
+@triton.jit
+def _feature_means(features, slots, weight, out, pixels, capacity, channels, chunk: tl.constexpr):
+    """A program per Gaussian reads the labels of its image, so that the order of its sums is always the same."""
+    b = tl.program_id(1).to(tl.int64)
+    k = tl.program_id(0)
+    n = tl.load(weight + b * capacity + k).to(tl.float64)
+    if n > 0:
+        for channel in range(channels):
+            sums = tl.zeros([chunk], tl.float64)
+            for first in range(0, pixels, chunk):
+                i = first + tl.arange(0, chunk)
+                own = tl.load(slots + b * pixels + i, mask=i < pixels, other=-1) == k
+                value = tl.load(features + (b * channels + channel) * pixels + i, mask=own, other=0.0)
+                sums += value.to(tl.float64)
+            tl.store(out + (b * capacity + k) * channels + channel, tl.sum(sums, 0) / n)
+
+
+@triton.jit
+def _stored(x, single: tl.constexpr):
+    """x with the precision of float32, if it is to be stored so."""
+    return x.to(tl.float32).to(tl.float64) if single else x
+
+
+@triton.jit
+def _join(
+    camera, lengths2, moments, whole, counts, mean_o, covariance_o, weight_o, count_o, member, slot_of,
+    height, most, capacity, total,
+    rounded: tl.constexpr, scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr,
+    noise_floor: tl.constexpr, angle2: tl.constexpr, min_pixels: tl.constexpr, min_rows: tl.constexpr,
+    prune: tl.constexpr, number: tl.constexpr, lifted: tl.constexpr, near_plane: tl.constexpr, epsilon: tl.constexpr,
+    pixel_variance: tl.constexpr, lanes: tl.constexpr,
+):  # fmt: skip
+    b = tl.program_id(0).to(tl.int64)
+    fx, fy, cy = tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4), tl.load(camera + 9 * b + 5)
+    focal = tl.minimum(fx, fy)
+    slope = slope_of(focal, scale, reference, scaled)
+    lane = tl.arange(0, lanes)
+    zero = tl.zeros([lanes], tl.float64)
+    mx, my, mz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    lx, ly, lz, ox, oy, oz, px, py, pz, p2, reach = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    n = tl.zeros([lanes], tl.int32)
+    merged, nearest, u_left, u_right, since, last = n, n, n, n, n, n
+    born = n - 1  # a lane without a Gaussian
+    created, kept = 0, 0
+    for v in range(height):
+        row = b * height + v
+        ry = (v - cy) / fy
+        for j in range(tl.load(counts + row)):
+            at = moments + 7 * (row * most + j)
+            hx, hz = tl.load(at), tl.load(at + 1)
+            hxx, hxz, hzz = tl.load(at + 2), tl.load(at + 3), tl.load(at + 4)
+            hlx, hlz = tl.load(at + 5), tl.load(at + 6)
+            at = whole + 4 * (row * most + j)
+            hn, h_bin, h_left, h_right = tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3)
+            hy, hly = ry * hz, ry * hlz
+            h_reach = tl.load(lengths2 + b * number + h_bin)
+
+            shared = tl.minimum(u_right, h_right) - tl.maximum(u_left, h_left)
+            span = tl.maximum(u_right, h_right) - tl.minimum(u_left, h_left)
+            over = (born >= 0) & (since < v) & (shared > 0)
+            rho = tl.where(over, shared.to(tl.float64) / tl.where(over, span, 1).to(tl.float64), 0.0)
+            best = over & (rho == tl.max(rho, 0))
+            oldest = tl.min(tl.where(best, born, 2147483647), 0)
+
+            dot = hlx * lx + hlz * lz
+            along = dot * dot > angle2 * (hlx * hlx + hlz * hlz) * (lx * lx + lz * lz)
+            dx, dy, dz = mx - hx, my - hy, mz - hz
+            first = tl.abs(dz) < 6.0 * (slope * mz * mz)
+            nx, ny, nz = ly * pz - lz * py, lz * px - lx * pz, lx * py - ly * px
+            distance = nx * dx + ny * dy + nz * dz
+            later = distance * distance < (nx * nx + ny * ny + nz * nz) * (noise_floor * noise_floor)
+            plane = (first & (merged == 1)) | (later & (merged != 1))
+            join = best & (born == oldest) & (p2 < reach) & along & plane
+            joined = tl.sum(join.to(tl.int32), 0) > 0
+            if joined:
+                both = n + hn
+                share = hn.to(tl.float64) / both.to(tl.float64)
+                factor = n.to(tl.float64) * hn.to(tl.float64) / both.to(tl.float64)
+                dx, dy, dz = hx - mx, hy - my, hz - mz
+                sxx = tl.where(join, sxx + (hxx + factor * (dx * dx)), sxx)
+                sxy = tl.where(join, sxy + (ry * hxz + factor * (dx * dy)), sxy)
+                sxz = tl.where(join, sxz + (hxz + factor * (dx * dz)), sxz)
+                syy = tl.where(join, syy + (ry * ry * hzz + factor * (dy * dy)), syy)
+                syz = tl.where(join, syz + (ry * hzz + factor * (dy * dz)), syz)
+                szz = tl.where(join, szz + (hzz + factor * (dz * dz)), szz)
+                mx, my, mz = (
+                    tl.where(join, mx + share * dx, mx), tl.where(join, my + share * dy, my),
+                    tl.where(join, mz + share * dz, mz),
+                )  # fmt: skip
+                lx, ly, lz = tl.where(join, lx + hlx, lx), tl.where(join, ly + hly, ly), tl.where(join, lz + hlz, lz)
+                begun = join & (merged == 1)
+                ox, oy, oz = tl.where(begun, mx, ox), tl.where(begun, my, oy), tl.where(begun, mz, oz)
+                ex, ey, ez = hx - ox, hy - oy, hz - oz
+                px, py, pz = tl.where(join, px + ex, px), tl.where(join, py + ey, py), tl.where(join, pz + ez, pz)
+                p2 = tl.where(join, ex * ex + ey * ey + ez * ez, p2)
+                n = tl.where(join, both, n)
+                merged = tl.where(join, merged + 1, merged)
+                u_left = tl.where(join, (u_left + h_left) // 2, u_left)
+                u_right = tl.where(join, (u_right + h_right) // 2, u_right)
+                reach = tl.where(join & (h_bin < nearest), h_reach, reach)
+                nearest = tl.where(join, tl.minimum(nearest, h_bin), nearest)
+                last = tl.where(join, v, last)
+                tl.store(member + row * most + j, oldest)
+            else:
+                own = lane == tl.min(tl.where(born < 0, lane, lanes), 0)
+                mx, my, mz = tl.where(own, hx, mx), tl.where(own, hy, my), tl.where(own, hz, mz)
+                sxx, sxy, sxz = tl.where(own, hxx, sxx), tl.where(own, ry * hxz, sxy), tl.where(own, hxz, sxz)
+                syy, syz = tl.where(own, ry * ry * hzz, syy), tl.where(own, ry * hzz, syz)
+                szz = tl.where(own, hzz, szz)
+                lx, ly, lz = tl.where(own, hlx, lx), tl.where(own, hly, ly), tl.where(own, hlz, lz)
+                ox, oy, oz = tl.where(own, 0.0, ox), tl.where(own, 0.0, oy), tl.where(own, 0.0, oz)
+                px, py, pz = tl.where(own, 0.0, px), tl.where(own, 0.0, py), tl.where(own, 0.0, pz)
+                p2, reach = tl.where(own, 0.0, p2), tl.where(own, h_reach, reach)
+                n, merged, nearest = tl.where(own, hn, n), tl.where(own, 1, merged), tl.where(own, h_bin, nearest)
+                u_left, u_right = tl.where(own, h_left, u_left), tl.where(own, h_right, u_right)
+                since, last, born = tl.where(own, v, since), tl.where(own, v, last), tl.where(own, created, born)
+                tl.store(member + row * most + j, created)
+                created += 1
+        # What the row did not extend has ended; after the last row all of them, in the order of their creation.
+        gone = (born >= 0) & (tl.where(height - 1 - v == 0, -1, last) != v)
+        if tl.sum(gone.to(tl.int32), 0) > 0:
+            large, tall = n >= min_pixels, merged >= min_rows
+            if prune == 0:
+                keep = gone
+            elif prune == 1:
+                keep = gone & (large | tall)
+            else:
+                keep = gone & large & tall
+            slot = lane * 0 - 1
+            left = keep
+            for _ in range(tl.sum(keep.to(tl.int32), 0)):
+                next_born = tl.min(tl.where(left, born, 2147483647), 0)
+                mine = left & (born == next_born)
+                slot = tl.where(mine, kept, slot)
+                left = left & ~mine
+                kept += 1
+            tl.store(slot_of + b * total + born, slot, mask=gone)
+            out = b * capacity + slot
+            ratio = tl.where(n > 1, n - 1, 1).to(tl.float64)
+            some = n > 1
+            cxx, cxy = tl.where(some, sxx / ratio, 0.0), tl.where(some, sxy / ratio, 0.0)
+            cxz, cyy = tl.where(some, sxz / ratio, 0.0), tl.where(some, syy / ratio, 0.0)
+            cyz, czz = tl.where(some, syz / ratio, 0.0), tl.where(some, szz / ratio, 0.0)
+            ax, ay, az = mx, my, mz
+            if lifted:
+                ax, ay, az = _stored(ax, rounded), _stored(ay, rounded), _stored(az, rounded)
+                cxx, cxy, cxz = _stored(cxx, rounded), _stored(cxy, rounded), _stored(cxz, rounded)
+                cyy, cyz, czz = _stored(cyy, rounded), _stored(cyz, rounded), _stored(czz, rounded)
+                across = tl.maximum(az, near_plane) / focal
+                least = tl.maximum(across * across * pixel_variance, epsilon * (cxx + cyy + czz))
+                cxx, cxy, cxz, cyy, cyz, czz = floored(cxx, cxy, cxz, cyy, cyz, czz, least)
+            tl.store(mean_o + 3 * out, ax, mask=keep)
+            tl.store(mean_o + 3 * out + 1, ay, mask=keep)
+            tl.store(mean_o + 3 * out + 2, az, mask=keep)
+            store_symmetric(covariance_o + 9 * out, cxx, cxy, cxz, cyy, cyz, czz, keep)
+            tl.store(weight_o + out, n.to(tl.float64), mask=keep)
+            tl.store(count_o + out, (n * 0 + 1).to(tl.int64), mask=keep)
+            born = tl.where(gone, -1, born)

@@ -1,0 +1,163 @@
+"""A monotone map of the variance, fitted where the truth is known (``ufmstar recalibrate``) and applied elsewhere."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.checked import Checked, choice
+from ufmstar_torch.config import UfMStarConfig
+
+SCALAR, ISOTONIC = "scalar", "isotonic"
+_SHOWN = 12  # digits of a digest
+# Settings of UfM* that do not change what V means.
+_HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
+
+
+@dataclass(frozen=True)
+class Recalibration(Checked):
+    """V -> V', the same at every pixel.
+
+    Between two knots log V' is linear in log V. Above the last knot V' / V is that of the last knot. Below the first
+    one an isotonic map is constant, since no smaller variance was ever observed to hold: V = 0 gets the first knot's
+    V'. A scalar map is V' = s V everywhere.
+
+    Attributes:
+        variance: V at the knots [m^2], positive and increasing.
+        recalibrated: V' at the knots [m^2], positive and not decreasing.
+        kind: "isotonic", or "scalar" with a single knot.
+        row: name of the method that it was fitted to, as "UfM*-Anchored-DepthOnly".
+        ufm: settings of UfM* that it was fitted to (``UfMStarConfig.to_dict``); {} = unknown.
+        weights: SHA-256 of the network's files, in hex; () = unknown.
+        sequences: names of the sequences that it was fitted to.
+        digests: of these sequences: the map must not be judged on them.
+
+    Raises:
+        ValueError: knots that are not such numbers.
+    """
+
+    variance: tuple[float, ...]
+    recalibrated: tuple[float, ...]
+    kind: str = choice(ISOTONIC, SCALAR)
+    row: str = ""
+    ufm: Mapping[str, Any] = field(default_factory=dict)
+    weights: tuple[str, ...] = ()
+    sequences: tuple[str, ...] = ()
+    digests: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        v, r = self.variance, self.recalibrated
+        if not v or len(v) != len(r) or (self.kind == SCALAR and len(v) > 1):
+            raise ValueError(f"Recalibration needs knots, a single one if scalar, got {len(v)} and {len(r)} values")
+        numbers = all(isinstance(x, float | int) and math.isfinite(x) and x > 0 for x in (*v, *r))
+        if not numbers or any(b <= a for a, b in pairwise(v)):
+            raise ValueError("Recalibration.variance must hold increasing positive numbers")
+        if any(b < a for a, b in pairwise(r)):
+            raise ValueError("Recalibration.recalibrated must hold positive numbers that do not decrease")
+
+    def __call__(self, variance: Tensor) -> Tensor:
+        """V' at every pixel.
+
+        Args:
+            variance: [...] V >= 0 [m^2], NaN where there is none.
+
+        Returns:
+            [...] in the same dtype [m^2], NaN where ``variance`` is NaN.
+        """
+        if self.kind == SCALAR:
+            return variance * (self.recalibrated[0] / self.variance[0])
+        v, r = (torch.tensor(x, dtype=torch.float64, device=variance.device).log() for x in self._knots())
+        position = variance.double().log()
+        upper = torch.searchsorted(v, position.contiguous()).clamp(1, len(v) - 1)
+        low, high = v[upper - 1], v[upper]
+        share = ((position - low) / (high - low)).clamp(0, 1)  # log 0 = -inf: the first knot
+        inside = r[upper - 1] + share * (r[upper] - r[upper - 1])
+        beyond = (position - v[-1]).clamp_min(0)
+        return torch.where(variance.isnan(), variance, (inside + beyond).exp().to(variance.dtype))
+
+    def require(self, config: UfMStarConfig, weights: Iterable[str] | None = None) -> None:
+        """Check that V means what it meant when the map was fitted.
+
+        Args:
+            config: of the UfM* whose variance is to be mapped.
+            weights: SHA-256 of the network's files; None = unknown.
+
+        Raises:
+            ValueError: the map was fitted under other settings of UfM*, or to another network.
+        """
+        now = _flat(config.to_dict())
+        changed = [
+            f"{name} = {value!r} (now {now[name]!r})"
+            for name, value in _flat(self.ufm).items()
+            if name in now and name not in _HARMLESS and now[name] != value
+        ]
+        if changed:
+            raise ValueError(f"the recalibration was fitted to UfM* with {', '.join(changed)}")
+        if weights is not None and self.weights and set(weights) != set(self.weights):
+            raise ValueError("the recalibration was fitted to a network with other weights")
+
+    def save(self, path: str | Path) -> None:
+        """Write it as JSON, which :meth:`from_json` reads."""
+        Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n", encoding="utf-8")
+
+    def _knots(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """At least two knots: a single one is doubled with the same ratio above."""
+        v, r = self.variance, self.recalibrated
+        return (v, r) if len(v) > 1 else ((v[0], 2 * v[0]), (r[0], 2 * r[0]))
+
+
+def read_recalibration(name: str) -> Recalibration:
+    """From FILE, or from FILE@DIGEST, which refuses a file that has changed since it was named.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no recalibration, or another one than was named.
+    """
+    file, digest = split_name(name)
+    if digest and not file_digest(file).startswith(digest):
+        raise ValueError(f"{file} has changed since it was chosen for this evaluation: use another output folder")
+    return Recalibration.from_json(file)
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """(FILE, DIGEST) of FILE@DIGEST; the digest is "" without one."""
+    file, mark, digest = name.rpartition("@")
+    named = mark and len(digest) == _SHOWN and all(c in "0123456789abcdef" for c in digest)
+    return (file, digest) if named else (name, "")
+
+
+def named(file: str | Path) -> str:
+    """FILE@DIGEST.
+
+    Raises:
+        FileNotFoundError: no such file.
+    """
+    return f"{file}@{file_digest(file)[:_SHOWN]}"
+
+
+def file_digest(file: str | Path) -> str:
+    """Hex digest of a file's content."""
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+def beside(weights: str | Path) -> Path:
+    """The file of a recalibration that lies beside weights: fastdepth.onnx -> fastdepth.recalibration.json."""
+    return Path(weights).with_suffix(".recalibration.json")
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
