@@ -76,8 +76,8 @@ class UfMOptions:
         anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
             corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
             landmarks, a line x y z sigma [m] each, in the world of the poses
-        posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors says which
-            anchors, default: dense
+        posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
+            the anchors, default: dense
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 
