@@ -55,6 +55,7 @@ class FrameInput:
         out_of_range: [B] further pixels of the mask with a finite positive depth that are not valid.
         fault: [B] int64 index into ``FRAME_FAULTS``, 0 = fine.
         rotation_deviation: [B] float64 max |R^T R - I| of the pose as given.
+        known_fault: ``fault`` on the CPU where pose and intrinsics were given there, which nobody waits for; else None.
     """
 
     depth: Tensor
@@ -68,6 +69,7 @@ class FrameInput:
     rotation_deviation: Tensor
     beyond: Tensor
     out_of_range: Tensor
+    known_fault: Tensor | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -115,7 +117,8 @@ def check_values(
     plain, device = maps.depth, maps.depth.device
     deviation = rotation_deviation(pose[..., :3, :3])
     faults = _pose_fault(pose, deviation, rotation_tolerance), _intrinsics_fault(intrinsics, plain.shape[-2:])
-    fault = _first(*faults, device)
+    known = _first(*faults, torch.device("cpu")) if pose.device.type == intrinsics.device.type == "cpu" else None
+    fault = _first(*faults, device) if known is None else _moved(known, device)
     fine = fault == 0
     given = (plain > 0) & (plain < torch.inf) & fine[:, None, None]  # NaN is neither
     if maps.mask is not None:
@@ -132,7 +135,7 @@ def check_values(
     safe_depth = torch.where(use, plain, torch.zeros_like(plain))
     return FrameInput(
         safe_depth, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, use, fault,
-        _moved(deviation, device), beyond.sum((1, 2)), (near & ~use).sum((1, 2)),
+        _moved(deviation, device), beyond.sum((1, 2)), (near & ~use).sum((1, 2)), known,
     )  # fmt: skip
 
 
