@@ -171,21 +171,26 @@ class MeanUncertainty:
     """An image average of the total variance from a sample of pixels, per stream [B].
 
     Attributes:
-        mean: average of V over the sampled pixels [m^2]; NaN without a valid pixel.
+        mean: average of V over the sampled pixels [m^2], with ``config.unmeasured="nan"`` over those that are measured;
+            NaN without any.
         standard_error: of that average as an estimate of the mean over all valid pixels [m^2];
             NaN with fewer than two pixels.
         pixels: number of pixels averaged.
-        statistics: per-stream counts of this frame.
+        measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two views or more; about 0
+            in a first view, whose mean says nothing of disagreement. NaN without a valid pixel.
+        statistics: per-stream counts of this frame; ``unmeasured`` are the other sampled pixels.
     """
 
     mean: Tensor
     standard_error: Tensor
     pixels: Tensor
+    measured: Tensor
     statistics: FrameStatistics
 
     def __repr__(self) -> str:
         """Means, errors and counts in a line."""
-        return f"MeanUncertainty(mean={_short(self.mean)} m^2, pixels={_short(self.pixels)}, {self.statistics!r})"
+        counts = f"pixels={_short(self.pixels)}, measured={_short(self.measured)}"
+        return f"MeanUncertainty(mean={_short(self.mean)} m^2, {counts}, {self.statistics!r})"
 
 
 def _size(value: Tensor) -> str:

@@ -14,7 +14,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.given import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
@@ -350,7 +350,8 @@ class UncertainDepth(NetworksInTurn):
                 raise ValueError("anchors come from the source that UncertainDepth was made with: give none")
             anchors = self.landmarks.update(image, pose, intrinsics)
         try:
-            yield anchors if anchors is None or self.preprocess is None else anchors.moved(intrinsics, K)
+            moved = anchors is not None and self.preprocess is not None
+            yield require_anchors(anchors).moved(intrinsics, K) if moved else anchors
         except BaseException:
             if self.landmarks is not None:
                 self.landmarks.undo()

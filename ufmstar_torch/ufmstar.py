@@ -183,19 +183,27 @@ class UfMStar(StatefulModule):
                 and frames with one seed, take the same pixels.
             average: apply the exponential moving average at the sampled pixels.
 
+        The first views of a place have nothing to be compared with: their mean is low for want of evidence
+        (``MeanUncertainty.measured`` near 0). With ``config.unmeasured="nan"`` only measured pixels are averaged, and
+        an image without any gets NaN.
+
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
         out, variance, _, _ = self._observe(frame, anchors, index, average=average)
+        sampled = used.sum(1)
+        measured = ((out.measured >= unmeasured.HALF) & used).sum(1) / sampled
+        used = used & ~variance.isnan()  # not measured, with config.unmeasured = "nan"
         count = used.sum(1)
         value = torch.where(used, variance, torch.zeros_like(variance))
         mean = total(value, 1) / count  # 0/0 = NaN where no pixel is valid
         squares = total(torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)), 1)
-        left = 1 - count / out.statistics.valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
+        # Without replacement: all pixels, no error.
+        left = 1 - sampled / out.statistics.valid_pixels.clamp_min(1)
         error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
-        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, out.statistics)
+        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, measured, out.statistics)
 
     def warm_up(self, size: tuple[int, int], *, streams: int = 1, anchored: bool | None = None) -> None:
         """Compile, or load from disk, all that the first frames of this size would otherwise wait for.
@@ -313,13 +321,6 @@ class UfMStar(StatefulModule):
         kept = {"overall_evidence": old.overall_evidence, "posterior": old.posterior} if keep_evidence else {}
         self._store(new.tensors() | kept)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        """A state that was saved before there was a posterior has learnt nothing for it."""
-        weight, key = state_dict.get(prefix + "weight"), prefix + "posterior"
-        if isinstance(weight, Tensor) and weight.dim() == 2:
-            state_dict.setdefault(key, self.posterior.new_zeros(len(weight), self.posterior.shape[1]))
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         UfMStarState(**state).require(self.config)
 
@@ -365,7 +366,10 @@ class UfMStar(StatefulModule):
         with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
             if self.config.on_bad_frame == "raise":
-                raise_faults((frame.fault if frame.known_fault is None else frame.known_fault).tolist())
+                known = frame.fault if frame.known_fault is None else frame.known_fault
+                if known.device.type == "meta":
+                    raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
+                raise_faults(known.tolist())
             if self.observer is not None:
                 self.observer.stage("check")
             step = self._step(frame.depth.device.type)
@@ -464,9 +468,13 @@ class UfMStar(StatefulModule):
         self._settle()
         super()._save_to_state_dict(destination, prefix, keep_vars)
 
-    def _load_from_state_dict(self, *given: Any) -> None:
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *given: Any) -> None:
+        """A state that was saved before there was a posterior has learnt nothing for it."""
         self._settle()
-        super()._load_from_state_dict(*given)
+        weight = state_dict.get(prefix + "weight")
+        if isinstance(weight, Tensor) and weight.dim() == 2:
+            state_dict.setdefault(prefix + "posterior", self.posterior.new_zeros(len(weight), self.posterior.shape[1]))
+        super()._load_from_state_dict(state_dict, prefix, *given)
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy starts with a step of its own."""
