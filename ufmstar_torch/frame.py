@@ -219,6 +219,8 @@ def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
         raise ValueError(f"{name} must be [B, {n}, {n}] or [{n}, {n}], got {tuple(value.shape)}")
     if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):
         raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
+    if value.device.type == "meta" and plain.device.type != "meta":
+        raise ValueError(f"{name} must hold values, got a tensor on device meta")
     return value.detach().to(torch.float64).expand(plain.shape[0], n, n)
 
 
