@@ -104,6 +104,7 @@ SETTINGS = {
     "anchor_shrinkage": ("shrinkage κ", "anchors"),
     "track_noise": ("track noise", "px"),
     "corrected": ("depth corrected", ""),
+    "posterior": ("posterior", ""),
     "overlap_weighted": ("fusion weighted by overlap", ""),
     "disagreement": ("disagreement", ""),
     "regression": ("regression", ""),
