@@ -228,13 +228,12 @@ class OnnxNetwork(DepthNetwork):
         self._open()
 
 
-def open_session(graph: str | bytes, threads: int, providers: tuple[str, ...]) -> InferenceSession:
-    """A session on a file, or on a file's content; see :class:`OnnxNetwork`."""
+def open_session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSession:
+    """A session on a file; arguments and errors as :class:`OnnxNetwork`."""
     ort = _onnxruntime()
     from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
-    path = graph if isinstance(graph, str) else "the graph"
-    if isinstance(graph, str) and not Path(graph).is_file():
+    if not Path(path).is_file():
         raise FileNotFoundError(f"no ONNX file {path}")
     if absent := [p for p in providers if p not in ort.get_available_providers()]:
         raise ValueError(f"providers {absent} are not available; this ONNX Runtime has {ort.get_available_providers()}")
@@ -246,7 +245,7 @@ def open_session(graph: str | bytes, threads: int, providers: tuple[str, ...]) -
     refusals = (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.InvalidArgument)
     failures = (ort_errors.Fail, ort_errors.NotImplemented)
     try:
-        return ort.InferenceSession(graph, options, providers=list(providers))
+        return ort.InferenceSession(path, options, providers=list(providers))
     except (*refusals, *failures) as error:
         raise ValueError(f"{path} is not an ONNX file that ONNX Runtime can run: {error}") from error
 

@@ -27,6 +27,8 @@ from ufmstar_torch.eval.bench.text import format_report
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
 from ufmstar_torch.eval.commands import bench_command
 from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
+from ufmstar_torch.eval.report.figures_growth import draw_growth
+from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.results.machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, FastDepthWidths
@@ -307,6 +309,8 @@ def test_memory_counts_components_slots_and_the_map():
     # mean 3, covariance 9, weight and disagreement 1 each in float32, and an int64 count
     assert state_memory(ufm) == {
         "bytes_per_component": 64,
+        "packed_bytes_per_component": 44,  # the paper's 11 numbers
+        "packed": 44 * used,
         "components": used,
         "in_use": 64 * used,
         "allocated": 64 * 256,
@@ -474,6 +478,24 @@ def test_a_long_run_compares_the_same_room_early_and_late():
         measure_long_run(RenderedRoom(), UfMStarConfig(), size=48, frames=24, early=10, window=10)
 
 
+def test_a_long_run_with_merging_is_drawn_beside_one_without(tmp_path):
+    def run(limit: float) -> dict:
+        config = UfMStarConfig(merge=limit, merge_every=5)
+        return {
+            "merge": limit,
+            **measure_long_run(RenderedRoom(period=10), config, size=48, frames=40, early=10, window=10),
+        }
+
+    runs = [run(0.0), run(2.0)]
+    assert runs[1]["memory"]["components"] < runs[0]["memory"]["components"]
+    figure = draw_growth(runs)
+    lines = [line for axes in figure.axes for line in axes.lines]
+    assert [list(line.get_xdata()) for line in lines] == [[10, 20, 30, 40]] * 4
+    assert lines[1].get_ydata()[-1] == runs[1]["memory"]["components"]
+    save_figure(figure, tmp_path / "growth.svg")
+    assert "merge 2" in (tmp_path / "growth.svg").read_text()
+
+
 def report_with(**changes):
     result = {
         "size": 224,
@@ -512,6 +534,7 @@ def test_targets_are_told_as_met_or_missed():
         (["--threads", "-2"], "threads"),
         (["--sequence", "nowhere"], "nowhere"),
         (["--weights", "nothing.onnx"], "nothing.onnx"),
+        (["--merge", "-1"], "at least 0"),
     ],
 )
 def test_arguments_that_do_not_fit(words, told, capsys):
@@ -529,6 +552,7 @@ def test_a_busy_machine_is_mentioned():
         "compilation": None,
         "results": [],
         "long_run": None,
+        "growth": [],
         "anchors": None,
         "peer": None,
         "against": None,

@@ -139,7 +139,7 @@ def test_thin_wide_plates_survive_a_thousand_fusions_in_float32():
 
 def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    select._has_numba.cache_clear()
+    select.has_numba.cache_clear()
     try:
         with pytest.warns(UserWarning, match="numba cannot be imported .* torch reference serves") as caught:
             chosen = [select.select_step("auto", "cpu") for _ in range(2)]
@@ -149,7 +149,7 @@ def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
         with pytest.raises(ImportError):
             select.select_step("numba", "cpu")
     finally:
-        select._has_numba.cache_clear()
+        select.has_numba.cache_clear()
 
 
 def test_seam():

@@ -248,3 +248,25 @@ def test_prediction_checks_itself():
     both = DepthPrediction(torch.ones(1, 2, 2), torch.ones(1, 2, 2), 2 * torch.ones(1, 2, 2))
     assert torch.equal(both.variance, torch.full((1, 2, 2), 3.0))
     assert DepthPrediction(torch.ones(1, 2, 2)).variance is None
+
+
+def test_stream_and_a_device_for_the_multiview_part_change_no_bit():
+    members = [Scaled(1.0), Scaled(1.1), Scaled(0.9)]
+    plain = UncertainDepth(members, CONFIG)
+    ahead = UncertainDepth(members, CONFIG, multiview_device="cpu").to(torch.device("cpu"))
+    frames = [(image(i), POSES[i], K) for i in range(5)]
+    asked = []
+
+    def video():
+        for i, frame in enumerate(frames):
+            asked.append(i)
+            yield frame
+
+    for i, out in enumerate(ahead.stream(video())):
+        expected = plain(*frames[i])
+        assert out.member == expected.member == i % 3
+        assert torch.equal(out.variance.nan_to_num(-1), expected.variance.nan_to_num(-1))
+        assert asked[-1] == min(i + 1, 4), "one image ahead"
+    assert int(ahead.image_index) == 5
+    assert list(ahead.stream([])) == []
+    assert ahead.ufm.mean.device.type == "cpu"

@@ -197,6 +197,21 @@ def test_chunks_change_nothing(monkeypatch):
     assert regress(m, points[:, :0], EXACT).disagreement.shape == (1, 0)
 
 
+def test_on_cuda_free_memory_decides_how_much_is_regressed_at_a_time(monkeypatch):
+    import ufmstar_torch.regress as module
+
+    def pairs(free: int, kept: int = 0, device: str = "cuda") -> int:
+        monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 80 << 30))
+        monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: kept)
+        monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)
+        return module._pairs_at_a_time(torch.device(device), 4)
+
+    assert pairs(64 << 30) == pairs(32 << 30, 32 << 30) == 2**28
+    assert pairs(64 << 30) // (256 * 1024) == 1024, "points at a time, with 256 streams of 1024 components"
+    assert pairs(1 << 20) == pairs(64 << 30, device="cpu") == 2**22
+
+
 def test_weights_average_between_components():
     """Half way between two equal Gaussians of m = 1 and m = 3, with a vanishing prior, lies 2."""
     m = mixture(1, 2, 1, empty=0)
@@ -237,6 +252,9 @@ def test_sample_is_seeded_uniform_and_valid():
     for seed in range(400):
         index, _ = sample_pixels(valid[:1], 10, seed)
         counts[index[0]] += 1
+    equal, _ = sample_pixels(valid[:1].expand(3, 10, 10), 10, 7)
+    assert torch.equal(equal[0], equal[1])
+    assert torch.equal(equal[0], sample_pixels(valid, 10, 7)[0][0]), "whatever is in the other streams"
     # Binomial(400, 0.2) per valid pixel: mean 80, sigma 8.
     assert (counts[:50] - 80).abs().max() < 5 * 8
     assert counts[50:].sum() == 0

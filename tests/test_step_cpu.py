@@ -193,3 +193,27 @@ def test_the_check_agrees_with_the_reference_to_the_last_bit(dtype):
         assert set(range(10)) == set(slow.fault.tolist())
         assert slow.beyond.sum() > 0
         assert slow.out_of_range.sum() > 0
+
+
+def test_warming_up_compiles_all_that_a_frame_needs_and_touches_no_state():
+    """In this process everything is compiled: what is checked is that nothing is compiled after a warm-up."""
+    from numba.core import event
+
+    config = CONFIGS["anchored"].replace(features=2, initial_capacity=2)
+    ufm = UfMStar(config, dtype=torch.float64)
+    before = {name: value.clone() for name, value in ufm.state.tensors().items()}
+    ufm.warm_up(SIZE, streams=2)
+    for name, value in ufm.state.tensors().items():
+        assert torch.equal(value, before[name]), name
+    with event.install_recorder("numba:compile") as compiled:
+        for arguments, more in frames(3, config.replace(on_bad_frame="skip"), torch.float32, streams=2):
+            ufm.config = config.replace(on_bad_frame="skip")
+            ufm(*arguments, **more)
+            ufm.mean_uncertainty(*arguments, **more)
+    assert not compiled.buffer
+    with pytest.raises(ValueError, match="size and streams must be positive"):
+        ufm.warm_up((0, 4))
+
+
+def test_warming_up_with_the_reference():
+    UfMStar(CONFIGS["default"].replace(backend="torch")).warm_up((8, 8), anchored=True)

@@ -34,6 +34,7 @@ def compiled(kernel: Any, arguments: tuple[Any, ...], known: dict[str, Any]) -> 
     given = dict(zip(names, arguments, strict=False))
     signature = {n: TYPES[v.dtype] if isinstance(v, torch.Tensor) else "i32" for n, v in given.items()}
     assert all(isinstance(v, torch.Tensor | int) for v in given.values()), "a float would arrive as float32"
+    known |= {n: 1 for n, v in given.items() if isinstance(v, int) and v == 1}  # as a launch does
     signature |= dict.fromkeys(known, "constexpr")
     source = ASTSource(fn=kernel, signature={n: signature[n] for n in names}, constexprs=known)
     return triton.compile(source, target=TARGET, options=options)

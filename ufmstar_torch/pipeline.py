@@ -14,7 +14,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.given import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
@@ -61,6 +61,29 @@ class UncertainPrediction:
     def disagreement(self) -> Tensor:
         """[B, H, W] M [m^2]."""
         return self.ufm.disagreement
+
+
+@dataclass(frozen=True)
+class _Predicted:
+    """A prediction on its way to UfM*'s device.
+
+    Attributes:
+        prediction, intrinsics, member: as in :class:`UncertainPrediction`.
+        features: [B, F, H, W] for UfM*, or None.
+        ready: when the values have arrived; None = they are there for whatever is queued on their device.
+    """
+
+    prediction: DepthPrediction
+    intrinsics: Tensor
+    member: int | None
+    features: Tensor | None
+    ready: torch.cuda.Event | None
+
+    def arrived(self) -> DepthPrediction:
+        """The prediction; waits for copies to the host."""
+        if self.ready is not None:
+            self.ready.synchronize()
+        return self.prediction
 
 
 class NetworksInTurn(nn.Module):
@@ -152,6 +175,8 @@ class UncertainDepth(NetworksInTurn):
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
             (or ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean
             aleatoric variance and the variance between the members as epistemic variance.
+        posterior: also a corrected depth and its variance, ``out.ufm.posterior()``: ``config`` with ``anchored`` and
+            ``posterior`` switched on.
         samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
             network must sample by itself in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the network's input; None passes both through.
@@ -160,6 +185,8 @@ class UncertainDepth(NetworksInTurn):
             :class:`~ufmstar_torch.anchors.landmarks.LandmarkSource`; of several streams, a list with one for
             each. Saved and reset with the state. None: those given with an image, if any.
         recalibration: of the variance, as :class:`UfMStar` takes it (``Recalibration.from_json(FILE)``).
+        multiview_device: of UfM* and of the results, whatever the networks' is: "cpu" for the paper's split. None = the
+            networks'. :meth:`stream` runs both at the same time.
 
     The networks are put into eval mode here and run without gradients. A stochastic network decides itself
     to sample in eval mode, as decoder dropout at test time does.
@@ -184,10 +211,12 @@ class UncertainDepth(NetworksInTurn):
         config: UfMStarConfig | None = None,
         *,
         mode: str = "alternate",
+        posterior: bool = False,
         samples: int | None = None,
         preprocess: Preprocess | None = None,
         anchors: Given | list[Given] | tuple[Given, ...] | None = None,
         recalibration: Recalibration | None = None,
+        multiview_device: torch.device | str | None = None,
     ) -> None:
         single = len(_modules(networks)) == 1
         if mode not in ("alternate", "full"):
@@ -197,11 +226,14 @@ class UncertainDepth(NetworksInTurn):
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         super().__init__(networks, samples=samples, preprocess=preprocess)
+        if posterior:
+            config = (config or UfMStarConfig()).replace(anchored=True, posterior=True)
         self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth), recalibration=recalibration)
         if anchors is not None and not self.ufm.config.anchored:
             raise ValueError("anchors go with UfMStarConfig(anchored=True)")
         self.landmarks = None if anchors is None else StreamLandmarks(anchors)
         self.mode = mode
+        self.multiview_device = None if multiview_device is None else torch.device(multiview_device)
         self.register_buffer("image_index", torch.zeros((), dtype=torch.int64))
         self._next = 0
 
@@ -230,12 +262,44 @@ class UncertainDepth(NetworksInTurn):
         Raises:
             ValueError, TypeError: as :meth:`UfMStar.forward`; neither alternation nor landmarks have advanced then.
         """
-        prediction, K, member, optional = self._predicted(image, intrinsics, features)
+        return self._fused(self._predicted(image, intrinsics, features), image, pose, intrinsics, valid, anchors)
+
+    def stream(self, frames: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Iterator[UncertainPrediction]:
+        """The predictions of a video, in order, with the networks one image ahead of UfM*.
+
+        With networks on a GPU and ``multiview_device="cpu"`` the two run at the same time, so each result comes when
+        the next image has been given.
+
+        Args:
+            frames: image, pose and intrinsics of each, as :meth:`forward` takes them.
+
+        Raises:
+            ValueError, TypeError: as :meth:`forward`.
+        """
+        waiting: tuple[_Predicted, tuple[Tensor, Tensor, Tensor]] | None = None
+        for image, pose, intrinsics in frames:
+            ahead = self._predicted(image, intrinsics, None, ahead=waiting is not None)
+            if waiting is not None:
+                yield self._fused(waiting[0], *waiting[1], None, None)
+            waiting = ahead, (image, pose, intrinsics)
+        if waiting is not None:
+            yield self._fused(waiting[0], *waiting[1], None, None)
+
+    def _fused(
+        self,
+        given: _Predicted,
+        image: Tensor,
+        pose: Tensor,
+        intrinsics: Tensor,
+        valid: Tensor | None,
+        anchors: Anchors | None,
+    ) -> UncertainPrediction:
+        K, prediction = given.intrinsics, given.arrived()
         with self._anchored(image, pose, intrinsics, K, anchors) as own:
             a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-            ufm = self.ufm(prediction.depth, pose, K, a, e, valid, anchors=own, **optional)
+            ufm = self.ufm(prediction.depth, pose, K, a, e, valid, anchors=own, features=given.features)
         self._done(ufm.statistics)
-        return UncertainPrediction(prediction, ufm, K, member)
+        return UncertainPrediction(prediction, ufm, K, given.member)
 
     def mean_uncertainty(
         self,
@@ -261,11 +325,14 @@ class UncertainDepth(NetworksInTurn):
             ValueError, TypeError: as :meth:`UfMStar.mean_uncertainty`; neither alternation nor landmarks have advanced
                 then.
         """
-        prediction, K, _, optional = self._predicted(image, intrinsics, features)
+        given = self._predicted(image, intrinsics, features)
+        prediction, K = given.arrived(), given.intrinsics
         sample: dict[str, Any] = {"pixels": pixels, "fraction": fraction, "seed": seed, "average": average}
         with self._anchored(image, pose, intrinsics, K, anchors) as own:
             a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-            mean = self.ufm.mean_uncertainty(prediction.depth, pose, K, a, e, valid, anchors=own, **optional, **sample)
+            mean = self.ufm.mean_uncertainty(
+                prediction.depth, pose, K, a, e, valid, anchors=own, features=given.features, **sample
+            )
         self._done(mean.statistics)
         return mean
 
@@ -283,7 +350,8 @@ class UncertainDepth(NetworksInTurn):
                 raise ValueError("anchors come from the source that UncertainDepth was made with: give none")
             anchors = self.landmarks.update(image, pose, intrinsics)
         try:
-            yield anchors if anchors is None or self.preprocess is None else anchors.moved(intrinsics, K)
+            moved = anchors is not None and self.preprocess is not None
+            yield require_anchors(anchors).moved(intrinsics, K) if moved else anchors
         except BaseException:
             if self.landmarks is not None:
                 self.landmarks.undo()
@@ -296,12 +364,12 @@ class UncertainDepth(NetworksInTurn):
         self._count(self._next + 1)
 
     def _predicted(
-        self, image: Tensor, intrinsics: Tensor, features: Tensor | None
-    ) -> tuple[DepthPrediction, Tensor, int | None, dict[str, Any]]:
-        """The prediction for the next image, its intrinsics, the member, and UfM*'s features."""
+        self, image: Tensor, intrinsics: Tensor, features: Tensor | None, *, ahead: bool = False
+    ) -> _Predicted:
+        """The prediction for the next image, or, with ``ahead``, for the one after that."""
         if image.dim() != 4 or image.shape[1] != 3:
             raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
-        member = None if self.mode == "full" else self.turn(self._next)
+        member = None if self.mode == "full" else self.turn(self._next + ahead)
         with torch.no_grad():
             x, K = self.prepare(image, intrinsics.expand(image.shape[0], 3, 3))
             prediction = self.every(x, K) if member is None else self.member(x, K, member)
@@ -311,7 +379,18 @@ class UncertainDepth(NetworksInTurn):
                     "config.features=1 regresses the aleatoric variance, but the network predicts none: give features"
                 )
             features = prediction.aleatoric_variance[:, None]
-        return prediction, K, member, {"features": features}
+        parts = (prediction.depth, prediction.aleatoric_variance, prediction.epistemic_variance, K, features)
+        (depth, *own, K_there, features), ready = _copied(parts, self.multiview_device)
+        assert depth is not None
+        assert K_there is not None
+        return _Predicted(DepthPrediction(depth, *own), K_there, member, features, ready)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """The networks move; UfM* stays on its own device, if it has one."""
+        super()._apply(fn, recurse)
+        if self.multiview_device is not None:
+            self.ufm.to(self.multiview_device)
+        return self
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget the views (:meth:`UfMStar.reset`); resetting all streams also restarts the alternation."""
@@ -345,6 +424,27 @@ class UncertainDepth(NetworksInTurn):
                 return
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._next = int(self.image_index)
+
+
+def _copied(
+    values: Sequence[Tensor | None], device: torch.device | None
+) -> tuple[list[Tensor | None], torch.cuda.Event | None]:
+    """The values on ``device`` (None: where they are), and when copies from CUDA into pinned memory will have ended."""
+
+    def copy(value: Tensor | None) -> Tensor | None:
+        if value is None or device is None:
+            return value
+        if device.type != "cpu" or value.device.type != "cuda":
+            return value.to(device, non_blocking=True)
+        return torch.empty(value.shape, dtype=value.dtype, pin_memory=True).copy_(value.detach(), non_blocking=True)
+
+    copies = [copy(value) for value in values]
+    source = values[0]
+    if source is None or device is None or device.type != "cpu" or source.device.type != "cuda":
+        return copies, None
+    ready = torch.cuda.Event()
+    ready.record(torch.cuda.current_stream(source.device))
+    return copies, ready
 
 
 def _modules(networks: object) -> list[nn.Module]:

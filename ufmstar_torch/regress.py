@@ -6,6 +6,7 @@ average of m_k with weights w_k(x), a weak prior (pi_0, mu_0) taking over where 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +20,11 @@ from ufmstar_torch.fixed_order import total
 from ufmstar_torch.gaussian import cholesky3, inverse_lower3
 from ufmstar_torch.mixture import GaussianMixture
 
-# Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32.
+# Points x components evaluated at a time: bounds the temporary memory to some 100 MB in float32. On CUDA as many as a
+# quarter of the free memory holds, if that is more, with _NUMBERS for each pair: 3 of the offset, its distance, density
+# and their temporaries.
 _CHUNK = 2**22
+_NUMBERS = 16
 
 
 @dataclass(frozen=True)
@@ -55,11 +59,21 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
     """
     dtype = points.dtype
     whitening, log_peak = _densities(mixture, dtype)
-    per_chunk = max(1, _CHUNK // max(1, mixture.streams * mixture.capacity))
+    pairs = _pairs_at_a_time(points.device, points.element_size())
+    per_chunk = max(1, pairs // max(1, mixture.streams * mixture.capacity))
     parts = [_chunk(mixture, whitening, log_peak, x, config) for x in points.split(per_chunk, dim=1)]
     if not parts:
         parts = [_chunk(mixture, whitening, log_peak, points, config)]
     return Regression(torch.cat([p.disagreement for p in parts], 1), torch.cat([p.features for p in parts], 1))
+
+
+def _pairs_at_a_time(device: torch.device, size: int) -> int:
+    """How many pairs of a point and a component may be held at a time, in numbers of ``size`` bytes."""
+    if device.type != "cuda" or not torch.cuda.is_initialized():  # fake tensors need no device
+        return _CHUNK
+    free = torch.cuda.mem_get_info(device)[0]
+    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # kept by torch, but not in use
+    return max(_CHUNK, free // (4 * _NUMBERS * size))
 
 
 def regress_image(
@@ -235,16 +249,34 @@ def moving_average(
 def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """A uniform sample of the valid pixels of each image, without replacement.
 
+    The seed and the number of pixels alone decide in which random order an image's pixels are asked, and the first
+    ``count`` valid ones are taken: equal streams of a batch draw the same pixels.
+
     Args:
         valid: [B, H, W] bool.
         count: pixels per image, 1 <= count <= H W.
-        seed: of the random numbers, drawn on the CPU so that every device samples alike.
+        seed: of the random order, drawn on the CPU so that every device samples alike.
 
     Returns:
         index [B, count] into the flattened image and used [B, count]; fewer than ``count`` valid pixels
         leave the rest of ``used`` False.
     """
-    generator = torch.Generator().manual_seed(seed)
-    keys = torch.rand(valid.shape, generator=generator, device="cpu").to(valid.device, non_blocking=True)
-    score, index = torch.where(valid, keys, torch.full_like(keys, -1.0)).flatten(1).topk(count, dim=1)
-    return index, score >= 0
+    flat = valid.flatten(1)
+    pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
+    asked = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
+    while True:
+        order = _random_order(pixels, seed)[:asked].to(valid.device, non_blocking=not on_cpu)
+        usable = flat[:, order]
+        if asked >= pixels or bool((usable.sum(1) >= count).all()):
+            break
+        asked *= 2
+    behind = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
+    place = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
+    index = torch.empty_like(place).scatter_(1, place, order.expand_as(place))[:, :count]
+    return index, torch.gather(flat, 1, index)
+
+
+@functools.lru_cache(maxsize=4)  # the draw costs more than a sample
+def _random_order(pixels: int, seed: int) -> Tensor:
+    """A permutation of the numbers below ``pixels``; not to be modified."""
+    return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))

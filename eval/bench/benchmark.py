@@ -51,9 +51,11 @@ class BenchSettings:
         threads: number of threads of torch and numba; default: the cores of this process
         seed: of the rendered room
         long: also time this many frames in one room (1000 without a number)
+        merge: limits of merging (UfMStarConfig.merge) of the long run, which is run with each; 0 = off
         anchors: also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one
             thread (300 without a number; needs OpenCV)
         skip_compile: do not time compilation (some tens of seconds)
+        device: time steps of 1, 64 and 256 streams on this GPU instead (cuda)
         json: file for the report
     """
 
@@ -71,8 +73,10 @@ class BenchSettings:
     threads: int | None = None
     seed: int = 0
     long: int | None = field(default=None, metadata={"const": 1000})
+    merge: tuple[float, ...] = (0.0,)
     anchors: int | None = field(default=None, metadata={"const": _TARGET_CORNERS})
     skip_compile: bool = False
+    device: str = "cpu"
     json: Path | None = None
 
     def __post_init__(self) -> None:
@@ -80,6 +84,8 @@ class BenchSettings:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
+        if not self.merge or min(self.merge) < 0:
+            raise ValueError(f"--merge must be limits of at least 0, got {list(self.merge)}")
         if min(self.sizes) < 16:
             raise ValueError(f"--sizes must be at least 16 pixels, got {list(self.sizes)}")
 
@@ -92,8 +98,9 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         progress: is called with a description of what is measured next.
 
     Returns:
-        The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run" and
-        "anchors" where asked for, "rates" of the machine, "peer" and "against", and "targets".
+        The report: settings, versions, hardware, "results" per size and backend, "rates" of the machine, "compilation",
+        "long_run", "growth" (a long run for each limit of merging), "anchors", "device", "peer" and "against" where
+        asked for, and "targets".
 
     Raises:
         ValueError: an option is out of range.
@@ -118,10 +125,20 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         "settings": {"threads": threads, "seed": options.seed, "config": config.to_dict()},
         "compilation": None,
         "long_run": None,
+        "growth": [],
         "anchors": None,
         "peer": None,
         "against": None,
+        "rates": None,
+        "device": None,
+        "results": [],
     }
+    if options.device != "cpu":
+        from ufmstar_torch.eval.bench.device import measure_device
+
+        report["device"] = measure_device(options.device, options.sizes, options.frames, options.seed, progress)
+        report["load_average"]["after"] = machine.load_average()
+        return {**report, "targets": []}
     if "numba" in options.backends and not options.skip_compile:
         progress("compilation")
         report["compilation"] = measure_compilation()
@@ -134,9 +151,12 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
             progress("the peer")
             report["peer"] = measure_peer(options.peer, source.frames(options.sizes[0], options.frames))
         if options.long is not None:
-            progress(f"long run of {options.long} frames")
             backend = config.replace(backend=options.backends[0])
-            report["long_run"] = measure_long_run(source, backend, size=_TARGET_SIZE, frames=options.long)
+            for limit in options.merge:
+                progress(f"long run of {options.long} frames, merge {limit:g}")
+                run = measure_long_run(source, backend.replace(merge=limit), size=_TARGET_SIZE, frames=options.long)
+                report["growth"].append({"merge": limit, **run})
+            report["long_run"] = report["growth"][0]
         if options.anchors is not None:
             report["anchors"] = _anchors(options, config, source, progress)
     report["load_average"]["after"] = machine.load_average()

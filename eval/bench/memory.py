@@ -31,11 +31,14 @@ def weight_bytes(*modules: nn.Module) -> int:
 
 
 def state_memory(ufm: UfMStar) -> dict[str, int]:
-    """Bytes of the components in use, of the slots allocated, and of the moving average's map."""
+    """Bytes of the components in use, of the slots allocated, and of the moving average's map; "packed" is what the
+    components in use take as the paper counts them."""
     mixture = ufm.mixture
     each, components = mixture.bytes_per_component(), int(mixture.components.sum())
     return {
         "bytes_per_component": each,
+        "packed_bytes_per_component": mixture.packed_bytes_per_component(),
+        "packed": mixture.packed_bytes_per_component() * components,
         "components": components,
         "in_use": each * components,
         "allocated": each * mixture.streams * mixture.capacity,

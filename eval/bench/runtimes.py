@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-import io
+import tempfile
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -99,11 +100,11 @@ def _in_torch(network: nn.Module, image: Tensor) -> Callable[..., Tensor]:
 
 def _in_onnx_runtime(network: nn.Module, image: Tensor) -> Callable[..., Tensor]:
     """The network, exported by torch."""
-    content = io.BytesIO()
-    with warnings.catch_warnings(), torch.no_grad():
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # of the tracer, about checks of the input, and of the exporter's age
-        torch.onnx.export(_Maps(network), (image,), content, dynamo=False)
-    session = open_session(content.getvalue(), torch.get_num_threads(), ("CPUExecutionProvider",))
+        path = str(Path(folder, "network.onnx"))
+        torch.onnx.export(_Maps(network), (image,), path, dynamo=False)
+        session = open_session(path, torch.get_num_threads(), ("CPUExecutionProvider",))
     feeds = {session.get_inputs()[0].name: image.numpy()}
     return lambda *_: torch.from_numpy(session.run(None, feeds)[0])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ufmstar_torch.eval.bench.device import device_text
 from ufmstar_torch.eval.bench.timing import STAGES
 
 _COLUMNS = ("median_ms", "p90_ms", "mean_ms", "min_ms", "cpu_median_ms", "cpu_p90_ms", "cpu_mean_ms", "cpu_min_ms")
@@ -26,10 +27,12 @@ def format_report(report: Mapping[str, Any]) -> str:
         lines.append(f"first steps of a process: {c['cold_s']:.1f} s compiling, {c['warm_s']:.1f} s with compiled code")
     for result in report["results"]:
         lines += ["", *_result(result)]
-    if report["long_run"] is not None:
-        lines += ["", *_long_run(report["long_run"])]
+    for run in report["growth"]:
+        lines += ["", *_long_run(run)]
     if report["anchors"] is not None:
         lines += ["", *_anchors(report["anchors"])]
+    if report.get("device") is not None:
+        return "\n".join([*lines, "", *device_text(report["device"])])
     if report["peer"] is not None:
         lines += ["", *_peer(report["peer"])]
     if report["against"] is not None:
@@ -114,8 +117,9 @@ def _against(against: Mapping[str, Any]) -> list[str]:
 
 def _long_run(run: Mapping[str, Any]) -> list[str]:
     lines = [
-        f"long run, {run['size']} x {run['size']}, {run['frames']} frames in one room: last steps / early ones = "
-        f"{run['ratio']:.2f} (CPU {run['cpu_ratio']:.2f}), {run['memory']['in_use'] / 1e3:.1f} kB in use",
+        f"long run, {run['size']} x {run['size']}, {run['frames']} frames in one room, merge {run['merge']:g}: "
+        f"last steps / early ones = {run['ratio']:.2f} (CPU {run['cpu_ratio']:.2f}), "
+        f"{run['memory']['in_use'] / 1e3:.1f} kB in use, {run['memory']['packed'] / 1e3:.1f} kB packed",
         f"  {'frames':>12}{'step [ms]':>11}{'CPU [ms]':>10}{'total':>8}{'in view':>9}{'segments':>10}{'new':>7}",
     ]
     for row in run["rows"]:

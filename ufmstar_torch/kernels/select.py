@@ -5,22 +5,35 @@ from __future__ import annotations
 import functools
 import warnings
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
+from ufmstar_torch.posterior.update import PosteriorKernels
 from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
 
 
+@runtime_checkable
+class LateStep(Protocol):
+    """A step that keeps something of a frame for the next one."""
+
+    def settled(self, state: UfMStarState, config: UfMStarConfig, /) -> UfMStarState:
+        """The state that it returned last, with what it keeps."""
+        ...
+
+
 def select_step(name: str, device_type: str) -> Step:
-    """The step for a device.
+    """The step for a device. That of a GPU has a memory (``step_device``): one for every state.
 
     Args:
         name: "torch": the reference on every device; it waits for the device only where the mixture may
@@ -38,6 +51,10 @@ def select_step(name: str, device_type: str) -> Step:
         from ufmstar_torch.kernels import step_cpu
 
         return step_cpu.step
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.step_device import DeviceStep
+
+        return DeviceStep(_triton())
     return functools.partial(step, kernels=select_kernels(name, device_type))
 
 
@@ -47,6 +64,10 @@ def select_check(name: str, device_type: str) -> CheckKernel:
         from ufmstar_torch.kernels import check_cpu
 
         return check_cpu.check_values
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.triton import check
+
+        return check.check_values
     return check_values
 
 
@@ -63,7 +84,7 @@ def select_kernels(name: str, device_type: str) -> Kernels:
     """The parts of the step where it is the reference's; arguments as :func:`select_step`."""
     if _on_gpu(name, device_type):
         return _triton()
-    if name == "torch" or device_type in ("cpu", "meta") or not _has_numba():
+    if name == "torch" or device_type in ("cpu", "meta") or not has_numba():
         return REFERENCE
     from ufmstar_torch.kernels import segment_cpu
 
@@ -78,7 +99,7 @@ def _compiled(name: str, device_type: str) -> bool:
         import numba as numba  # an ImportError for who asked for it by name
 
         return True
-    return name == "auto" and device_type == "cpu" and _has_numba()
+    return name == "auto" and device_type == "cpu" and has_numba()
 
 
 def _on_gpu(name: str, device_type: str) -> bool:
@@ -90,6 +111,16 @@ def _on_gpu(name: str, device_type: str) -> bool:
             raise ValueError(f"backend='triton' needs tensors of a GPU, got device type {device_type!r}")
         return True
     return name == "auto" and device_type in _TRITON_DEVICES and _has_triton()
+
+
+def select_posterior(name: str, device_type: str) -> PosteriorKernels:
+    """The posterior's kernels for a device; arguments and errors as :func:`select_kernels`. An accelerator takes the
+    reference."""
+    if device_type != "cpu" or select_kernels(name, device_type) is REFERENCE:
+        return POSTERIOR_REFERENCE
+    from ufmstar_torch.kernels import posterior_cpu
+
+    return PosteriorKernels(solve=posterior_cpu.solve, distance=posterior_cpu.distance, read=posterior_cpu.read)
 
 
 @functools.cache
@@ -119,7 +150,7 @@ def _has_triton() -> bool:
 
 
 @functools.cache
-def _has_numba() -> bool:
+def has_numba() -> bool:
     """Whether numba can be imported; one warning where it cannot."""
     try:
         import numba as numba
@@ -127,6 +158,19 @@ def _has_numba() -> bool:
         warnings.warn(f"numba cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
         return False
     return True
+
+
+def compile_triangulation() -> None:
+    """Compile what triangulates tracked corners, where numba can be imported."""
+    if not has_numba():
+        return
+    import numpy as np
+
+    from ufmstar_torch.kernels.triangulate_cpu import triangulate
+
+    poses = np.stack([np.eye(4)] * 2)
+    poses[1, 0, 3] = 1.0
+    triangulate(np.array([[[0.5, 0.0], [-0.5, 0.0]]]), np.ones((1, 2), np.bool_), poses, np.eye(3))
 
 
 def _on_host(kernel: SegmentKernel) -> SegmentKernel:

@@ -70,7 +70,7 @@ def correspond(
     still = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1), match.new_zeros(b, 3, dtype=torch.float64)
     camera = intrinsics.to(torch.float64).contiguous()
     previous, current = candidates(previous_cam, still, current_cam, camera, size, config)
-    matched, pairs = match.new_zeros(b, 1), match.new_zeros(b, dtype=torch.int32)
+    matched, pairs = match.new_zeros(b, 1), match.new_zeros(b, dtype=torch.int64)
     _launch_match(
         previous, current, config, match, overlap, match.new_zeros(1, dtype=torch.int64), matched, pairs, True
     )
@@ -105,20 +105,26 @@ def candidates(
     return rooms
 
 
-def match_bits(previous: Candidates, current: Candidates, config: UfMStarConfig) -> tuple[Tensor, Tensor, Tensor]:
+def match_bits(
+    previous: Candidates, current: Candidates, config: UfMStarConfig, pairs: Tensor
+) -> tuple[Tensor, Tensor]:
     """The matches of every candidate of the mixture.
+
+    Args:
+        previous, current: of :func:`candidates`.
+        config: eta, eta_occlusion.
+        pairs: [B] int64, to which the number of pairs is added.
 
     Returns:
         Bits [B, K, ceil(C/32)] int64: bit i of word w of the k-th listed candidate stands for the (32 w + i)-th listed
         candidate of the image; only the words of listed candidates are written. Which of the image's Gaussians matched
-        [B, C] bool. The number of pairs [B] int32.
+        [B, C] bool.
     """
     (b, k), c = previous.index.shape, current.index.shape[1]
     bits = torch.empty(b, k, triton.cdiv(c, WORD), dtype=torch.int64, device=previous.index.device)
     matched = torch.zeros(b, c, dtype=torch.bool, device=bits.device)
-    pairs = torch.zeros(b, dtype=torch.int32, device=bits.device)
     _launch_match(previous, current, config, matched, previous.image, bits, matched, pairs, False)
-    return bits, matched, pairs
+    return bits, matched
 
 
 def _launch_match(

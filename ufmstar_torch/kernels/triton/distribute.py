@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
+from ufmstar_torch.kernels.triton.listing import whitened
 from ufmstar_torch.kernels.triton.matrices import load_symmetric
-from ufmstar_torch.kernels.triton.regress import whitened
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute as reference
 

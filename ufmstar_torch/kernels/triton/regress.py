@@ -9,27 +9,80 @@ pixels, 256 in their order take the place of a tile.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from ufmstar_torch import unmeasured
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.triton.launch import launch, power_of_two
-from ufmstar_torch.kernels.triton.matrices import load_symmetric, lowest_bit, moved, turned
+from ufmstar_torch.kernels.triton.listing import EPSILON, PRIOR, prepare
+from ufmstar_torch.kernels.triton.matrices import lowest_bit
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
 from ufmstar_torch.regress import regress_image as reference
 
-# As the CPU's: share of the denominator that culling may leave out, and that of the prior in a threshold.
-EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
-_PRIOR = 1e-3
-_LOG2_E = tl.constexpr(math.log2(math.e))
-_HALF_LOG_TWO_PI_CUBED = tl.constexpr(1.5 * math.log(2 * math.pi))
 _SIDE = 16  # pixels of a tile
 _CHUNK = 32  # components bounded at a time: the bits of a mask
-_SLOTS = 128  # slots of the mixture prepared at a time
+_UNMEASURED = {"paper": 0, "prior": 1, "relative": 2, "nan": 3}
+
+
+@dataclass(frozen=True)
+class FrameRegression:
+    """Step 5 and what follows it in a step.
+
+    Attributes:
+        disagreement: M [B, H, W] [m^2] after the moving average, NaN where not valid.
+        features: [B, H, W, F].
+        measured: [B, H, W], see ``unmeasured``.
+        memory: [B, H, W] of the moving average.
+    """
+
+    disagreement: Tensor
+    features: Tensor
+    measured: Tensor
+    memory: Tensor
+
+
+def regress_frame(
+    mixture: GaussianMixture,
+    to_camera: tuple[Tensor, Tensor],
+    frame: FrameInput,
+    memory: Tensor,
+    config: UfMStarConfig,
+    counts: Tensor,
+    *,
+    smooth: bool,
+) -> FrameRegression:
+    """Regression, what was not measured, and the moving average at every pixel, in two launches.
+
+    Args:
+        mixture: M_i, [B, K].
+        to_camera: R and t that take it into the camera frame.
+        frame: of B streams.
+        memory: of the moving average.
+        config: exact regression, no anchors.
+        counts: [8, B] int64 (``append``), to which valid and unmeasured pixels are added.
+        smooth: whether to average.
+    """
+    depth, average = frame.depth.contiguous(), smooth and config.ema_alpha < 1.0
+    if average and memory.shape != depth.shape:
+        memory = memory.new_full(depth.shape, torch.nan)
+    updated = torch.empty_like(memory) if average else memory
+    channels = mixture.features.shape[2]
+    maps, measured = torch.empty_like(depth), torch.empty_like(depth)
+    features = depth.new_empty(*depth.shape, channels)
+    camera = frame.intrinsics.to(torch.float64).contiguous()
+    listed = prepare(mixture, camera, frame.size, depth.dtype, config, to_camera)
+    _launch(
+        mixture, listed, depth, frame.valid, camera, depth, maps, features, config, subset=False,
+        stepped=(mixture.count, memory, updated, measured, counts), alpha=config.ema_alpha if average else 1.0,
+    )  # fmt: skip
+    return FrameRegression(maps, features, measured, updated)
 
 
 def regress_image(
@@ -43,25 +96,36 @@ def regress_image(
     """As :func:`ufmstar_torch.regress.regress_image`; ``config.regression == "neighbourhood"`` runs there."""
     if config.regression != "exact":
         return reference(mixture_cam, depth, intrinsics, valid, config, pixels)
-    b, height, width = depth.shape
     maps = depth.new_empty(depth.shape if pixels is None else pixels.shape)
     features = depth.new_empty(*maps.shape, mixture_cam.features.shape[2])
     camera = intrinsics.to(torch.float64).contiguous()
-    listed = prepare(mixture_cam, camera, (height, width), depth.dtype, config)
-    tiles = triton.cdiv(height, _SIDE) * triton.cdiv(width, _SIDE)
-    chosen = 0 if pixels is None else pixels.shape[1]
-    channels = mixture_cam.features.shape[2]
-    launch(
-        _regress, (tiles if pixels is None else triton.cdiv(chosen, _SIDE * _SIDE), b),
-        depth.contiguous(), valid.contiguous(), camera, depth if pixels is None else pixels.contiguous(), *listed,
-        mixture_cam.disagreement.contiguous(), mixture_cam.features.contiguous(), maps, features,
-        height, width, chosen, mixture_cam.capacity, fused=True,
-        prior=config.prior_weight, prior_total=config.prior_weight * config.prior_mean,
-        least=math.log2(_PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
-        slack=16 * torch.finfo(depth.dtype).eps, channels=channels, padded=power_of_two(channels), side=_SIDE,
-        chunk=_CHUNK, subset=pixels is not None,
-    )  # fmt: skip
+    listed = prepare(mixture_cam, camera, (depth.shape[1], depth.shape[2]), depth.dtype, config)
+    chosen = depth if pixels is None else pixels.contiguous()
+    subset = pixels is not None
+    _launch(mixture_cam, listed, depth.contiguous(), valid, camera, chosen, maps, features, config, subset=subset)
     return Regression(maps, features)
+
+
+def _launch(
+    mixture: GaussianMixture, listed: tuple[Tensor, ...], depth: Tensor, valid: Tensor, camera: Tensor, pixels: Tensor,
+    maps: Tensor, features: Tensor, config: UfMStarConfig, *, subset: bool, stepped: tuple[Tensor, ...] | None = None,
+    alpha: float = 1.0,
+) -> None:  # fmt: skip
+    b, height, width = depth.shape
+    chosen = pixels.shape[1] if subset else 0
+    channels = mixture.features.shape[2]
+    tiles = triton.cdiv(height, _SIDE) * triton.cdiv(width, _SIDE)
+    launch(
+        _regress, (triton.cdiv(chosen, _SIDE * _SIDE) if subset else tiles, b),
+        depth, valid.contiguous(), camera, pixels, *listed, mixture.disagreement.contiguous(),
+        mixture.features.contiguous(), maps, features, *(stepped or (mixture.count, *4 * [depth])),
+        height, width, chosen, mixture.capacity, b, fused=True,
+        prior=config.prior_weight, prior_total=config.prior_weight * config.prior_mean,
+        least=math.log2(PRIOR * config.prior_weight), share=math.log2(EPSILON[depth.dtype] / 3) - 0.01,
+        slack=16 * torch.finfo(depth.dtype).eps, channels=channels, padded=power_of_two(channels), side=_SIDE,
+        chunk=_CHUNK, subset=subset, stepped=stepped is not None, alpha=alpha, mode=_UNMEASURED[config.unmeasured],
+        stated=config.prior_mean, relative=config.unmeasured_relative, half=unmeasured.HALF,
+    )  # fmt: skip
 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
@@ -70,45 +134,6 @@ def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Ten
     memory, shown = torch.empty_like(before), torch.empty_like(now)
     launch(_smooth, (triton.cdiv(now.numel(), 1024),), before, now, memory, shown, now.numel(), alpha=alpha, chunk=1024)
     return memory, shown
-
-
-def prepare(
-    mixture: GaussianMixture,
-    camera: Tensor,
-    size: tuple[int, int],
-    dtype: torch.dtype,
-    config: UfMStarConfig,
-    motion: tuple[Tensor, Tensor] | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The components that can matter in the image, listed in their order.
-
-    Args:
-        mixture: [B, K].
-        camera: [B, 3, 3] float64 [px].
-        size: H and W [px].
-        dtype: of the regression.
-        config: of UfM*.
-        motion: R [B, 3, 3] and t [B, 3] float64 from the mixture's frame into the camera's; None = it is there.
-
-    Returns:
-        Means [B, 3, K] float64 [m]; whitening and log2 of the peak [B, 7, K] in ``dtype``; index [B, K] int32 into the
-        mixture; their number [B] int32.
-    """
-    b, capacity, device = mixture.streams, mixture.capacity, mixture.mean.device
-    if motion is None:
-        eye = torch.eye(3, dtype=torch.float64, device=device).repeat(b, 1, 1)
-        motion = eye, torch.zeros(b, 3, dtype=torch.float64, device=device)
-    means = torch.empty(b, 3, capacity, dtype=torch.float64, device=device)
-    fields = torch.empty(b, 7, capacity, dtype=dtype, device=device)
-    index = torch.empty(b, capacity, dtype=torch.int32, device=device)
-    count = torch.empty(b, dtype=torch.int32, device=device)
-    launch(
-        _prepare, (b,),
-        mixture.mean.contiguous(), mixture.covariance.contiguous(), mixture.weight.contiguous(), *motion, camera,
-        means, fields, index, count, capacity, *size,
-        share=math.log2(EPSILON[dtype] / 3) - 0.01 + math.log2(_PRIOR * config.prior_weight), chunk=_SLOTS,
-    )  # fmt: skip
-    return means, fields, index, count
 
 
 @triton.jit
@@ -125,89 +150,6 @@ def _smooth(previous, current, memory, shown, count, alpha: tl.constexpr, chunk:
     kept = mixed(tl.load(previous + i, mask=i < count, other=0.0), now, alpha)
     tl.store(memory + i, kept, mask=i < count)
     tl.store(shown + i, tl.where(now != now, now, kept).to(shown.dtype.element_ty), mask=i < count)
-
-
-@triton.jit
-def whitened(xx, xy, xz, yy, yz, zz):
-    """Inverse Cholesky factor (rows, 6 numbers) and its determinant's inverse, as ``regress_points_cpu.prepare``."""
-    least = 1e-14 * tl.maximum(xx, tl.maximum(yy, zz))
-    l00 = tl.sqrt(tl.maximum(xx, least))
-    l10, l20 = xy / l00, xz / l00
-    l11 = tl.sqrt(tl.maximum(yy - l10 * l10, least))
-    l21 = (yz - l20 * l10) / l11
-    l22 = tl.sqrt(tl.maximum(zz - l20 * l20 - l21 * l21, least))
-    i00, i11, i22 = 1.0 / l00, 1.0 / l11, 1.0 / l22
-    i10, i21 = -l10 / (l00 * l11), -l21 / (l11 * l22)
-    return i00, i10, i11, -(l20 * i00 + l21 * i10) / l22, i21, i22, l00 * l11 * l22
-
-
-@triton.jit
-def _outside(m, z, smm, smz, square, a, focal, centre, size):
-    """Whether the ellipsoid's silhouette lies beside the image along one axis; see ``regress_tiles_cpu._meets``."""
-    half_b = m * z - square * smz
-    root = tl.sqrt(tl.maximum(half_b * half_b - a * (m * m - square * smm), 0.0))
-    root += 1e-9 * (tl.abs(half_b) + root)
-    p, q = (half_b - root) / a * focal + centre, (half_b + root) / a * focal + centre
-    return (tl.maximum(p, q) < -1) | (tl.minimum(p, q) > size)
-
-
-@triton.jit
-def _prepare(
-    mean, covariance, weight, R, t, camera, means, fields, index, count, capacity, height, width,
-    share: tl.constexpr, chunk: tl.constexpr,
-):  # fmt: skip
-    b = tl.program_id(0).to(tl.int64)
-    lane = tl.arange(0, chunk)
-    R, t, camera = R + 9 * b, t + 3 * b, camera + 9 * b
-    occupied = 0
-    for first in range(0, capacity, chunk):
-        k = first + lane
-        occupied += tl.sum((tl.load(weight + b * capacity + k, mask=k < capacity, other=0.0) > 0).to(tl.int32), 0)
-    limit = share - tl.log2(tl.maximum(occupied, 1).to(tl.float64))
-    n = 0
-    for first in range(0, capacity, chunk):
-        k = b * capacity + first + lane
-        there = first + lane < capacity
-        w = tl.load(weight + k, mask=there, other=0.0).to(tl.float64)
-        there = there & (w > 0)
-        x = tl.load(mean + 3 * k, mask=there, other=0.0).to(tl.float64)
-        y = tl.load(mean + 3 * k + 1, mask=there, other=0.0).to(tl.float64)
-        z = tl.load(mean + 3 * k + 2, mask=there, other=0.0).to(tl.float64)
-        x, y, z = moved(R, t, x, y, z)
-        xx, xy, xz, yy, yz, zz = load_symmetric(covariance + 9 * k, 1, there)
-        xx, yy, zz = tl.where(there, xx, 1.0), tl.where(there, yy, 1.0), tl.where(there, zz, 1.0)
-        xx, xy, xz, yy, yz, zz = turned(R, xx, xy, xz, yy, yz, zz)
-        i00, i10, i11, i20, i21, i22, det = whitened(xx, xy, xz, yy, yz, zz)
-        peak = tl.log(tl.where(there, w, 1.0) / det) - _HALF_LOG_TWO_PI_CUBED
-
-        square = 2 * (peak - limit / _LOG2_E) * (1 + 1e-6)
-        least = 1e-14 * tl.maximum(xx, tl.maximum(yy, zz))
-        szz = square * (zz + least)
-        a = z * z - szz
-        behind = (square <= 0) | ((z < 0) & (a > 1e-6 * szz))
-        anywhere = a <= 1e-6 * szz
-        a = tl.where(behind | anywhere, 1.0, a)
-        beside = _outside(x, z, xx + least, xz, square, a, tl.load(camera), tl.load(camera + 2), width)
-        beside = beside | _outside(y, z, yy + least, yz, square, a, tl.load(camera + 4), tl.load(camera + 5), height)
-        seen = there & (anywhere | ~beside) & ~behind
-
-        at = n + tl.cumsum(seen.to(tl.int32), 0) - 1
-        tl.store(index + b * capacity + at, (first + lane).to(tl.int32), mask=seen)
-        out = means + 3 * b * capacity + at
-        tl.store(out, x, mask=seen)
-        tl.store(out + capacity, y, mask=seen)
-        tl.store(out + 2 * capacity, z, mask=seen)
-        out = fields + 7 * b * capacity + at
-        scale = tl.sqrt(w * 0.0 + 0.5 * _LOG2_E)
-        tl.store(out, i00 * scale, mask=seen)
-        tl.store(out + capacity, i10 * scale, mask=seen)
-        tl.store(out + 2 * capacity, i11 * scale, mask=seen)
-        tl.store(out + 3 * capacity, i20 * scale, mask=seen)
-        tl.store(out + 4 * capacity, i21 * scale, mask=seen)
-        tl.store(out + 5 * capacity, i22 * scale, mask=seen)
-        tl.store(out + 6 * capacity, peak * _LOG2_E, mask=seen)
-        n += tl.sum(seen.to(tl.int32), 0)
-    tl.store(count + b, n)
 
 
 @triton.jit
@@ -240,9 +182,11 @@ def _bounds(means, fields, capacity, j, there, cx, cy, cz, hx, hy, hz, slack: tl
 @triton.jit
 def _regress(
     depth, valid, camera, pixels, means, fields, index, count, m, features, out, out_f,
-    height, width, chosen, capacity,
+    compared, before, memory, measured, counts, height, width, chosen, capacity, streams,
     prior: tl.constexpr, prior_total: tl.constexpr, least: tl.constexpr, share: tl.constexpr, slack: tl.constexpr,
     channels: tl.constexpr, padded: tl.constexpr, side: tl.constexpr, chunk: tl.constexpr, subset: tl.constexpr,
+    stepped: tl.constexpr, alpha: tl.constexpr, mode: tl.constexpr, stated: tl.constexpr, relative: tl.constexpr,
+    half: tl.constexpr,
 ):  # fmt: skip
     real = depth.dtype.element_ty
     b = tl.program_id(1).to(tl.int64)
@@ -295,6 +239,7 @@ def _regress(
 
     evidence = tl.full([side * side], prior, real)
     total = tl.full([side * side], prior_total, real)
+    seen = tl.zeros([side * side], real)
     f = tl.arange(0, padded)
     sums = tl.zeros([side * side, padded], real)
     for first in range(0, n, chunk):
@@ -315,12 +260,35 @@ def _regress(
             w = tl.exp2(tl.load(fields + 6 * capacity + j) - (y0 * y0 + y1 * y1 + y2 * y2))
             k = b * capacity + tl.load(index + j)
             evidence += w
-            total += w * tl.load(m + k).to(real)
+            own = tl.load(m + k).to(real)
+            if stepped:
+                twice = tl.load(compared + k) > 1
+                seen += tl.where(twice, w, 0.0)
+                if mode == 1:
+                    own = tl.where(twice, own, stated)
+            total += w * own
             if channels > 0:
                 value = tl.load(features + k * channels + f, mask=f < channels, other=0.0).to(real)
                 sums += w[:, None] * value[None, :]
     nan = float("nan")
-    tl.store(out + target, tl.where(ok, total / evidence, nan), mask=inside)
+    value = total / evidence
+    if stepped:
+        known = seen / evidence
+        if mode == 2:
+            size = relative * tl.load(depth + source, mask=ok, other=0.0)
+            value += tl.maximum(1 - known, 0.0) * (size * size)
+        if mode == 3:
+            value = tl.where(known < half, nan, value)
+        tl.store(measured + target, tl.where(ok, known, nan), mask=inside)
+        tl.atomic_add(counts + 6 * streams + b, tl.sum(ok.to(tl.int32), 0))
+        tl.atomic_add(counts + 7 * streams + b, tl.sum((ok & (known < half)).to(tl.int32), 0))
+        value = tl.where(ok, value, nan)
+        if alpha < 1.0:
+            now = value.to(memory.dtype.element_ty)
+            kept = mixed(tl.load(before + target, mask=inside, other=0.0), now, alpha)
+            tl.store(memory + target, kept, mask=inside)
+            value = tl.where(now != now, now, kept).to(real)
+    tl.store(out + target, tl.where(ok, value, nan), mask=inside)
     if channels > 0:
         values = tl.where(ok[:, None], sums / evidence[:, None], nan)
         tl.store(

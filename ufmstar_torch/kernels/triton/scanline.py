@@ -74,7 +74,7 @@ def scanlines(given: SegmentInput, *, labels: bool) -> Rows:
         masked=given.valid is not None, spread_out=given.variance is not None, labels=labels,
         scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
         scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
-        line_thresh=float(limits.line_thresh), max_depth=float(limits.max_depth), gap=limits.occlusion_gap,
+        line_thresh=float(limits.line_thresh), max_depth=float(limits.depth_limit), gap=limits.occlusion_gap,
         n_check=limits.n_check, sparse=limits.sparse, max_open=limits.max_open, places=power_of_two(limits.max_open),
         number=given.depth_bins, lanes=lanes, warps=1,
     )  # fmt: skip
@@ -102,7 +102,7 @@ def _bins(
     inside = i < height * width
     z = tl.load(depth + b * height * width + i, mask=inside, other=0.0).to(tl.float64)
     fx, fy = tl.load(camera + 9 * b), tl.load(camera + 9 * b + 4)
-    s = 0.5 * tl.minimum(width.to(tl.float64) / fx, height.to(tl.float64) / fy)
+    s = 0.5 * tl.minimum(width / fx, height / fy)
     length = s * 0.0 + shortest
     edge = s * 0.0
     k = tl.zeros([chunk], tl.int32)

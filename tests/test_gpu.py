@@ -1,0 +1,114 @@
+"""What only a CUDA device can show: no synchronisation, many streams, flat memory, the graph. ``pytest -m gpu``.
+
+The kernels themselves are in ``test_triton.py``, which runs on the device as well.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from test_ufmstar import SPGF, walks
+
+import scenes
+from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device, torch sees none"),
+]
+
+FIXED = {"on_bad_frame": "skip", "initial_capacity": 256, "max_components": 256}
+
+
+def frames(streams: int, count: int):
+    """Depth, pose and intrinsics on the device, the first ones of a walk and back again."""
+    there = [tuple(v.cuda() for v in frame[:3]) for frame in walks(streams, 8)]
+    there += there[::-1]
+    return [there[i % len(there)] for i in range(count)]
+
+
+@pytest.mark.parametrize("growing", [False, True])
+def test_a_thousand_frames_without_a_synchronisation_and_with_flat_memory(growing):
+    settings = {"on_bad_frame": "skip", "initial_capacity": 8} if growing else FIXED
+    ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **settings)), frames(2, 16)
+    for frame in given:
+        ufm(*frame)
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for i in range(1000):
+            ufm(*given[i % 16])
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    torch.cuda.synchronize()
+    assert torch.cuda.memory_allocated() <= before + 2**20
+    assert ufm.mixture.components.min() > 4
+
+
+def test_256_streams_equal_themselves_alone_and_leave_each_other_alone():
+    ufm, given = UfMStar(UfMStarConfig(segment=SPGF)), [f[:3] for f in walks(4, 6)]
+    alone, broken = UfMStar(UfMStarConfig(segment=SPGF)), UfMStar(UfMStarConfig(segment=SPGF))
+    for depth, pose, K in given:
+        many = [v.repeat(64, *[1] * (v.dim() - 1)).cuda() for v in (depth, pose, K)]
+        other = many[0].clone()
+        other[1] = torch.nan
+        out = ufm(*many)
+        out_alone = alone(depth.cuda(), pose.cuda(), K.cuda())
+        out_broken = broken(other, *many[1:])
+        for b in range(256):
+            assert torch.equal(out.variance[b].nan_to_num(-1), out_alone.variance[b % 4].nan_to_num(-1))
+            if b != 1:
+                assert torch.equal(out.variance[b].nan_to_num(-1), out_broken.variance[b].nan_to_num(-1))
+
+
+def test_the_graph_equals_the_step():
+    ufm, given = UfMStar(UfMStarConfig(segment=SPGF, **FIXED)), frames(2, 12)
+    plain = copy.deepcopy(ufm)
+    captured = ufm.capture(*given[0])
+    for i, frame in enumerate(given):
+        if i == 8:
+            ufm.reset([1])
+            plain.reset([1])
+        expected = plain(*frame)
+        out = captured(*frame)
+        assert torch.equal(out.variance.nan_to_num(-1), expected.variance.nan_to_num(-1))
+    for name, value in plain.state_dict().items():
+        assert torch.equal(ufm.state_dict()[name].nan_to_num(-1), value.nan_to_num(-1))
+
+
+def test_gpu_equals_cpu_over_a_walk():
+    config = UfMStarConfig(segment=SPGF)
+    gpu, cpu = UfMStar(config), UfMStar(config)
+    for depth, pose, K, _ in walks(4, 8):
+        a, b = gpu(depth.cuda(), pose.cuda(), K.cuda()), cpu(depth, pose, K)
+        assert torch.equal(a.labels.cpu(), b.labels)
+        torch.testing.assert_close(a.variance.cpu(), b.variance, rtol=1e-6, atol=1e-9, equal_nan=True)
+
+
+@pytest.mark.parametrize("size", [(224, 224), (518, 518)])
+def test_large_images(size):
+    depths, poses, K = scenes.sequence(3, *size, 0.03)
+    gpu, cpu = UfMStar(), UfMStar()
+    for depth, pose in zip(depths, poses, strict=True):
+        given = torch.tensor(depth)[None].float(), torch.tensor(pose), torch.tensor(K)
+        a, b = gpu(*(v.cuda() for v in given)), cpu(*given)
+        assert torch.equal(a.labels.cpu(), b.labels)
+        torch.testing.assert_close(a.variance.cpu(), b.variance, rtol=1e-3, atol=1e-6, equal_nan=True)
+    assert a.variance.shape == (1, *size)
+
+
+def test_networks_on_the_gpu_and_ufmstar_on_the_cpu():
+    from test_pipeline import CONFIG, POSES, K, Scaled, image
+
+    members = [Scaled(1.0), Scaled(1.1)]
+    split = UncertainDepth(members, CONFIG, multiview_device="cpu").cuda()
+    given = [(image(i).cuda(), POSES[i], K) for i in range(5)]
+    outputs = list(split.stream(given))
+    plain = UncertainDepth(members, CONFIG).cpu()
+    for out, frame in zip(outputs, given, strict=True):
+        expected = plain(*(v.cpu() for v in frame))
+        assert out.variance.device.type == "cpu"
+        torch.testing.assert_close(out.variance, expected.variance, rtol=1e-5, atol=1e-8, equal_nan=True)

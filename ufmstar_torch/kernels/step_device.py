@@ -1,0 +1,198 @@
+"""A step on a GPU in about ten launches that waits for nothing.
+
+The mixture has a fixed number of slots. What a frame adds is counted on the device, and the counts are copied to the
+host behind the frame's last change of the mixture. The host reads them when the next frame comes, so it waits only
+where it is more than a frame ahead of the device. Where slots ran short, it then doubles them and appends what had
+found none, before anything else: the next frame matches what it would have matched had the mixture grown in time, and
+only the map of the frame before was regressed without it. Growth starts before the last slot is taken, so that this is
+rare.
+
+What the paper's step does not have (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
+``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels, which reads one number a
+frame where the mixture may grow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.hook import AnchorInput
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.kernels.triton import append as ends
+from ufmstar_torch.kernels.triton.append import append, cameras
+from ufmstar_torch.kernels.triton.correspond import candidates, match_bits
+from ufmstar_torch.kernels.triton.fuse import fuse_bits
+from ufmstar_torch.kernels.triton.regress import regress_frame
+from ufmstar_torch.kernels.triton.segment import Floor, fit
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.output import FrameStatistics, StepOutput
+from ufmstar_torch.segment_input import SegmentInput
+from ufmstar_torch.state import UfMStarState
+from ufmstar_torch.step import Kernels, StepObserver, step
+
+_ROOM = 4 / 3  # slots for each that is needed, below which the mixture grows ahead of need
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame whose counts the host has not read yet.
+
+    Attributes:
+        current: C_i in the camera frame, [B, C].
+        to_first: R and t into the mixture's frame.
+        left: [B, C] bool, what found no slot.
+        needed: [B] int32 on the host, slots that would hold everything, once ``copied``.
+        copied: the end of the copy; None on the CPU.
+    """
+
+    current: GaussianMixture
+    to_first: tuple[Tensor, Tensor]
+    left: Tensor
+    needed: Tensor
+    copied: torch.cuda.Event | None
+
+    @classmethod
+    def after(cls, current: GaussianMixture, to_first: tuple[Tensor, Tensor], left: Tensor, needed: Tensor) -> Waiting:
+        """Queue the copy of the counts."""
+        if needed.device.type != "cuda":
+            return cls(current, to_first, left, needed.cpu(), None)
+        on_host = torch.empty(needed.shape, dtype=needed.dtype, pin_memory=True)
+        on_host.copy_(needed, non_blocking=True)
+        copied = torch.cuda.Event()
+        copied.record(torch.cuda.current_stream(needed.device))
+        return cls(current, to_first, left, on_host, copied)
+
+    def slots(self) -> int:
+        """The slots that the fullest stream needs; waits until they are known."""
+        if self.copied is not None:
+            self.copied.synchronize()
+        return int(self.needed.max())
+
+
+class DeviceStep:
+    """:class:`ufmstar_torch.step.Step` with the memory that late growth needs.
+
+    The memory belongs to the state that was returned last. A caller that takes this state elsewhere (to save it, say)
+    asks :meth:`settled` for it first; another state makes the step forget what was waiting.
+
+    Args:
+        kernels: for what is not run here.
+    """
+
+    def __init__(self, kernels: Kernels) -> None:
+        self._kernels = kernels
+        self._waiting: Waiting | None = None
+        self._of: Tensor | None = None
+
+    def __call__(
+        self,
+        state: UfMStarState,
+        frame: FrameInput,
+        config: UfMStarConfig,
+        *,
+        pixels: Tensor | None = None,
+        smooth: bool = True,
+        anchors: AnchorInput | None = None,
+        observer: StepObserver | None = None,
+    ) -> tuple[UfMStarState, StepOutput]:
+        plain = config.disagreement == "w2" and config.regression == "exact"
+        if config.anchored or config.overlap_weighted or not plain or pixels is not None or observer is not None:
+            return step(
+                self.settled(state, config), frame, config, pixels=pixels, smooth=smooth, anchors=anchors,
+                observer=observer, kernels=self._kernels,
+            )  # fmt: skip
+        state = self._with_room(state, config, _ROOM)
+        updated, out, self._waiting = device_step(state, frame, config, smooth=smooth)
+        self._of = updated.mean
+        return updated, out
+
+    def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
+        """The state with everything appended that was waiting; waits for the device."""
+        return self._with_room(state, config, 1.0)
+
+    def _with_room(self, state: UfMStarState, config: UfMStarConfig, room: float) -> UfMStarState:
+        """The state with ``room`` slots for each that the frame before needed, and with what was waiting for one."""
+        waiting, self._waiting = self._waiting, None
+        if waiting is None or state.mean is not self._of:
+            return state
+        mixture, needed = state.mixture, waiting.slots()
+        grown = mixture.grown(int(needed * room), config.max_components)
+        if needed > mixture.capacity:
+            chosen, motion = waiting.left, waiting.to_first
+            append(
+                grown,
+                waiting.current,
+                motion,
+                chosen,
+                state.frames,
+                near_plane=config.near_plane,
+                again=True,
+                last=True,
+            )
+        self._of = grown.mean
+        return replace(state, **grown.tensors())
+
+
+def device_step(
+    state: UfMStarState, frame: FrameInput, config: UfMStarConfig, *, smooth: bool = True
+) -> tuple[UfMStarState, StepOutput, Waiting | None]:
+    """One image through steps 2 to 5 with the slots that the state has; see :func:`ufmstar_torch.step.step`.
+
+    Returns:
+        The new state, the output, and what may be waiting for slots; None where the mixture cannot grow.
+    """
+    b = frame.depth.shape[0]
+    stored = state.covariance.dtype
+    eps = 8 * torch.finfo(stored).eps
+    given = SegmentInput.of_frame(frame, config)
+    current, labels = fit(given, labels=True, floor=Floor(config.near_plane, eps))
+    assert labels is not None
+    here = cameras(state, frame)
+    camera = frame.intrinsics.contiguous()
+    previous, new = candidates(state.mixture, here.to_camera, current, camera, frame.size, config)
+    counts = torch.zeros(ends.COUNTS, b, dtype=torch.int64, device=frame.depth.device)
+    bits, matched = match_bits(previous, new, config, counts[ends.PAIRS])
+    mixture = fuse_bits(state.mixture, current, here.to_first, (bits, new.index, previous.place, new.count), config)
+    full = _full(mixture.capacity, config)
+    left, needed = append(
+        mixture, current, here.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
+    )
+    waiting = None if full else Waiting.after(current, here.to_first, left, needed)
+    result = regress_frame(mixture, here.to_camera, frame, state.smoothed, config, counts, smooth=smooth)
+    statistics = FrameStatistics(
+        components=counts[ends.COMPONENTS],
+        segments=counts[ends.SEGMENTS],
+        matched=counts[ends.MATCHED],
+        pairs=counts[ends.PAIRS],
+        new=counts[ends.NEW],
+        dropped=counts[ends.DROPPED],
+        valid_pixels=counts[ends.VALID],
+        beyond=frame.beyond,
+        out_of_range=frame.out_of_range,
+        unmeasured=counts[ends.UNMEASURED],
+        fault=frame.fault,
+        rotation_deviation=frame.rotation_deviation,
+        anchors=torch.zeros_like(frame.fault),
+        anchors_used=torch.zeros_like(frame.fault),
+    )
+    updated = UfMStarState(
+        **mixture.tensors(),
+        T_world_first=here.first,
+        started=here.started,
+        frames=here.frames,
+        skipped=here.skipped,
+        smoothed=result.memory,
+        evidence=state.evidence,
+        overall_evidence=state.overall_evidence,
+    )
+    out = StepOutput(result.disagreement, result.features, None, result.measured, labels.long(), current, statistics)
+    return updated, out, waiting
+
+
+def _full(capacity: int, config: UfMStarConfig) -> bool:
+    """Whether a mixture of so many slots may not grow."""
+    return config.max_components is not None and capacity >= config.max_components
