@@ -64,6 +64,10 @@ def select_check(name: str, device_type: str) -> CheckKernel:
         from ufmstar_torch.kernels import check_cpu
 
         return check_cpu.check_values
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.triton import check
+
+        return check.check_values
     return check_values
 
 
