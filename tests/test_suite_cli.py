@@ -236,10 +236,10 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 
     def measure(rows, networks, sequence, **how):
         measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames, how["plan"].threads))
-        return {"rows": []}
+        return {"rows": [], "sequence": {"name": sequence.name}, "count": len(measured)}
 
     monkeypatch.setattr(measurement, "measure", measure)
-    monkeypatch.setattr(measurement, "timed_networks", lambda networks: networks)
+    monkeypatch.setattr(measurement, "timed_networks", lambda networks, rows: networks)
     rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
     (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
     words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")
@@ -247,7 +247,9 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     assert measured == [], "another part may still be running"
     code, _, err = ufmstar(*words, "--shard", "2/2")
     assert (code, "measuring time, energy and memory" in err) == (0, True)
-    assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
-    assert measured == [(rows, "ash", 1, 1)]
+    written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
+    assert (written["sequence"], written["count"]) == ({"name": "3 sequences"}, 2.0), "means over the sequences"
+    assert [one["sequence"] for one in written["sequences"]] == ["ash", "birch", "cedar"]
+    assert measured == [(rows, name, 1, 1) for name in ("ash", "birch", "cedar")]
     assert ufmstar(*words, "--resume")[0] == 0
-    assert len(measured) == 1
+    assert len(measured) == 3

@@ -174,6 +174,7 @@ class UfMStarConfig(Checked):
         anchored: use anchors, sparse measured depths (an extension)
         anchor_half_life: age after which an anchor's evidence counts half
         anchor_shrinkage: anchors that a Gaussian needs to be believed half
+        posterior: with anchors, also a corrected depth and its variance (UfMStarOutput.posterior)
         merge: loss per pixel up to which two Gaussians are joined; 0 = Gaussians are never merged
         merge_share: share in its own points below which a Gaussian is dissolved in the others
         merge_every: frames of a stream from one merging to the next
@@ -218,6 +219,7 @@ class UfMStarConfig(Checked):
     anchored: bool = False
     anchor_half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
     anchor_shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
+    posterior: bool = False
 
     # Merging (an extension, not in the paper: ``merge``)
     merge: float = number(0.0, "l_max", "nat", 0.0, 10.0)
@@ -240,6 +242,8 @@ class UfMStarConfig(Checked):
             raise ValueError(f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}")
         if self.unmeasured == "prior" and not self.prior_mean:
             raise ValueError("UfMStarConfig.unmeasured = 'prior' needs a prior_mean above 0")
+        if self.posterior and not self.anchored:
+            raise ValueError("UfMStarConfig.posterior needs anchored = True")
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"

@@ -34,9 +34,11 @@ class Row:
 
     @property
     def name(self) -> str:
-        """The method's name, with what anchors it if that are tracked corners: "UfM*-Anchored-Ensemble"."""
-        anchored = self.setting.anchors == TRACKED
-        return self.method.name.replace("UfM*-", "UfM*-Anchored-", 1) if anchored else self.method.name
+        """The method's name, and what tracked corners serve: "UfM*-Anchored-Ensemble", "UfM*-Posterior-Ensemble"."""
+        if self.setting.anchors != TRACKED:
+            return self.method.name
+        kind = "Posterior" if self.setting.posterior else "Anchored"
+        return self.method.name.replace("UfM*-", f"UfM*-{kind}-", 1)
 
     @property
     def changed(self) -> dict[str, Any]:
@@ -44,7 +46,8 @@ class Row:
         values = self.setting.to_dict()
         if self.setting.recalibration:  # without the folder
             values["recalibration"] = Path(split_name(self.setting.recalibration)[0]).name
-        return {name: value for name, value in values.items() if (name, value) != ("anchors", TRACKED)}
+        named = {"anchors", "posterior"} if self.setting.anchors == TRACKED else set()
+        return {name: value for name, value in values.items() if name not in named}
 
     @property
     def label(self) -> str:

@@ -63,6 +63,10 @@ UNCERTAINTY_MS = Quantity("ms.uncertainty", "uncertainty", "Uncertainty", 1, Non
 NETWORK_MS = Quantity("ms.network", "network", "Network", 1, None, "ms")
 TOTAL_MS = Quantity("ms.total", "time per frame", "Time per frame", 1, None, "ms")
 
+# What uncertainty costs, where it was measured.
+ENERGY = Quantity("energy_mj", "energy", "Energy", None, LOWER, "mJ")
+MEMORY = Quantity("memory_mb", "memory", "Memory", None, LOWER, "MB")
+
 # The paper's columns, and those that the field expects beside them.
 MAIN = (DELTA1, NLL, ECE_DELTA, ECE_Q, STATE)
 EXTRA = (
@@ -100,6 +104,7 @@ SETTINGS = {
     "anchor_shrinkage": ("shrinkage κ", "anchors"),
     "track_noise": ("track noise", "px"),
     "corrected": ("depth corrected", ""),
+    "posterior": ("posterior", ""),
     "overlap_weighted": ("fusion weighted by overlap", ""),
     "disagreement": ("disagreement", ""),
     "regression": ("regression", ""),

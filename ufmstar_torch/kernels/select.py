@@ -14,6 +14,8 @@ from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
+from ufmstar_torch.posterior.update import PosteriorKernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
@@ -62,6 +64,10 @@ def select_check(name: str, device_type: str) -> CheckKernel:
         from ufmstar_torch.kernels import check_cpu
 
         return check_cpu.check_values
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.triton import check
+
+        return check.check_values
     return check_values
 
 
@@ -105,6 +111,16 @@ def _on_gpu(name: str, device_type: str) -> bool:
             raise ValueError(f"backend='triton' needs tensors of a GPU, got device type {device_type!r}")
         return True
     return name == "auto" and device_type in _TRITON_DEVICES and _has_triton()
+
+
+def select_posterior(name: str, device_type: str) -> PosteriorKernels:
+    """The posterior's kernels for a device; arguments and errors as :func:`select_kernels`. An accelerator takes the
+    reference."""
+    if device_type != "cpu" or select_kernels(name, device_type) is REFERENCE:
+        return POSTERIOR_REFERENCE
+    from ufmstar_torch.kernels import posterior_cpu
+
+    return PosteriorKernels(solve=posterior_cpu.solve, distance=posterior_cpu.distance, read=posterior_cpu.read)
 
 
 @functools.cache
