@@ -396,7 +396,7 @@ def test_what_a_configuration_says_may_not_be_contradicted(metric, relative):
     assert from_hugging_face(relative, kind="inverse").kind == "inverse"
     assert from_hugging_face(metric).preprocess.aspect_multiple == 14
     assert from_hugging_face(metric, keep_aspect=False).preprocess == DepthAnything.from_pretrained(metric).preprocess
-    with pytest.raises(ValueError, match="says depth_estimation_type 'relative', which is 'inverse'"):
+    with pytest.raises(ValueError, match="states depth_estimation_type 'relative', which is 'inverse'"):
         from_hugging_face(relative, kind="metric")
 
 
@@ -460,7 +460,7 @@ def test_architectures_that_are_always_metric_need_no_declaration(tmp_path):
     for architecture in ("depth_pro", "zoedepth"):
         folder = write_other(tmp_path / architecture, architecture)
         assert from_hugging_face(folder).kind == "metric"
-        with pytest.raises(ValueError, match=f"says the architecture {architecture}, which is 'metric'"):
+        with pytest.raises(ValueError, match=f"states the architecture {architecture}, which is 'metric'"):
             from_hugging_face(folder, kind="inverse")
     folder = write_other(tmp_path / "no_field_of_view", "depth_pro", use_fov_model=False)
     with pytest.raises(ValueError, match=r"not the field of view \(use_fov_model\)"):
