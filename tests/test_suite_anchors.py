@@ -47,7 +47,8 @@ def networks(tmp_path_factory):
 class Biased:
     """The truth, but what is farther than 2 m is put 40 % too far; as much of a ``DepthSource`` as is asked of it."""
 
-    digest, passes, needs_image, cacheable, networks, runtime, max_depth = "biased", 1, False, False, (), None, None
+    digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
+    max_depth = None
 
     def prepared(self, how):
         return self

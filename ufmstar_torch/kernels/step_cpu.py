@@ -156,6 +156,7 @@ def step(
         smoothed=smoothed,
         evidence=evidence.component,
         overall_evidence=evidence.overall,
+        posterior=state.posterior,
     )
     stage("average")
     return state, StepOutput(disagreement, result.features, residual, measured, labels, current_cam, statistics)
