@@ -396,11 +396,8 @@ def test_what_a_configuration_says_may_not_be_contradicted(metric, relative):
     assert from_hugging_face(relative, kind="inverse").kind == "inverse"
     assert from_hugging_face(metric).preprocess.aspect_multiple == 14
     assert from_hugging_face(metric, keep_aspect=False).preprocess == DepthAnything.from_pretrained(metric).preprocess
-<<<<<<< HEAD
-=======
     assert (from_hugging_face(metric).max_depth, from_hugging_face(metric, scale=0.5).max_depth) == (20.0, 10.0)
     assert from_hugging_face(relative, kind="inverse").max_depth is None
->>>>>>> main
     with pytest.raises(ValueError, match="states depth_estimation_type 'relative', which is 'inverse'"):
         from_hugging_face(relative, kind="metric")
 
