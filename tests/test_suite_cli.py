@@ -152,6 +152,15 @@ def test_a_broken_sequence_is_listed_at_the_end(ufmstar, tmp_path):
     assert ufmstar(*words_for(root, tmp_path / "out", "--resume", "--no-report"))[0] == 0
 
 
+@pytest.mark.usefixtures("stubbed")
+def test_a_network_of_no_row_is_named(ufmstar, rooms, tmp_path):
+    words = words_for(rooms, tmp_path / "out", "--network", "ensemble=trained:none.safetensors", "--no-report")
+    for more in ([], ["--dry-run"]):
+        code, out, err = ufmstar(*words, *more)
+        assert code == 0
+        assert "--network ensemble=...: not used, suite depth-only has no row of it" in out + err
+
+
 def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_path, stubbed):
     raised = []
 
@@ -163,7 +172,8 @@ def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_pat
     code, text, err = ufmstar(*words_for(rooms, tmp_path / "out"))
     assert code == 130
     assert "1 sequence" in text
-    assert "stopped; --resume goes on" in err
+    assert "stopped; finished rows are kept in " in err
+    assert "records; --resume goes on" in err
     assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume", "--no-report"))[0] == 0
     assert [name for name, _ in stubbed.asked] == ["ash", "birch", "birch", "cedar"]
 

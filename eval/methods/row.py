@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,12 @@ class Row:
     Attributes:
         method: which network, how often it is run, and what judges its views.
         setting: what an ablation changes about it.
+        title: what tables and figures call it; "" = by method and setting. It makes no other row of it.
     """
 
     method: Method
     setting: Setting = DEFAULT
+    title: str = field(default="", compare=False)
 
     @property
     def slug(self) -> str:
@@ -60,7 +62,8 @@ class Row:
 
     def to_dict(self) -> dict[str, Any]:
         """The row as plain values, as eval.json has it."""
-        return {"method": self.method.name, "setting": self.setting.to_dict()}
+        named = {"label": self.title} if self.title else {}
+        return {"method": self.method.name, "setting": self.setting.to_dict(), **named}
 
 
 def plain_rows(rows: Iterable[Row]) -> list[Row]:

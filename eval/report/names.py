@@ -157,8 +157,8 @@ def setting_label(values: Mapping[str, Any]) -> str:
 
 
 def row_label(row: Row) -> str:
-    """A row for people: "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
-    return ", ".join(filter(None, (row.name, setting_label(row.changed))))
+    """A row for people: its own title, or "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
+    return row.title or ", ".join(filter(None, (row.name, setting_label(row.changed))))
 
 
 def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
@@ -171,7 +171,7 @@ def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
     for row in listed:
         ours = "our defaults" if row.method in papers and row.setting.ufm_preset != PAPER else ""
         changed = {name: value for name, value in row.changed.items() if not (shared and name == "preprocess")}
-        labels[row] = ", ".join(filter(None, (row.name, ours, setting_label(changed))))
+        labels[row] = row.title or ", ".join(filter(None, (row.name, ours, setting_label(changed))))
     return labels
 
 

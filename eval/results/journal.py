@@ -47,8 +47,8 @@ class MapWriter(FrameSink):
         """
         if self._key in result.rows:
             estimate = result.rows[self._key].estimate
-            names = ("depth", "variance", "disagreement", "anchored", "bias", "valid")
-            names += ("posterior_depth", "posterior_variance")
+            anchored = ("anchored", "bias", "posterior_depth", "posterior_variance")
+            names = ("depth", "variance", "disagreement", *anchored, "valid")
             maps = {name: getattr(estimate, name) for name in names}
             self.written = self._writer.write(result.name, **maps)
 

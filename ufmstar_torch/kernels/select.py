@@ -7,6 +7,7 @@ import warnings
 from dataclasses import fields, replace
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
@@ -21,6 +22,7 @@ from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
+_LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
 
 
 @runtime_checkable
@@ -110,7 +112,7 @@ def _on_gpu(name: str, device_type: str) -> bool:
         if device_type not in _TRITON_DEVICES and not (device_type == "cpu" and interpreted()):
             raise ValueError(f"backend='triton' needs tensors of a GPU, got device type {device_type!r}")
         return True
-    return name == "auto" and device_type in _TRITON_DEVICES and _has_triton()
+    return name == "auto" and device_type in _TRITON_DEVICES and _has_triton(device_type)
 
 
 def select_posterior(name: str, device_type: str) -> PosteriorKernels:
@@ -139,12 +141,16 @@ def _triton() -> Kernels:
 
 
 @functools.cache
-def _has_triton() -> bool:
-    """Whether triton can be imported; one warning where it cannot."""
+def _has_triton(device_type: str) -> bool:
+    """Whether triton can be imported and supports the device; one warning where not."""
     try:
         import triton as triton
     except ImportError as error:
         warnings.warn(f"triton cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
+        return False
+    nvidia = device_type == "cuda" and torch.version.hip is None and torch.cuda.is_initialized()
+    if nvidia and torch.cuda.get_device_capability() < _LEAST_CAPABILITY:
+        warnings.warn("triton needs compute capability 8.0; the slower torch reference serves", stacklevel=4)
         return False
     return True
 
