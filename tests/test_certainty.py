@@ -287,6 +287,23 @@ def test_the_papers_configuration():
     assert UfMStarConfig.from_dict(theirs) == paper
 
 
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_the_papers_configuration_agrees_with_the_oracle(backend):
+    """Pruning if either is small, thresholds of this image's size with the camera's own f, neighbourhoods."""
+    paper = UfMStarConfig.paper().replace(backend=backend)
+    thresholds = paper.segment.scaled_to(H, W)
+    assert (thresholds.min_pixels, thresholds.min_rows) == (48, 4)
+    assert thresholds.adaptive_thresh_scale == pytest.approx(2.4 * W / 224)  # the larger of the two factors
+    judge = oracle.Oracle(oracle_settings(thresholds), neighbourhood=(2.0, 0.1, 0.5))
+    ufm = UfMStar(paper, dtype=torch.float64)
+    for i in range(2):
+        out = ufm(*frame(i, torch.float64))
+        V, _ = judge.step(DEPTHS[i], POSES[i], K_)
+        np.testing.assert_allclose(out.variance[0].numpy(), V, rtol=1e-7, atol=1e-10)
+    assert len(judge.mixture) > 1
+    assert float(out.variance[out.valid].max()) > 0
+
+
 def test_outputs_print_as_a_line():
     ufm = UfMStar(CONFIG)
     mean = ufm.mean_uncertainty(*frame(0), pixels=50)

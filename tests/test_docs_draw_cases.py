@@ -65,6 +65,7 @@ def by_oracle(case: Any) -> float:
     return float(np.mean([oracle.w2_squared(centre, S, m, c) for m, c in zip(means, covariances, strict=True)]))
 
 
+@pytest.mark.slow  # matplotlib
 def test_the_picture_shows_every_case(script: Any, tmp_path: Path) -> None:
     figure = script.draw({name: script.Case.of(offsets) for name, offsets in script.OFFSETS.items()})
     assert [axes.get_title(loc="left")[:2] for axes in figure.axes[:5]] == ["A:", "B:", "C:", "D:", "E:"]

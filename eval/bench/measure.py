@@ -152,7 +152,8 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
 
     Args:
         job: an evaluation whose sequences are done.
-        plan: how much is measured; None = the defaults, with fewer frames where a sequence has no more.
+        plan: how much is measured; None = the defaults, with fewer frames where a sequence has no more. Windows of
+            energy are divided among the sequences, at least one for each.
 
     Raises:
         ValueError: no sequence can be opened, none has frames enough, or no row can be measured.
@@ -160,11 +161,12 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """
     plan = plan or Plan()
     device = device_of(job.device, 0)
-    rows = job.suite.rows
+    rows, items = job.suite.rows, job.items[: plan.sequences]
+    plan = replace(plan, windows=-(-plan.windows // max(1, len(items))))
     networks = timed_networks(job.load(torch.device(device)), rows)
     measured: dict[tuple[str, str], dict[str, Any]] = {}
     failed = []
-    for item in job.items[: plan.sequences]:
+    for item in items:
         try:
             sequence = item.open()
             frames = max(1, min(plan.frames, len(sequence) - plan.warm_up))

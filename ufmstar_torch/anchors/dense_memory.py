@@ -90,7 +90,7 @@ class Memory:
             K: [3, 3] [px].
             cell: side of a cell [px].
         """
-        from ufmstar_torch.kernels.dense_cpu import sight
+        from ufmstar_torch.kernels.sight_cpu import sight
 
         self.frame += 1
         used = np.flatnonzero(self._used)
@@ -166,7 +166,7 @@ class Memory:
             T_world_cam: [4, 4] [m].
             K: [3, 3] [px].
         """
-        from ufmstar_torch.kernels.dense_cpu import patches
+        from ufmstar_torch.kernels.sight_cpu import patches
 
         if slot is None:
             age = np.where(self._used, self._seen, -1)
