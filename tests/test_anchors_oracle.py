@@ -10,7 +10,9 @@ from test_ufmstar import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.evidence import inliers
+from ufmstar_torch.anchors.given import AnchorInput, Anchors
+from ufmstar_torch.kernels import anchors_cpu
 
 pytestmark = pytest.mark.numerics
 
@@ -69,3 +71,25 @@ def test_a_sequence_agrees_with_the_oracle(expected, backend):
     assert rejected > 10, "outliers must be put to the test"
     np.testing.assert_allclose(ours.overall_evidence[0].numpy(), judge.total, rtol=1e-9)
     assert 0 < float((output.anchored[output.valid] > 0).double().mean()) < 1, "B is cut off at 0 in some places"
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_compiled_support_is_the_references_own(seed):
+    """Clusters, equal positions, wrong tracks and invalid anchors, from none to hundreds."""
+    generator = torch.Generator().manual_seed(seed)
+    b, n = 2, (1, 2, 3, 4, 5, 9, 12, 40, 100, 300, 301, 500)[seed]
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(b, *shape, generator=generator, dtype=torch.float64)
+
+    pixel = (uniform(n, 2) * (200 if seed % 2 else 12)).round()
+    predicted = 1 + 4 * uniform(n)
+    wrong = uniform(n) < 0.3
+    depth = predicted * (1.1 + 0.02 * uniform(n)) * torch.where(wrong, 1 + uniform(n), 1.0)
+    variance = 1e-4 * depth.square() * (uniform(n) < 0.5)
+    valid = uniform(n) < (0.9 if seed % 3 else 0.5)
+    given = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, valid)
+    expected = inliers(given)
+    assert torch.equal(anchors_cpu.inliers(given), expected)
+    if n >= 40:
+        assert 0 < expected.sum() < valid.sum()

@@ -43,7 +43,17 @@ def test_signatures():
     assert names(UfMStar.mean_uncertainty) == [*observation, "pixels", "fraction", "seed", "average"]
     assert names(UfMStar.query) == ["points", "frame"]
     assert names(UfMStar.reset) == ["streams", "keep_evidence"]
-    made_of = ["networks", "config", "mode", "samples", "preprocess", "anchors", "recalibration", "multiview_device"]
+    made_of = [
+        "networks",
+        "config",
+        "mode",
+        "posterior",
+        "samples",
+        "preprocess",
+        "anchors",
+        "recalibration",
+        "multiview_device",
+    ]
     assert names(UncertainDepth.__init__) == made_of
     images = ["image", "pose", "intrinsics", "valid", "features", "anchors"]
     assert names(UncertainDepth.forward) == images

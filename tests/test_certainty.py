@@ -32,6 +32,7 @@ H, W = 30, 40
 CONFIG = UfMStarConfig(segment=SPGF)
 DEPTHS, POSES, K_ = scenes.sequence(6, H, W, 0.05)
 K = torch.tensor(K_)
+DEPTHS_OF = [torch.tensor(depth, dtype=torch.float32)[None] for depth in DEPTHS]
 HOSTILE = [0.0, -1.0, 1e-45, 1e-40, 1e-20, 1e-7, 1e6, 1e10, 1e20, 3e38, float("inf"), float("nan")]
 
 
@@ -206,6 +207,59 @@ def test_a_point_far_from_everything_reads_as_chosen():
         np.testing.assert_allclose(float(ufm.query(far).disagreement), expected, rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:stream 0")
+@pytest.mark.parametrize("choice", CHOICES)
+def test_a_large_noisy_image_without_a_segment_reads_as_chosen(choice):
+    """5 cm of noise between neighbours leave no segment of the length that a large image asks for."""
+    size = (600, 900)
+    noisy = 1 + 0.05 * torch.randn(2, 1, *size, generator=torch.Generator().manual_seed(0))
+    camera = torch.tensor([[800.0, 0, 450], [0, 800, 300], [0, 0, 1]])
+    ufm = UfMStar(UfMStarConfig(unmeasured=choice, **CHOICES[choice]))
+    for depth in noisy:
+        out = ufm(depth, torch.eye(4), camera)
+        assert int(out.statistics.segments[0]) == 0
+        assert int(out.statistics.unmeasured[0]) == depth.numel()
+    expected = {"paper": 0.0, "prior": 0.3, "nan": float("nan")}
+    mean = (0.2 * noisy).square().mean(0) if choice == "relative" else torch.full((1, *size), expected[choice])
+    np.testing.assert_allclose(out.variance.numpy(), mean.numpy(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_what_was_not_measured_does_not_make_the_next_frame_certain(choice):
+    """The first view's M, 0 as the paper has it, halves that of the second by the moving average; chosen otherwise it
+    does not."""
+    first, second = frame(0), frame(1)
+    config = CONFIG.replace(unmeasured=choice, **CHOICES[choice])
+    smoothed, plain = UfMStar(config), UfMStar(config.replace(ema_alpha=1.0))
+    for ufm in (smoothed, plain):
+        ufm(*first)
+    a, b = smoothed(*second), plain(*second)
+    compared = b.measured > 0.5
+    assert int(compared.sum()) > 100
+    ratio = (a.disagreement / b.disagreement)[compared]
+    if choice == "paper":
+        assert float(ratio.median()) == pytest.approx(0.5, rel=1e-4)
+    elif choice == "nan":
+        np.testing.assert_allclose(ratio.numpy(), 1.0, rtol=1e-4)
+    else:
+        assert float(ratio.min()) > 0.5
+
+
+def test_depth_alone_through_the_pipeline_is_never_certain_unasked():
+    """First frame, a point far from every Gaussian, and a later frame: a choice other than the paper's leaves no 0."""
+    network = wrap_network(lambda x: DEPTHS_OF[int(x[0, 0, 0, 0] * 255)])
+    for choice in ("relative", "prior"):
+        model = UncertainDepth(network, CONFIG.replace(unmeasured=choice, **CHOICES[choice]))
+        for i in range(3):
+            image = torch.zeros(1, 3, H, W) + i / 255
+            out = model(image, torch.tensor(POSES[i]), K)
+            assert float(out.variance[out.ufm.valid].min()) > 1e-5
+    paper = UncertainDepth(network, CONFIG)
+    out = paper(torch.zeros(1, 3, H, W), torch.tensor(POSES[0]), K)
+    assert float(out.variance[out.ufm.valid].max()) == 0
+    assert int(out.ufm.statistics.unmeasured[0]) == int(out.ufm.valid.sum())
+
+
 def test_a_frame_without_a_segment_warns_once():
     ufm = UfMStar(CONFIG)
     depth, pose, intrinsics = frame(0)
@@ -231,6 +285,23 @@ def test_the_papers_configuration():
     ours, theirs = UfMStarConfig().to_dict(), paper.to_dict()
     assert {name for name in ours if ours[name] != theirs[name]} == changed
     assert UfMStarConfig.from_dict(theirs) == paper
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_the_papers_configuration_agrees_with_the_oracle(backend):
+    """Pruning if either is small, thresholds of this image's size with the camera's own f, neighbourhoods."""
+    paper = UfMStarConfig.paper().replace(backend=backend)
+    thresholds = paper.segment.scaled_to(H, W)
+    assert (thresholds.min_pixels, thresholds.min_rows) == (48, 4)
+    assert thresholds.adaptive_thresh_scale == pytest.approx(2.4 * W / 224)  # the larger of the two factors
+    judge = oracle.Oracle(oracle_settings(thresholds), neighbourhood=(2.0, 0.1, 0.5))
+    ufm = UfMStar(paper, dtype=torch.float64)
+    for i in range(2):
+        out = ufm(*frame(i, torch.float64))
+        V, _ = judge.step(DEPTHS[i], POSES[i], K_)
+        np.testing.assert_allclose(out.variance[0].numpy(), V, rtol=1e-7, atol=1e-10)
+    assert len(judge.mixture) > 1
+    assert float(out.variance[out.valid].max()) > 0
 
 
 def test_outputs_print_as_a_line():

@@ -396,7 +396,9 @@ def test_what_a_configuration_says_may_not_be_contradicted(metric, relative):
     assert from_hugging_face(relative, kind="inverse").kind == "inverse"
     assert from_hugging_face(metric).preprocess.aspect_multiple == 14
     assert from_hugging_face(metric, keep_aspect=False).preprocess == DepthAnything.from_pretrained(metric).preprocess
-    with pytest.raises(ValueError, match="says depth_estimation_type 'relative', which is 'inverse'"):
+    assert (from_hugging_face(metric).max_depth, from_hugging_face(metric, scale=0.5).max_depth) == (20.0, 10.0)
+    assert from_hugging_face(relative, kind="inverse").max_depth is None
+    with pytest.raises(ValueError, match="states depth_estimation_type 'relative', which is 'inverse'"):
         from_hugging_face(relative, kind="metric")
 
 
@@ -460,16 +462,20 @@ def test_architectures_that_are_always_metric_need_no_declaration(tmp_path):
     for architecture in ("depth_pro", "zoedepth"):
         folder = write_other(tmp_path / architecture, architecture)
         assert from_hugging_face(folder).kind == "metric"
-        with pytest.raises(ValueError, match=f"says the architecture {architecture}, which is 'metric'"):
+        with pytest.raises(ValueError, match=f"states the architecture {architecture}, which is 'metric'"):
             from_hugging_face(folder, kind="inverse")
     folder = write_other(tmp_path / "no_field_of_view", "depth_pro", use_fov_model=False)
     with pytest.raises(ValueError, match=r"not the field of view \(use_fov_model\)"):
         from_hugging_face(folder)
 
 
-@pytest.mark.parametrize("architecture", ["prompt_depth_anything", "chmv2", "bert", None])
+COMPARED = ("depth_anything", "depth_pro", "dpt", "glpn", "zoedepth")
+SHIPPED = transformers.models.auto.modeling_auto.MODEL_FOR_DEPTH_ESTIMATION_MAPPING_NAMES
+
+
+@pytest.mark.parametrize("architecture", [*sorted(set(SHIPPED) - set(COMPARED)), "bert", None])
 def test_other_architectures_are_refused_by_name(broken, architecture):
-    """One needs a second input, one predicts no depth, one is no depth model."""
+    """All that ``AutoModelForDepthEstimation`` loads and that is not compared above, and what is no depth model."""
     (broken / "config.json").write_text(json.dumps({"model_type": architecture}))
     with pytest.raises(CheckpointError, match=rf"broken \({architecture}\) cannot be loaded as a depth model: covered"):
         from_hugging_face(broken, kind="metric")

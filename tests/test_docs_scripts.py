@@ -97,7 +97,7 @@ def test_places_divide_the_pixels(script: Any) -> None:
 
 def test_the_scripts_run(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Every table of a tour of six frames, and the pictures, from its beginning to its end."""
-    found = script("clips").clips(argparse.Namespace(root=None, tours="200:201", frames=6))
+    found = script("clips").clips(argparse.Namespace(root=None, tours="200:201", frames=6, fov=None))
     clip, ensemble = found
     assert clip.aleatoric is None
     assert ensemble.aleatoric is not None
@@ -105,6 +105,9 @@ def test_the_scripts_run(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: p
     for table in tables.values():
         table(ensemble, 4)
     script("measure_views").share(resting(script, np.linspace(-0.1, 0.1, 6)))
+    precision = script("measure_precision")
+    half, brain = (np.median(precision.changes(clip, dtype)) for dtype in precision.DTYPES.values())
+    assert 0 < half < brain < 1
     factors = script("measure_factors")
     monkeypatch.setattr(factors, "CHANGES", {"alpha = 1 (no average)": {"ema_alpha": 1.0}})
     figures = [factors.figures(clip), factors.figures(ensemble)]

@@ -181,6 +181,12 @@ def test_seam_of_the_gpu_kernels(monkeypatch):
             chosen = [select.select_kernels("auto", "cuda") for _ in range(2)]
         assert len(caught) == 1
         assert all(kernels.fuse is REFERENCE.fuse for kernels in chosen)
+        monkeypatch.undo()
+        monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (7, 5))
+        select._has_triton.cache_clear()
+        with pytest.warns(UserWarning, match=r"triton needs compute capability 8.0"):
+            assert select.select_kernels("auto", "cuda").fuse is REFERENCE.fuse
     finally:
         select._has_triton.cache_clear()
 

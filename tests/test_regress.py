@@ -201,6 +201,7 @@ def test_on_cuda_free_memory_decides_how_much_is_regressed_at_a_time(monkeypatch
     import ufmstar_torch.regress as module
 
     def pairs(free: int, kept: int = 0, device: str = "cuda") -> int:
+        monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 80 << 30))
         monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: kept)
         monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)

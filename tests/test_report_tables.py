@@ -33,6 +33,7 @@ from shared_data import require_shared
 from test_efficiency_table import line as measured_line
 
 from ufmstar_torch import cli
+from ufmstar_torch.eval.bench.measure import over_sequences
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
@@ -494,6 +495,22 @@ class TestThePapersNumbers:
         assert len(paper_efficiency_tables(["Depth Anything V2"])) == 2  # none of its two: both
         for table in paper_efficiency_tables(table.network for table in PAPER_2):
             check_latex(latex(table).removeprefix("%"))
+
+    def test_energy_and_memory_stand_in_the_main_table(self):
+        """Energy of the sequences that were measured, memory of the network and of every record."""
+        runs = {("d", f"s{n}"): measured_line(mvd=(24.0, 50.0 + 10 * n), memory={"mvd": 1}) for n in range(5)}
+        figures = {(UFM_STAR, where): {"nll": 1.0} for where in runs}
+        found = in_memory({**figures, (UFM_STAR, ("d", "later")): {"nll": 1.0}}, efficiency=over_sequences(runs))
+        table = main_table(found)
+        cells = parsed(markdown(table))["UfM\\*-Ensemble".replace("\\", "")]
+        half = 2.776 * 250**0.5 / 5**0.5  # Student's t of four degrees of freedom, variance of 0, 10, ..., 40
+        assert cells["energy [mJ] ↓"] == f"1927 ± {half:.0f}"  # 1857 of the network, 50 to 90 of the step
+        assert cells["memory [MB] ↓"] == "1245"
+        assert "memory on all sequences, energy on 5 of them" in table.notes[-1]
+        assert found.efficiency["rows"][0]["latency"]["multiview"]["median_ms"] == 24.0
+        assert found.efficiency["sequence"]["name"] == "5 sequences"
+        without = over_sequences({("d", "s"): measured_line(mvd=(24.0, None), dnn=(252.0, None))})
+        assert without["sequences"][0]["energy_mj"] == {"UfM*-Ensemble": None}
 
     def test_table_2_stands_below_what_was_measured(self, tmp_path):
         found = in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}, efficiency=measured_line())

@@ -244,6 +244,28 @@ def test_the_flag(tmp_path, capfd):
     assert summary["anchors"]["mean_anchored"] < 0.1
 
 
+@pytest.mark.slow
+def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour, tmp_path):
+    config = ON.replace(posterior=True)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    summary = run(map_job(tour, config), whole)
+    run(map_job(tour, config, lambda frame: too_far(frame, stop_at=5)), parts)
+    assert run(map_job(tour, config), parts, resume=True)["posterior"] == summary["posterior"]
+    posterior, plain = summary["posterior"], summary["metrics"]
+    assert posterior["metrics"]["rmse"] < 0.7 * plain["rmse"]
+    assert posterior["metrics"]["ece_delta"] < plain["ece_delta"]
+    assert posterior["unseen"] > 0
+    assert "posterior  " in run_table(summary)
+    for name in tour.names:
+        one, other = (read_frame(out / "frames" / f"{name}.npz") for out in (whole, parts))
+        for key in ("posterior_depth", "posterior_variance"):
+            np.testing.assert_array_equal(one[key], other[key])
+    panel = Finished(whole, tour, records(whole), with_error=True).panel(7)
+    labels = [column.label for column in map_columns(fit_scales([panel]), with_error=True, with_posterior=True)]
+    assert labels == ["depth", "posterior", "σ", "|error|", "σ, posterior", "|error|, posterior"]
+    assert np.nanmean(panel.posterior_error) < 0.7 * np.nanmean(panel.error)
+
+
 def test_pictures_have_a_column_for_what_anchors_add(tour, finished, tmp_path):
     out, done = finished[0], records(finished[0])
     panel = Finished(out, tour, done, with_error=True).panel(7)

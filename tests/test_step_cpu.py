@@ -58,7 +58,7 @@ def tensors(out) -> dict[str, torch.Tensor]:
     """What a frame returned, by name."""
     found = {f"statistics.{name}": value for name, value in vars(out.statistics).items()}
     found |= {f"current_cam.{name}": value for name, value in out.current_cam.tensors().items()}
-    return found | {k: v for k, v in vars(out).items() if isinstance(v, torch.Tensor)}
+    return {name: value for name, value in (found | vars(out)).items() if isinstance(value, torch.Tensor)}
 
 
 def assert_same(one, other, rows=slice(None)) -> None:

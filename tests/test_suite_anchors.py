@@ -48,6 +48,7 @@ class Biased:
     """The truth, but what is farther than 2 m is put 40 % too far; as much of a ``DepthSource`` as is asked of it."""
 
     digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
+    max_depth = None
 
     def prepared(self, how):
         return self

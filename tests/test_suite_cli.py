@@ -152,6 +152,15 @@ def test_a_broken_sequence_is_listed_at_the_end(ufmstar, tmp_path):
     assert ufmstar(*words_for(root, tmp_path / "out", "--resume", "--no-report"))[0] == 0
 
 
+@pytest.mark.usefixtures("stubbed")
+def test_a_network_of_no_row_is_named(ufmstar, rooms, tmp_path):
+    words = words_for(rooms, tmp_path / "out", "--network", "ensemble=trained:none.safetensors", "--no-report")
+    for more in ([], ["--dry-run"]):
+        code, out, err = ufmstar(*words, *more)
+        assert code == 0
+        assert "--network ensemble=...: not used, suite depth-only has no row of it" in out + err
+
+
 def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_path, stubbed):
     raised = []
 
@@ -163,7 +172,8 @@ def test_a_signal_stops_in_good_order_and_resume_goes_on(ufmstar, rooms, tmp_pat
     code, text, err = ufmstar(*words_for(rooms, tmp_path / "out"))
     assert code == 130
     assert "1 sequence" in text
-    assert "stopped; --resume goes on" in err
+    assert "stopped; finished rows are kept in " in err
+    assert "records; --resume goes on" in err
     assert ufmstar(*words_for(rooms, tmp_path / "out", "--resume", "--no-report"))[0] == 0
     assert [name for name, _ in stubbed.asked] == ["ash", "birch", "birch", "cedar"]
 
@@ -226,10 +236,10 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
 
     def measure(rows, networks, sequence, **how):
         measured.append(([row.method.name for row in rows], sequence.name, how["plan"].frames, how["plan"].threads))
-        return {"rows": []}
+        return {"rows": [], "sequence": {"name": sequence.name}, "count": len(measured)}
 
     monkeypatch.setattr(measurement, "measure", measure)
-    monkeypatch.setattr(measurement, "timed_networks", lambda networks: networks)
+    monkeypatch.setattr(measurement, "timed_networks", lambda networks, rows: networks)
     rows = ["DepthOnly", "UfM-DepthOnly", "UfM-DepthOnly-100K", "UfM*-DepthOnly"]
     (tmp_path / "timed.toml").write_text(f"efficiency = true\n[[rows]]\nmethods = {rows}\n")
     words = words_for(rooms, tmp_path / "out", "--no-report", "--threads", "1", suite=tmp_path / "timed.toml")
@@ -237,7 +247,9 @@ def test_a_suite_about_efficiency_measures_once(ufmstar, rooms, tmp_path, monkey
     assert measured == [], "another part may still be running"
     code, _, err = ufmstar(*words, "--shard", "2/2")
     assert (code, "measuring time, energy and memory" in err) == (0, True)
-    assert json.loads((tmp_path / "out" / "efficiency.json").read_text()) == {"rows": []}
-    assert measured == [(rows, "ash", 1, 1)]
+    written = json.loads((tmp_path / "out" / "efficiency.json").read_text())
+    assert (written["sequence"], written["count"]) == ({"name": "3 sequences"}, 2.0), "means over the sequences"
+    assert [one["sequence"] for one in written["sequences"]] == ["ash", "birch", "cedar"]
+    assert measured == [(rows, name, 1, 1) for name in ("ash", "birch", "cedar")]
     assert ufmstar(*words, "--resume")[0] == 0
-    assert len(measured) == 1
+    assert len(measured) == 3

@@ -20,6 +20,7 @@ from trainings import SPEC
 
 from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
+from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.results import launch, worker
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
@@ -197,7 +198,7 @@ def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(roo
     assert found[0][2:4] == (0, True)
     assert not found[1][3]
     assert sorted(found[0][4] + found[1][4]) == list(NAMES)
-    go(job_on(rooms, tmp_path / "whole"))
+    go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")))
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
 
@@ -246,7 +247,7 @@ def test_parts_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path):
         ended, _ = quiet(options_for(rooms, tmp_path / "out", "--shard", part), Stub())
         ends.append((ended.finished, ended.left))
     assert ends == [(True, 2), (True, 0)]
-    go(job_on(rooms, tmp_path / "whole"))
+    go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")))
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
     with pytest.raises(FolderError, match=r"other input: settings\.confident was 0\.5"):
         quiet(options_for(rooms, tmp_path / "out", "--shard", "1/2", "--confident", "0.1"), Stub())
@@ -266,7 +267,7 @@ def test_jobs_through_submitit(rooms, tmp_path):
     ended, told = quiet(options)
     assert (ended.finished, ended.left) == (True, 0)
     assert told[0].startswith("jobs ")
-    go(job_on(rooms, tmp_path / "whole"), evaluate_sequence)
+    go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")), evaluate_sequence)
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
 

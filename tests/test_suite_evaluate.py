@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +23,7 @@ from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.name import open_tour
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
+from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.pipeline import combine
 
 SKIP = UfMStarConfig(on_bad_frame="skip")
@@ -46,6 +48,12 @@ def path(tmp_path_factory):
 @pytest.fixture(scope="module")
 def sequence(path):
     return open_sequence(path)
+
+
+def members_of(text):
+    """The networks of a base in the form in which an evaluation runs them."""
+    file = text.partition(":")[2]
+    return [Inference().ready(member, Path(file), CPU) for member in load_trained(file)]
 
 
 def frames_of(sequence, indices=None):
@@ -89,7 +97,7 @@ def through(estimator, members, sequence, *, aleatoric=True, poses=None, indices
 
 @pytest.mark.parametrize("base", ["ensemble", "batch_ensemble", "evidential", "aleatoric", "depth_only"])
 def test_a_row_equals_a_loop_by_hand(base, texts, networks, sequence):
-    members = load_trained(texts[base].partition(":")[2])
+    members = members_of(texts[base])
     behind = {"ensemble": "Ensemble", "batch_ensemble": "BatchEnsemble", "depth_only": "DepthOnly"}
     name = behind.get(base, base.capitalize())
     rows = [row(f"UfM*-{name}"), row(f"UfM-{name}"), row(f"UfM-{name}-1K")]
@@ -106,7 +114,7 @@ def test_a_row_equals_a_loop_by_hand(base, texts, networks, sequence):
 
 
 def test_full_and_alone_put_the_members_together(texts, networks, sequence):
-    members = load_trained(texts["ensemble"].partition(":")[2])
+    members = members_of(texts["ensemble"])
     rows = [row("Ensemble"), row("UfM*-FullEnsemble"), row("UfM*-Ensemble")]
     found = evaluate(sequence, rows, networks)
     full = UncertainDepth(members, SKIP, mode="full", preprocess=members[0].preprocess)
@@ -142,7 +150,7 @@ def test_depth_only_ignores_variances(texts, sequence):
     assert {"delta1", "rmse", "abs_rel"} < found["DepthOnly"].figures.keys()
     assert not {"nll", "ece_delta", "spearman"} & found["DepthOnly"].figures.keys(), "it has no variance"
     assert list(found["DepthOnly"].sums) == ["metrics"]
-    members = load_trained(texts["aleatoric"].partition(":")[2])
+    members = members_of(texts["aleatoric"])
     by_hand = judged(sequence, through(UfMStar(SKIP), members, sequence, aleatoric=False))
     assert agrees(found["UfMstar-DepthOnly"].figures, by_hand)
 
@@ -176,7 +184,7 @@ def test_samples_depend_on_the_frame_and_their_number_alone(texts, networks, seq
 
 def test_mc_dropout_equals_seeded_passes_by_hand(texts, networks, sequence):
     found = evaluate(sequence, [row("UfM*-MCD"), row("MC-Dropout"), row("UfM*-FullMCD")], networks)
-    [member] = load_trained(texts["mc_dropout"].partition(":")[2])
+    [member] = members_of(texts["mc_dropout"])
     generator = torch.Generator()
     set_sampling(member, True, generator)
 
@@ -250,7 +258,7 @@ def test_every_inference_is_made_once(networks, sequence, monkeypatch):
 
 
 def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
-    members = load_trained(texts["ensemble"].partition(":")[2])
+    members = members_of(texts["ensemble"])
     one, two = row("UfM*-Ensemble", skip=1), row("UfM*-Ensemble")
     found = evaluate(sequence, [one, two], networks, limit=slice(1, None))
     assert (found[one.slug].frames["done"], found[two.slug].frames["done"]) == (2, 4)
@@ -263,7 +271,7 @@ def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
 def test_noise_reaches_the_estimator_and_nothing_else(texts, networks, sequence):
     noisy = row("UfM*-Aleatoric", rotation_noise=3.0, translation_noise=0.1, seed=2)
     found = evaluate(sequence, [noisy, row("UfM*-Aleatoric"), row("Aleatoric")], networks)
-    members = load_trained(texts["aleatoric"].partition(":")[2])
+    members = members_of(texts["aleatoric"])
 
     def poses(frame):
         return perturbed(frame.T_world_cam, noisy.setting, frame.index)

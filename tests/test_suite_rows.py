@@ -310,7 +310,7 @@ def test_a_in_h_agrees_with_the_oracle():
     estimator = Gaussians(config, CPU, aleatoric_in_h=True)
     judge = oracle.Oracle(oracle_settings(SPGF))
     depths, poses, K = scenes.sequence(3, 30, 40, 0.05)
-    for i, (depth, T) in enumerate(zip(depths, poses, strict=True)):
+    for i, (depth, T) in enumerate(zip(depths[:2], poses[:2], strict=True)):
         a = 0.01 * (1 + i) * depth**2
         given = Prediction(torch.tensor(depth), torch.tensor(a), None, torch.tensor(K))
         estimate = estimator.update(given, torch.tensor(T))
@@ -340,7 +340,7 @@ def test_a_in_h_is_a_row_of_its_own():
 
 
 def test_a_row_prepares_its_images_as_it_says(tmp_path):
-    source = base_network(write_networks(tmp_path)["aleatoric"])
+    source = base_network(f"aleatoric=trained:{write_network(tmp_path / 'aleatoric.safetensors')}")
     own = source.networks[0].preprocess
     assert source.prepared("network") is source
     assert source.prepared("resize") is source, "the tiny networks resize the whole frame anyway"
@@ -354,7 +354,7 @@ def test_a_row_prepares_its_images_as_it_says(tmp_path):
         with torch.no_grad():
             expected = source.networks[0](x)
         made = one.one(frame, 0)
-        assert torch.equal(made.depth, expected.depth[0])
+        torch.testing.assert_close(made.depth, expected.depth[0], rtol=1e-5, atol=1e-6)
         assert torch.equal(made.intrinsics, K_x[0])
     assert Preprocess.nyu().of_whole_frame() == Preprocess(size=(224, 224))
     vit = Preprocess(size=(518, 518), aspect_multiple=14, cubic=True)

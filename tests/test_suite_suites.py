@@ -10,10 +10,11 @@ import pytest
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.method import BASES, MANY, UFM_STAR
-from ufmstar_torch.eval.methods.row import plain_rows
+from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from, value_of
 from ufmstar_torch.eval.methods.suite import Suite, names, rows_of, suite_named
-from ufmstar_torch.eval.report.names import row_labels, shared_words
+from ufmstar_torch.eval.report.data import listed_rows
+from ufmstar_torch.eval.report.names import row_label, row_labels, shared_words
 
 # The rows of the paper's tables, written off.
 TABLE_1 = """
@@ -37,7 +38,7 @@ def test_tables_have_the_papers_rows_in_its_order(number, rows):
     assert [row.method.name for row in plain_rows(suite.rows)] == rows.split()
     assert {row.setting.preprocess for row in suite.rows} == {"resize"}
     assert suite.sequences == 100
-    assert suite.efficiency == (number == 2)
+    assert suite.efficiency == (number in (1, 2))
 
 
 def test_table_4_has_the_full_rows_and_the_alternating_ones_beside_them():
@@ -223,6 +224,33 @@ methods = ["UfM*-Ensemble"]
 setting = { "segment.min_pixels" = 2000 }
 each = { ema_alpha = [0.1, 1.0], skip = [0, 2] }
 """
+
+
+def test_rows_have_labels_of_their_own(tmp_path):
+    rows = """
+[[rows]]
+methods = ["UfM*-Ensemble", "UfM-Ensemble-100K"]
+label = "{method}, as we deploy it"
+[[rows]]
+methods = ["UfM*-Ensemble"]
+setting = { eta = 0.3 }
+label = "loose"
+[[rows]]
+methods = ["Ensemble"]
+"""
+    (tmp_path / "own.toml").write_text(rows)
+    suite = suite_named(str(tmp_path / "own.toml"))
+    expected = ["UfM*-Ensemble, as we deploy it", "UfM-Ensemble-100K, as we deploy it", "loose", "Ensemble"]
+    assert list(row_labels(suite.rows).values()) == [row_label(row) for row in suite.rows] == expected
+    again = Suite.from_dict(json.loads(json.dumps(suite.to_dict())))
+    assert [row.title for row in again.rows] == [*expected[:3], ""]
+    listed = listed_rows({"rows": [row.to_dict() for row in suite.rows]})
+    assert [row_label(row) for row in listed] == expected
+    assert listed[2] == Row(suite.rows[2].method, suite.rows[2].setting), "a label makes no other row"
+    for wrong in ("each = { eta = [0.1, 0.2] }\nlabel = 'x'", "label = 'x'"):
+        (tmp_path / "own.toml").write_text(f"[[rows]]\nmethods = ['UfM*-Ensemble', 'Ensemble']\n{wrong}")
+        with pytest.raises(ValueError, match="label 'x' names one row"):
+            suite_named(str(tmp_path / "own.toml"))
 
 
 def test_a_suite_from_a_file(tmp_path):

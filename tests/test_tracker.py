@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.anchors import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.tour.open import open_sequence
@@ -121,7 +122,24 @@ def test_landmarks_of_a_rendered_room_are_where_they_are(tour):
     assert counts[1] >= 10, "two have"
     assert np.median(counts[4:]) >= 20
     assert np.median(errors) < 0.05
-    assert 0.2 < 1.4826 * np.median(np.abs(surprises)) < 2.5, "the variance is of the errors' size"
+    assert 0.4 < 1.4826 * np.median(np.abs(surprises)) < 2, "the variance is of the errors' size"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["corners", "dense"])
+@pytest.mark.parametrize("name", ["tour:71?style=mixed&frames=60&size=240x320", "tour:72?frames=60&size=240x320"])
+def test_stated_variances_are_those_of_the_errors(source, name):
+    landmarks, sizes, errors, counts = landmark_source(source), [], [], []
+    for frame in open_sequence(name):
+        found = landmarks.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        z = true_depth(frame, found.pixel)
+        sizes.extend(np.abs(1 / found.depth - 1 / z) * found.depth**2 / np.sqrt(found.variance))
+        errors.extend(np.abs(found.depth - z) / z)
+        counts.append(len(z))
+    assert 0.8 < np.median(sizes) / 0.674 < 1.25
+    assert np.mean(np.array(sizes) > 5) < 0.12
+    assert np.median(errors) < {"corners": 0.06, "dense": 0.015}[source]
+    assert np.mean(counts) > {"corners": 80, "dense": 180}[source]
 
 
 def test_a_standing_and_a_turning_camera_have_no_anchors(tour):
@@ -163,7 +181,7 @@ def test_what_is_far_away_is_not_left_out():
     assert far.sum() > 25, "noise of 1 px makes some 15 % of 5 m here"
     assert (~far).sum() > 40
     sigma = np.sqrt(found.variance[far]) / found.depth[far]
-    assert 0.08 < np.median(sigma) < 0.25
+    assert 0.08 < np.median(sigma) < 0.5, "errors that add up from view to view are allowed for; these are independent"
     surprise = (1 / found.depth[far] - 1 / 5) / (np.sqrt(found.variance[far]) / found.depth[far] ** 2)
     assert np.median(np.abs(surprise)) < 1.5
 

@@ -7,6 +7,7 @@ import json
 import pickle
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from ufmstar_torch.models.batch_ensemble import BatchEnsemble, BatchEnsembleMemb
 from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
+from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.trained import load_for_training
 from ufmstar_torch.pipeline import combine
 
@@ -60,6 +62,11 @@ def image():
 
 def members_of(networks):
     return [m for n in networks for m in (n.all_members() if isinstance(n, BatchEnsemble) else [n])]
+
+
+def ready(network):
+    """The form in which a run has it."""
+    return Inference().ready(network, Path("net.safetensors"), torch.device("cpu"))
 
 
 def predict(network, image):
@@ -447,7 +454,9 @@ def test_a_run_with_all_members_of_two_files(ufmstar, scene, tmp_path, mode, met
     code, out, err = ufmstar("--weights", *files, "--mode", mode)
     assert code == 0, err
     assert "finished: 4 of 4 frames" in out
-    np.testing.assert_array_equal(depths(tmp_path / "out"), by_hand(scene, members_of(networks), mode))
+    np.testing.assert_array_equal(
+        depths(tmp_path / "out"), by_hand(scene, [ready(m) for m in members_of(networks)], mode)
+    )
     source = read_summary(tmp_path / "out")["source"]
     assert [file["name"] for file in source["weights"]] == ["a.safetensors", "b.safetensors"]
     assert (source["mode"], source["samples"]) == (mode, None)

@@ -204,6 +204,55 @@ def test_labels_of_a_whole_reference_frame(kernels):
     assert np.array_equal(labels[0].cpu().numpy(), r.frames[0]["labels"])
 
 
+HOSTILE = {
+    "fine": (1, 1), "nan": (lambda T: T[0, 1].fill_(torch.nan), 1), "infinite": (lambda T: T[1, 3].fill_(torch.inf), 1),
+    "last row": (lambda T: T[3, 0].fill_(0.5), 1), "sheared": (lambda T: T[0, 0].mul_(1.1), 1),
+    "almost": (lambda T: T[:3, :3].mul_(1.002), 1), "reflected": (lambda T: T[:3, 0].neg_(), 1),
+    "far": (lambda T: T[2, 3].fill_(2e9), 1), "K nan": (1, lambda K: K[0, 2].fill_(torch.nan)),
+    "K skew": (1, lambda K: K[0, 1].fill_(0.1)), "K negative": (1, lambda K: K[0, 0].neg_()),
+    "K homogeneous": (1, lambda K: K[2, 2].fill_(2.0)), "K long": (1, lambda K: K[1, 1].fill_(1e8)),
+    "K outside": (1, lambda K: K[0, 2].fill_(60.0)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_check(dtype):
+    """A stream for every fault, and every kind of pixel."""
+    from ufmstar_torch.frame import FrameMaps, check_values
+    from ufmstar_torch.kernels.select import select_check
+
+    b = len(HOSTILE)
+    pose = torch.tensor(scenes.look((1.0, 2.0, 3.0), 0.4, 0.2)).repeat(b, 1, 1)
+    camera = torch.tensor(scenes.intrinsics(*SIZE)).repeat(b, 1, 1)
+    for (spoil_pose, spoil_camera), T, C in zip(HOSTILE.values(), pose, camera, strict=True):
+        _ = spoil_pose(T) if callable(spoil_pose) else spoil_camera(C) if callable(spoil_camera) else None
+    generator = torch.Generator().manual_seed(0)
+    values = torch.tensor([torch.nan, torch.inf, -1.0, 0.0, 1e-7, 1e-6, 1.0, 5.0, 19.9, 20.0, 20.1, 2e6, 1e13])
+
+    def draw(*shape):
+        return values[torch.randint(len(values), shape, generator=generator)].to(dtype)
+
+    maps = FrameMaps(
+        draw(b, *SIZE),
+        draw(b, *SIZE),
+        draw(b, *SIZE),
+        draw(b, 2, *SIZE),
+        torch.rand(b, *SIZE, generator=generator) > 0.1,
+    )
+    options = {"rotation_tolerance": 0.01, "max_depth": 20.0}
+    for given in (maps, FrameMaps(maps.depth, None, None, None, None)):
+        expected = check_values(given, pose, camera, **options)
+        actual = select_check("triton", DEVICE)(*moved((given, pose, camera)), **options)
+        assert sorted(set(expected.fault.tolist())) == list(range(10))
+        for f in fields(expected):
+            x, y = getattr(actual, f.name), getattr(expected, f.name)
+            if f.name != "known_fault" and y is not None:
+                close(x, y, 1e-14, 1e-14)
+    if DEVICE != "cpu":
+        known = select_check("triton", DEVICE)(moved(maps), pose, camera, **options).known_fault
+        assert torch.equal(known, expected.fault)
+
+
 def steps(config, streams, frames, device):
     """Outputs and module over a walk; the first stream's second frame has no depth."""
     ufm = UfMStar(config)
@@ -246,7 +295,8 @@ def test_whole_step(streams, settings):
             assert (x is None) == (y is None)
             if x is not None:
                 close(x, y, 1e-8, 1e-10)
-        for name in {f.name for f in fields(e.statistics)} - ({"components", "unmeasured"} if late else set()):
+        given = {f.name for f in fields(e.statistics) if getattr(e.statistics, f.name) is not None}
+        for name in given - ({"components", "unmeasured"} if late else set()):
             torch.testing.assert_close(getattr(a.statistics, name).cpu(), getattr(e.statistics, name))
     assert (overflowed > 0) == (settings.get("initial_capacity") == 2 and not config.anchored)
     n = int(cpu.mixture.components.max())
@@ -307,7 +357,7 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
             plain.reset()
         launched.clear()
         out = captured(*frame)
-        assert len(launched) == len(set(launched)) == 11, launched
+        assert len(launched) == len(set(launched)) == 2 + 11, launched  # the check, the step
         expected = plain(*frame)
         close(out.variance, expected.variance, 0, 0)
         assert ufm.mean is memory

@@ -12,7 +12,7 @@ import pytest
 KERNELS = (
     "_regress", "_prepare", "_project", "_match", "_fuse", "_floor", "_bins", "_scanline", "_join", "_label",
     "_feature_means", "_smooth", "_evidence", "_sums", "_cameras",
-    "_append",
+    "_append", "_camera", "_maps",
 )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from random_gaussians import mixture
 import scenes
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
-from ufmstar_torch.frame import check_frame
+from ufmstar_torch.frame import FrameMaps, check_frame
 from ufmstar_torch.kernels.select import select_kernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
@@ -23,7 +23,7 @@ K = torch.tensor(scenes.intrinsics(*SIZE)).expand(2, 3, 3)
 def cases() -> dict[str, Callable[[], object]]:
     """By name."""
     from ufmstar_torch.kernels import step_device
-    from ufmstar_torch.kernels.triton import append, correspond, distribute, fuse, regress, segment
+    from ufmstar_torch.kernels.triton import append, check, correspond, distribute, fuse, regress, segment
 
     m = mixture(2, 40, 3, features=1)
     current = mixture(2, 20, 4, features=1)
@@ -65,6 +65,13 @@ def cases() -> dict[str, Callable[[], object]]:
         "fuse": lambda: fuse.fuse(m, current, pairs, config.replace(overlap_weighted=True)),
         "smooth": lambda: regress.smooth(depth, depth, 0.5),
         "distribute": lambda: distribute.distribute(m, m.mean, m.covariance[..., 0], config),
+        "check": lambda: check.check_values(
+            FrameMaps(depth, depth, depth, depth[:, None], depth > 0),
+            torch.eye(4).double().expand(2, 4, 4),
+            K,
+            rotation_tolerance=0.01,
+            max_depth=20.0,
+        ),
         "floor": lambda: fuse.floor_covariance(m.covariance, m.weight),
         "segment": lambda: segment.segment(given),
         "device": device,

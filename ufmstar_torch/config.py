@@ -174,6 +174,7 @@ class UfMStarConfig(Checked):
         anchored: use anchors, sparse measured depths (an extension)
         anchor_half_life: age after which an anchor's evidence counts half
         anchor_shrinkage: anchors that a Gaussian needs to be believed half
+        posterior: with anchors, also a corrected depth and its variance (UfMStarOutput.posterior)
         merge: loss per pixel up to which two Gaussians are joined; 0 = Gaussians are never merged
         merge_share: share in its own points below which a Gaussian is dissolved in the others
         merge_every: frames of a stream from one merging to the next
@@ -219,6 +220,7 @@ class UfMStarConfig(Checked):
     anchored: bool = False
     anchor_half_life: float = number(30.0, "ln 2/ln(1/gamma)", "frames", 0.0, open_low=True)
     anchor_shrinkage: float = number(2.0, "kappa", "anchors", 0.0, open_low=True)
+    posterior: bool = False
 
     # Merging (an extension, not in the paper: ``merge``)
     merge: float = number(0.0, "l_max", "nat", 0.0, 10.0)
@@ -244,6 +246,8 @@ class UfMStarConfig(Checked):
             raise ValueError("UfMStarConfig.unmeasured = 'prior' needs a prior_mean above 0")
         if self.spill is not None and (not self.spill or self.max_components is None):
             raise ValueError("UfMStarConfig.spill needs a folder or 'memory', and max_components")
+        if self.posterior and not self.anchored:
+            raise ValueError("UfMStarConfig.posterior needs anchored = True")
         if self.far_radius < self.near_radius:
             raise ValueError(
                 f"UfMStarConfig.far_radius must be at least near_radius = {self.near_radius}, got {self.far_radius}"
@@ -256,7 +260,7 @@ class UfMStarConfig(Checked):
         The default differs in three respects. Here a Gaussian below 2,000 pixels or below 32 rows is dropped; by
         default only one that is below 200 pixels and below 16 rows. Measured on four sequences at 224 x 224, that is
         4 to 6 Gaussians over 55 to 85 % of the usable pixels here, and 12 to 24 over 92 to 99 % by default
-        (docs/results/segmentation.md); ECE_delta of FastDepth's depth alone, whole frame, is .556 here and .485 by
+        (docs/results/segmentation.md); ECE_delta of FastDepth's depth alone, whole frame, is .562 here and .485 by
         default, mean over the four (docs/results/real_video.md). The regression sums here over the Gaussians within
         .1 m, or .5 m where there are none; by default over all, the sum that this approximates to save time, which was
         the better calibrated one (docs/results/analysis.md). And SPGF's thresholds have the camera's own focal length

@@ -116,7 +116,7 @@ def check_values(
     """
     plain, device = maps.depth, maps.depth.device
     deviation = rotation_deviation(pose[..., :3, :3])
-    faults = _pose_fault(pose, deviation, rotation_tolerance), _intrinsics_fault(intrinsics, plain.shape[-2:])
+    faults = pose_fault(pose, deviation, rotation_tolerance), intrinsics_fault(intrinsics, plain.shape[-2:])
     known = _first(*faults, torch.device("cpu")) if pose.device.type == intrinsics.device.type == "cpu" else None
     fault = _first(*faults, device) if known is None else _moved(known, device)
     fine = fault == 0
@@ -219,6 +219,8 @@ def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
         raise ValueError(f"{name} must be [B, {n}, {n}] or [{n}, {n}], got {tuple(value.shape)}")
     if value.dim() == 3 and value.shape[0] not in (1, plain.shape[0]):
         raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
+    if value.device.type == "meta" and plain.device.type != "meta":
+        raise ValueError(f"{name} must hold values, got a tensor on device meta")
     return value.detach().to(torch.float64).expand(plain.shape[0], n, n)
 
 
@@ -227,7 +229,7 @@ def _moved(value: Tensor, device: torch.device) -> Tensor:
     return value.to(device, non_blocking=device.type != "cpu")
 
 
-def _pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
+def pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
     """[B] codes 1 to 4 and 7, on the pose's own device."""
     zero = torch.zeros((), dtype=T.dtype, device=T.device)
     last = torch.stack([zero, zero, zero, zero + 1])
@@ -241,7 +243,7 @@ def _pose_fault(T: Tensor, deviation: Tensor, tolerance: float) -> Tensor:
     return _code({**dict(enumerate(checks, start=1)), 7: far})
 
 
-def _intrinsics_fault(K: Tensor, size: tuple[int, ...]) -> Tensor:
+def intrinsics_fault(K: Tensor, size: tuple[int, ...]) -> Tensor:
     """[B] codes 5, 6, 8 and 9 for a depth map of ``size`` (H, W), on the intrinsics' own device."""
     off_diagonal = K[:, 0, 1].abs() + K[:, 1, 0].abs() + K[:, 2, :2].abs().sum(-1)
     shape = (off_diagonal != 0) | (K[:, 2, 2] != 1) | (K[:, 0, 0] <= 0) | (K[:, 1, 1] <= 0)

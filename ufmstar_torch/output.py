@@ -31,6 +31,10 @@ class FrameStatistics:
         anchors: given and usable; 0 for a standing camera, say.
         anchors_used: of those, no gross outliers. 0 = nothing new was learnt: M + A + E is plain UfM*'s and B what had
             been learnt before, which at the start is nothing.
+        calibration: with ``config.posterior``, mean z^2 of held-out anchors lately: 1 = the posterior is off by as much
+            as it states, more = it is too certain. NaN before any; None without.
+        unseen: likewise, variance of log g/d that held-out anchors show for surfaces far from all anchors: large where
+            evidence covers little of what the camera sees.
     """
 
     components: Tensor
@@ -47,10 +51,13 @@ class FrameStatistics:
     rotation_deviation: Tensor
     anchors: Tensor
     anchors_used: Tensor
+    calibration: Tensor | None = None
+    unseen: Tensor | None = None
 
     def __repr__(self) -> str:
         """The counts of every stream that are not 0, in a line."""
-        counts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rotation_deviation"}
+        kept = (f.name for f in fields(self) if f.name != "rotation_deviation")
+        counts = {name: getattr(self, name) for name in kept if getattr(self, name) is not None}
         shown = [f"{name}={_short(value)}" for name, value in counts.items() if _any(value)]
         return f"FrameStatistics({', '.join(shown)})"
 
@@ -96,6 +103,7 @@ class UfMStarOutput:
         anchored: B, the mean square error that anchors found beyond M + A + E [m^2] (``evidence``); None unless
             ``config.anchored``.
         bias: the relative error r = g/d - 1 that anchors lead to expect; None unless ``config.anchored``.
+        posterior_depth, posterior_variance: what :meth:`posterior` returns; None unless ``config.posterior``.
         features: regressed further entries of H, [B, H, W, F], in the caller's units.
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
@@ -112,6 +120,8 @@ class UfMStarOutput:
     epistemic: Tensor | None
     anchored: Tensor | None
     bias: Tensor | None
+    posterior_depth: Tensor | None
+    posterior_variance: Tensor | None
     features: Tensor
     measured: Tensor
     valid: Tensor
@@ -128,6 +138,19 @@ class UfMStarOutput:
     def std(self) -> Tensor:
         """sqrt(variance) [m]."""
         return self.variance.sqrt()
+
+    def posterior(self) -> tuple[Tensor, Tensor]:
+        """p(depth | network, UfM*, anchors): depth [m] and its variance [m^2], NaN where not valid
+        (``ufmstar_torch.posterior``).
+
+        Before the first anchor these are ``depth`` and ``variance``, to the bit.
+
+        Raises:
+            ValueError: without ``config.posterior``.
+        """
+        if self.posterior_depth is None or self.posterior_variance is None:
+            raise ValueError("posterior needs UfMStarConfig(anchored=True, posterior=True)")
+        return self.posterior_depth, self.posterior_variance
 
     def corrected(self) -> tuple[Tensor, Tensor]:
         """Depth without the bias that anchors found, d (1 + r) [m], and the variance that remains [m^2].
@@ -148,21 +171,26 @@ class MeanUncertainty:
     """An image average of the total variance from a sample of pixels, per stream [B].
 
     Attributes:
-        mean: average of V over the sampled pixels [m^2]; NaN without a valid pixel.
+        mean: average of V over the sampled pixels [m^2], with ``config.unmeasured="nan"`` over those that are measured;
+            NaN without any.
         standard_error: of that average as an estimate of the mean over all valid pixels [m^2];
             NaN with fewer than two pixels.
         pixels: number of pixels averaged.
-        statistics: per-stream counts of this frame.
+        measured: share in [0, 1] of the sampled pixels whose M rests on surfaces seen from two views or more; about 0
+            in a first view, whose mean says nothing of disagreement. NaN without a valid pixel.
+        statistics: per-stream counts of this frame; ``unmeasured`` are the other sampled pixels.
     """
 
     mean: Tensor
     standard_error: Tensor
     pixels: Tensor
+    measured: Tensor
     statistics: FrameStatistics
 
     def __repr__(self) -> str:
         """Means, errors and counts in a line."""
-        return f"MeanUncertainty(mean={_short(self.mean)} m^2, pixels={_short(self.pixels)}, {self.statistics!r})"
+        counts = f"pixels={_short(self.pixels)}, measured={_short(self.measured)}"
+        return f"MeanUncertainty(mean={_short(self.mean)} m^2, {counts}, {self.statistics!r})"
 
 
 def _size(value: Tensor) -> str:

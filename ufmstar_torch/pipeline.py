@@ -14,7 +14,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch.anchors.given import Anchors
+from ufmstar_torch.anchors.given import Anchors, require_anchors
 from ufmstar_torch.anchors.streams import Given, StreamLandmarks
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
@@ -175,6 +175,8 @@ class UncertainDepth(NetworksInTurn):
             single-model mode, and with ``samples`` it is the sampling-based mode. "full" runs every member
             (or ``samples`` passes of a stochastic network) per image and takes the predictive mean, the mean
             aleatoric variance and the variance between the members as epistemic variance.
+        posterior: also a corrected depth and its variance, ``out.ufm.posterior()``: ``config`` with ``anchored`` and
+            ``posterior`` switched on.
         samples: number of stochastic passes per image in mode "full" with one network (MC-Dropout; the
             network must sample by itself in eval mode). None: the network is deterministic.
         preprocess: maps image and intrinsics to the network's input; None passes both through.
@@ -209,6 +211,7 @@ class UncertainDepth(NetworksInTurn):
         config: UfMStarConfig | None = None,
         *,
         mode: str = "alternate",
+        posterior: bool = False,
         samples: int | None = None,
         preprocess: Preprocess | None = None,
         anchors: Given | list[Given] | tuple[Given, ...] | None = None,
@@ -223,6 +226,8 @@ class UncertainDepth(NetworksInTurn):
         if mode == "full" and single and samples is None:
             raise ValueError("mode 'full' needs several networks, or samples for a stochastic one")
         super().__init__(networks, samples=samples, preprocess=preprocess)
+        if posterior:
+            config = (config or UfMStarConfig()).replace(anchored=True, posterior=True)
         self.ufm = UfMStar((config or UfMStarConfig()).within(self.max_depth), recalibration=recalibration)
         if anchors is not None and not self.ufm.config.anchored:
             raise ValueError("anchors go with UfMStarConfig(anchored=True)")
@@ -345,7 +350,8 @@ class UncertainDepth(NetworksInTurn):
                 raise ValueError("anchors come from the source that UncertainDepth was made with: give none")
             anchors = self.landmarks.update(image, pose, intrinsics)
         try:
-            yield anchors if anchors is None or self.preprocess is None else anchors.moved(intrinsics, K)
+            moved = anchors is not None and self.preprocess is not None
+            yield require_anchors(anchors).moved(intrinsics, K) if moved else anchors
         except BaseException:
             if self.landmarks is not None:
                 self.landmarks.undo()

@@ -69,7 +69,7 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
 
 def _pairs_at_a_time(device: torch.device, size: int) -> int:
     """How many pairs of a point and a component may be held at a time, in numbers of ``size`` bytes."""
-    if device.type != "cuda":
+    if device.type != "cuda" or not torch.cuda.is_initialized():  # fake tensors need no device
         return _CHUNK
     free = torch.cuda.mem_get_info(device)[0]
     free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)  # kept by torch, but not in use

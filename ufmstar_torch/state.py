@@ -11,6 +11,7 @@ from ufmstar_torch.anchors.hook import EVIDENCE_SUMS
 from ufmstar_torch.camera import rotation_deviation
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.posterior.running import SIZE as POSTERIOR_SIZE
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class UfMStarState:
             value; of size 0 x 0 before the first average.
         evidence: [B, K, 3] sums over anchors, row k of slot k; K = 0 without ``config.anchored``.
         overall_evidence: [B, 3] sums over anchors of the stream.
+        posterior: [B, S] float64 what the posterior has learnt (``posterior.running``); S = 0 without
+            ``config.posterior``.
     """
 
     mean: Tensor
@@ -43,6 +46,7 @@ class UfMStarState:
     smoothed: Tensor
     evidence: Tensor
     overall_evidence: Tensor
+    posterior: Tensor
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -58,6 +62,7 @@ class UfMStarState:
         mixture = GaussianMixture.empty(streams, capacity, features=config.features, dtype=dtype, device=device)
         counter = torch.zeros(streams, dtype=torch.int64, device=device)
         rows = capacity if config.anchored else 0
+        learnt = POSTERIOR_SIZE if config.posterior else 0
         return cls(
             **mixture.tensors(),
             T_world_first=torch.eye(4, dtype=torch.float64, device=device).repeat(streams, 1, 1),
@@ -67,6 +72,7 @@ class UfMStarState:
             smoothed=torch.zeros(streams, 0, 0, dtype=dtype, device=device),
             evidence=torch.zeros(streams, rows, EVIDENCE_SUMS, dtype=dtype, device=device),
             overall_evidence=torch.zeros(streams, EVIDENCE_SUMS, dtype=dtype, device=device),
+            posterior=torch.zeros(streams, learnt, dtype=torch.float64, device=device),
         )
 
     @property
@@ -90,7 +96,7 @@ class UfMStarState:
             "mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k),
             "features": (b, k, config.features), "T_world_first": (b, 4, 4), "started": (b,), "frames": (b,),
             "skipped": (b,), "smoothed": (b, *image), "evidence": (b, rows, EVIDENCE_SUMS),
-            "overall_evidence": (b, EVIDENCE_SUMS),
+            "overall_evidence": (b, EVIDENCE_SUMS), "posterior": (b, POSTERIOR_SIZE if config.posterior else 0),
         }  # fmt: skip
         for name, shape in shapes.items():
             if (given := tuple(getattr(self, name).shape)) != shape:

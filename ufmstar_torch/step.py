@@ -275,6 +275,7 @@ def step(
         smoothed=smoothed,
         evidence=evidence.component,
         overall_evidence=evidence.overall,
+        posterior=state.posterior,
     )
     stage("average")
     return updated, StepOutput(disagreement, result.features, residual, measured, labels, current_cam, statistics)

@@ -17,12 +17,13 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import LateStep, select_check, select_merge, select_step
+from ufmstar_torch.kernels.select import LateStep, select_check, select_merge, select_posterior, select_step
 from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
+from ufmstar_torch.posterior.update import Posterior, update
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.spill import Spill
@@ -62,6 +63,7 @@ class UfMStar(StatefulModule):
     """
 
     STATE = UfMStarState.names()
+    ALWAYS_FLOAT64 = ("T_world_first", "posterior")
     CONFIG = UfMStarConfig
     config: UfMStarConfig
     observer: StepObserver | None = None
@@ -133,7 +135,7 @@ class UfMStar(StatefulModule):
                 anchors without ``config.anchored``.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        out, variance, anchored = self._observe(frame, anchors)
+        out, variance, anchored, posterior = self._observe(frame, anchors)
         shape = depth.shape
         return UfMStarOutput(
             depth=depth,
@@ -143,6 +145,8 @@ class UfMStar(StatefulModule):
             epistemic=epistemic,
             anchored=None if anchored is None else anchored.reshape(shape),
             bias=None if out.residual is None else out.residual[..., 0].reshape(shape),
+            posterior_depth=None if posterior is None else posterior.depth.reshape(shape),
+            posterior_variance=None if posterior is None else posterior.variance.reshape(shape),
             features=out.features,
             measured=out.measured.reshape(shape),
             valid=frame.valid.reshape(shape),
@@ -169,6 +173,7 @@ class UfMStar(StatefulModule):
     ) -> MeanUncertainty:
         """Like :meth:`forward`, but regress only a seeded sample of pixels: an average per image for
         active learning (section "Compute- and memory efficiency"); only the regression gets cheaper with fewer pixels.
+        The posterior needs whole maps: here it learns nothing.
 
         Without ``average`` it estimates the mean of this frame's V alone; the map of :meth:`forward` is averaged over
         frames, and its mean differs (by 13 % in the median on recorded video).
@@ -180,19 +185,27 @@ class UfMStar(StatefulModule):
                 and frames with one seed, take the same pixels.
             average: apply the exponential moving average at the sampled pixels.
 
+        The first views of a place have nothing to be compared with: their mean is low for want of evidence
+        (``MeanUncertainty.measured`` near 0). With ``config.unmeasured="nan"`` only measured pixels are averaged, and
+        an image without any gets NaN.
+
         Raises:
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
-        out, variance, _ = self._observe(frame, anchors, index, average=average)
+        out, variance, _, _ = self._observe(frame, anchors, index, average=average)
+        sampled = used.sum(1)
+        measured = ((out.measured >= unmeasured.HALF) & used).sum(1) / sampled
+        used = used & ~variance.isnan()  # not measured, with config.unmeasured = "nan"
         count = used.sum(1)
         value = torch.where(used, variance, torch.zeros_like(variance))
         mean = total(value, 1) / count  # 0/0 = NaN where no pixel is valid
         squares = total(torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)), 1)
-        left = 1 - count / out.statistics.valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
+        # Without replacement: all pixels, no error.
+        left = 1 - sampled / out.statistics.valid_pixels.clamp_min(1)
         error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
-        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, out.statistics)
+        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, measured, out.statistics)
 
     def warm_up(self, size: tuple[int, int], *, streams: int = 1, anchored: bool | None = None) -> None:
         """Compile, or load from disk, all that the first frames of this size would otherwise wait for.
@@ -310,7 +323,8 @@ class UfMStar(StatefulModule):
             new = UfMStarState.initial(b if keep_evidence else 0, self.config, old.mean.dtype, old.mean.device)
         else:
             new = old.restarted(self._chosen(streams, b))
-        self._store(new.tensors() | ({"overall_evidence": old.overall_evidence} if keep_evidence else {}))
+        kept = {"overall_evidence": old.overall_evidence, "posterior": old.posterior} if keep_evidence else {}
+        self._store(new.tensors() | kept)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
         UfMStarState(**state).require(self.config)
@@ -339,7 +353,7 @@ class UfMStar(StatefulModule):
 
     def _observe(
         self, frame: FrameInput, anchors: Anchors | None, pixels: Tensor | None = None, *, average: bool = True
-    ) -> tuple[StepOutput, Tensor, Tensor | None]:
+    ) -> tuple[StepOutput, Tensor, Tensor | None, Posterior | None]:
         """Take in a frame: run the step and keep its state.
 
         Args:
@@ -349,14 +363,18 @@ class UfMStar(StatefulModule):
             average: apply the moving average.
 
         Returns:
-            The step's output, V and B (None unless ``config.anchored``) [m^2], at every pixel [B, H, W] or [B, n].
+            The step's output; V and B (None unless ``config.anchored``) [m^2], at every pixel [B, H, W] or [B, n]; the
+            posterior (None unless ``config.posterior``, and at some pixels).
         """
         checked_anchors = self._anchors(anchors, frame)
         # Normal tensors also under the caller's inference_mode: the state must outlive it.
         with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
             if self.config.on_bad_frame == "raise":
-                raise_faults((frame.fault if frame.known_fault is None else frame.known_fault).tolist())
+                known = frame.fault if frame.known_fault is None else frame.known_fault
+                if known.device.type == "meta":
+                    raise ValueError("depth lies on device meta, without values: set on_bad_frame='skip'")
+                raise_faults(known.tolist())
             if self.observer is not None:
                 self.observer.stage("check")
             step, config = self._step(frame.depth.device.type), self.config
@@ -368,6 +386,7 @@ class UfMStar(StatefulModule):
             )  # fmt: skip
             if (self.config.merge or self._spill is not None) and isinstance(step, LateStep):
                 state = step.settled(state, config)
+            state, out, posterior = self._with_posterior(state, out, frame, checked_anchors, dense=pixels is None)
             if self.config.merge:
                 kernels = select_merge(self.config.backend, frame.depth.device.type)
                 state = merged(state, frame.fault == 0, self.config, kernels)
@@ -391,7 +410,25 @@ class UfMStar(StatefulModule):
             variance = variance.clamp_min(self.config.variance_floor)
         if self.recalibration is not None:
             variance = self.recalibration(variance)
-        return out, variance, anchored
+        return out, variance, anchored, posterior
+
+    def _with_posterior(
+        self, state: UfMStarState, out: StepOutput, frame: FrameInput, anchors: AnchorInput | None, *, dense: bool
+    ) -> tuple[UfMStarState, StepOutput, Posterior | None]:
+        """State and output with what the posterior learns and returns; as they are without ``config.posterior``."""
+        if not (self.config.posterior and dense):
+            return state, out, None
+        claimed = out.disagreement
+        for own in self._own(frame):
+            claimed = claimed + own.detach()
+        claimed = claimed.clamp_min(self.config.variance_floor)
+        if self.recalibration is not None:
+            claimed = self.recalibration(claimed)
+        kernels = select_posterior(self.config.backend, frame.depth.device.type)
+        learnt, posterior = update(state.posterior, frame, anchors, claimed, kernels)
+        posterior = replace(posterior, variance=posterior.variance.clamp_min(self.config.variance_floor))
+        statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
+        return replace(state, posterior=learnt), replace(out, statistics=statistics), posterior
 
     def _warn_without_segments(self, frame: FrameInput, out: StepOutput) -> None:
         """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
@@ -441,9 +478,13 @@ class UfMStar(StatefulModule):
         self._settle()
         super()._save_to_state_dict(destination, prefix, keep_vars)
 
-    def _load_from_state_dict(self, *given: Any) -> None:
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *given: Any) -> None:
+        """A state that was saved before there was a posterior has learnt nothing for it."""
         self._settle()
-        super()._load_from_state_dict(*given)
+        weight = state_dict.get(prefix + "weight")
+        if isinstance(weight, Tensor) and weight.dim() == 2:
+            state_dict.setdefault(prefix + "posterior", self.posterior.new_zeros(len(weight), self.posterior.shape[1]))
+        super()._load_from_state_dict(state_dict, prefix, *given)
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy starts with a step of its own."""

@@ -58,6 +58,7 @@ class Plan:
         seconds: a window of energy lasts at least so long [s].
         windows: of energy per part.
         idle: for so long nothing is done, for the idle power [s].
+        sequences: of an evaluation that are measured, the first ones; None = all.
 
     Raises:
         ValueError: a number out of range.
@@ -69,6 +70,7 @@ class Plan:
     seconds: float = 3.0
     windows: int = 3
     idle: float = 10.0
+    sequences: int | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("frames", 1), ("warm_up", 0), ("windows", 1)):
@@ -77,6 +79,8 @@ class Plan:
                 raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
         if self.threads is not None and (not isinstance(self.threads, int) or self.threads < 1):
             raise ValueError(f"threads must be None or at least 1, got {self.threads!r}")
+        if self.sequences is not None and (not isinstance(self.sequences, int) or self.sequences < 1):
+            raise ValueError(f"sequences must be None or at least 1, got {self.sequences!r}")
         if not (self.seconds > 0 and self.idle > 0):
             raise ValueError(f"seconds and idle must be positive, got {self.seconds} and {self.idle}")
 
@@ -142,33 +146,77 @@ def measure(
 
 
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
-    """Measure the rows on the first sequence that can be opened, and write OUT/efficiency.json.
+    """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json.
 
     UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device.
 
     Args:
         job: an evaluation whose sequences are done.
-        plan: how much is measured; None = the defaults, with fewer frames where the sequence has no more.
+        plan: how much is measured; None = the defaults, with fewer frames where a sequence has no more. Windows of
+            energy are divided among the sequences, at least one for each.
 
     Raises:
-        ValueError: no sequence can be opened, it has no frames enough, or no row can be measured.
+        ValueError: no sequence can be opened, none has frames enough, or no row can be measured.
         OSError: the file cannot be written.
     """
     plan = plan or Plan()
     device = device_of(job.device, 0)
+    rows, items = job.suite.rows, job.items[: plan.sequences]
+    plan = replace(plan, windows=-(-plan.windows // max(1, len(items))))
+    networks = timed_networks(job.load(torch.device(device)), rows)
+    measured: dict[tuple[str, str], dict[str, Any]] = {}
     failed = []
-    for item in job.items:
+    for item in items:
         try:
             sequence = item.open()
-            break
+            frames = max(1, min(plan.frames, len(sequence) - plan.warm_up))
+            result = measure(rows, networks, sequence, device=device, plan=replace(plan, frames=frames))
+            measured[item.dataset, item.sequence] = result
         except (OSError, ValueError) as error:
             failed.append(f"{item.label}: {error}")
-    else:
-        raise ValueError(f"no sequence can be opened: {'; '.join(failed[:3])}")
-    frames = max(1, min(plan.frames, len(sequence) - plan.warm_up))
-    networks = timed_networks(job.load(torch.device(device)))
-    result = measure(job.suite.rows, networks, sequence, device=device, plan=replace(plan, frames=frames))
-    write_json_atomic(job.out / EFFICIENCY, result)
+    if not measured:
+        raise ValueError(f"no sequence can be measured: {'; '.join(failed[:3])}")
+    write_json_atomic(job.out / EFFICIENCY, over_sequences(measured))
+
+
+def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:
+    """What :func:`measure` returned for every (data set, sequence) as one: every number is the mean over the sequences,
+    and "sequences" has what uncertainty costs on each of them, for intervals.
+
+    Of each sequence and row: "energy_mj", gross, of uncertainty in the network and of the multiview step [mJ]; None
+    where a part was not measured.
+    """
+    runs = list(measured.values())
+    single = [
+        {
+            "dataset": dataset,
+            "sequence": sequence,
+            "energy_mj": {row["row"]: _uncertainty_mj(row["energy"]) for row in run["rows"]},
+        }
+        for (dataset, sequence), run in measured.items()
+    ]
+    mean: dict[str, Any] = _mean(runs)
+    if len(runs) > 1:
+        mean["sequence"] |= {"name": f"{len(runs)} sequences"}
+    return mean | {"sequences": single}
+
+
+def _uncertainty_mj(energy: Mapping[str, Mapping[str, Any]]) -> float | None:
+    parts = [part for name, part in energy.items() if name != DEPTH and "none" not in part]
+    if not all("gross" in part for part in parts):
+        return None
+    return sum(max(0.0, part["gross"]["millijoules"]) for part in parts)
+
+
+def _mean(values: Sequence[Any]) -> Any:
+    """The mean of equal structures of plain values; where they differ, or are no numbers, the first."""
+    first = values[0]
+    if isinstance(first, Mapping) and all(isinstance(v, Mapping) and v.keys() == first.keys() for v in values):
+        return {name: _mean([value[name] for value in values]) for name in first}
+    if isinstance(first, list) and all(isinstance(v, list) and len(v) == len(first) for v in values):
+        return [_mean(parts) for parts in zip(*values, strict=True)]
+    numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+    return sum(values) / len(values) if numbers and any(v != first for v in values) else first
 
 
 def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:

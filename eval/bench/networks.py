@@ -9,8 +9,11 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.bench.memory import NetworkMemory, weight_bytes
+from ufmstar_torch.eval.engine.networks import prepared_as
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import OF_NETWORK
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
@@ -90,9 +93,18 @@ class TimedNetwork:
         return NetworkMemory.of([self.depth] if self.base == "depth_only" else self.members, self.depth)
 
 
-def timed_networks(sources: Mapping[str, DepthSource]) -> dict[str, TimedNetwork]:
-    """The networks of an evaluation by base, without ground truth, for which no network runs."""
-    return {b: TimedNetwork(b, one.networks, one.label, one.passes) for b, one in sources.items() if one.networks}
+def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ()) -> dict[str, TimedNetwork]:
+    """The networks of an evaluation by base, without ground truth, for which no network runs.
+
+    Args:
+        sources: by base.
+        rows: that are measured; images are prepared as the first row of a base has it.
+    """
+    how = {row.method.base: row.setting.preprocess for row in reversed(rows)}
+    timed = {b: TimedNetwork(b, one.networks, one.label, one.passes) for b, one in sources.items() if one.networks}
+    for base, network in timed.items():
+        network.preprocess = prepared_as(network.preprocess, how.get(base, OF_NETWORK))
+    return timed
 
 
 def depth_alone(network: DepthNetwork) -> DepthNetwork:

@@ -256,6 +256,8 @@ def _evaluate(options: EvalOptions) -> int:
 
     with Bars() as bars, stop_signals(bars.say) as stop:
         job, launch = job_from(options), launch_from(options)
+        for base in job.unused:
+            bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
         outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
     if outcome.reports:
         return _report(outcome, options.threads, draws=not options.output.no_report)
@@ -276,7 +278,8 @@ def _report(outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
     for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
     if outcome.stopped:
-        print("ufmstar eval: stopped; --resume goes on", file=sys.stderr)
+        kept = outcome.job.out / "records"
+        print(f"ufmstar eval: stopped; finished rows are kept in {kept}; --resume goes on", file=sys.stderr)
         return 130
     if outcome.failed or not outcome.finished:
         print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
@@ -292,5 +295,7 @@ def _dry_run(options: EvalOptions) -> int:
     from ufmstar_torch.eval.results.worklist import Shard
 
     job = job_from(options)
+    for base in job.unused:
+        print(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
     print(dry_run(job, job.load(torch.device("cpu")), Shard.parse(options.shard or "1/1")))
     return 0

@@ -76,12 +76,15 @@ class UfMOptions:
         anchors: depths that show the error on which all views agree (docs/anchors.md). Without a word, or with corners:
             corners tracked in the images; dense: a depth in every cell of the image, searched in earlier images; FILE:
             landmarks, a line x y z sigma [m] each, in the world of the poses
+        posterior: also a depth that anchors correct, with its variance (docs/results/posterior.md); --anchors chooses
+            the anchors, default: dense
         recalibration: file of `ufmstar recalibrate`, or none; default: WEIGHTS.recalibration.json beside the weights
     """
 
     preset: str | None = option(None, choices=PRESETS)
     ufm_preset: str | None = option(None, choices=("paper", "default"))
     anchors: bool | str = option(False, const=True)
+    posterior: bool = False
     recalibration: str | None = None
     ufm: dict[str, Any] = fields_of(UfMStarConfig, "ufm.", defaults={"on_bad_frame": "skip"})
 
@@ -124,7 +127,7 @@ class RunOptions:
     uncertainty: UfMOptions
 
     def __post_init__(self) -> None:
-        UfMStarConfig.from_dict(self.uncertainty.ufm)
+        UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": True})
         parse_slice(self.frames)
         parse_size(self.maps.size)
         for words, name in (
@@ -134,15 +137,18 @@ class RunOptions:
         ):
             parse_intrinsics(words, name)
         _check_depth(as_dict(self.network) | as_dict(self.maps))
-        if self.uncertainty.ufm["anchored"] and not self.uncertainty.anchors:
-            raise ValueError("--ufm.anchored needs anchors: give --anchors instead")
+        for name, flag in (("anchored", "anchors"), ("posterior", "posterior")):
+            if self.uncertainty.ufm[name] and not getattr(self.uncertainty, flag):
+                raise ValueError(f"--ufm.{name} needs anchors: give --{flag} instead")
         if self.resume and self.overwrite:
             raise ValueError("--resume and --overwrite contradict each other")
 
     @property
     def config(self) -> UfMStarConfig:
         """The configuration of UfM*."""
-        return UfMStarConfig.from_dict(self.uncertainty.ufm | {"anchored": bool(self.uncertainty.anchors)})
+        chosen = self.uncertainty
+        tracked = {"anchored": bool(chosen.anchors) or chosen.posterior, "posterior": chosen.posterior}
+        return UfMStarConfig.from_dict(chosen.ufm | tracked)
 
     def settings(self) -> dict[str, Any]:
         """What is run, as plain values that a configuration file may hold: not how it is started."""

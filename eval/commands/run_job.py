@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.anchors.landmarks import LandmarkSource
+from ufmstar_torch.anchors.landmarks import DENSE, LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.commands.run import RunJob
 from ufmstar_torch.eval.commands.run_command import OWN_DEPTH, RunOptions
@@ -37,7 +37,7 @@ def job_from(chosen: RunOptions) -> RunJob:
     options, config = chosen.settings(), chosen.config
     device = require_device(options["device"])
     sequence = _sequence(chosen)
-    landmarks = _landmarks(chosen.uncertainty.anchors, sequence) if config.anchored else LandmarkTracker
+    landmarks = _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchored else LandmarkTracker
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")

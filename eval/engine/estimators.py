@@ -33,6 +33,8 @@ class Estimate:
         disagreement: M of UfM* [m^2], or None.
         anchored: B of UfM* with anchors [m^2], or None.
         bias: r of UfM* with anchors, or None.
+        posterior_depth: of UfM* with anchors and a posterior [m], or None.
+        posterior_variance: likewise [m^2].
         statistics: of UfM*, [1] per count, or None.
     """
 
@@ -44,6 +46,8 @@ class Estimate:
     disagreement: Tensor | None = None
     anchored: Tensor | None = None
     bias: Tensor | None = None
+    posterior_depth: Tensor | None = None
+    posterior_variance: Tensor | None = None
     statistics: FrameStatistics | None = None
 
 
@@ -109,6 +113,7 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         device,
         uses_variances=method.uses_aleatoric,
         corrected=row.setting.corrected,
+        posterior=row.setting.posterior,
         recalibration=recalibration,
         aleatoric_in_h=row.setting.aleatoric_in_h,
     )
@@ -209,6 +214,7 @@ class Gaussians:
         device: of the mixture.
         uses_variances: False leaves A and E aside.
         corrected: answer with the depth corrected by the anchors' bias, and the variance that remains.
+        posterior: answer with the posterior's depth and variance.
         recalibration: of the variance; None = as it is.
         aleatoric_in_h: the config has two features: the aleatoric variance, kept in the mixture, and 1. What is read
             back is added instead of the pixel's own, A'(x) = sum_k w_k(x) a_k + (1 - sum_k w_k(x)) A: the pixel's own
@@ -222,11 +228,13 @@ class Gaussians:
         *,
         uses_variances: bool = True,
         corrected: bool = False,
+        posterior: bool = False,
         recalibration: Recalibration | None = None,
         aleatoric_in_h: bool = False,
     ) -> None:
         self.ufm = UfMStar(config, recalibration=recalibration, device=device)
         self._uses_variances, self._corrected, self._in_h = uses_variances, corrected, aleatoric_in_h
+        self._posterior = posterior
         self._anchors = 0
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
@@ -245,6 +253,8 @@ class Gaussians:
         out = self.ufm(prediction.depth[None], T_world_cam[None], K, _one(a), _one(e), **optional)
         self._anchors = int(out.statistics.anchors_used[0])
         depth, variance = out.corrected() if self._corrected else (prediction.depth[None], out.variance)
+        if self._posterior:
+            depth, variance = out.posterior()
         if self._in_h and a is not None:
             kept, explained = out.features.unbind(-1)
             a = (kept + (1 - explained) * a)[0]
@@ -258,6 +268,8 @@ class Gaussians:
             disagreement=out.disagreement[0],
             anchored=None if out.anchored is None else out.anchored[0],
             bias=None if out.bias is None else out.bias[0],
+            posterior_depth=None if out.posterior_depth is None else out.posterior_depth[0],
+            posterior_variance=None if out.posterior_variance is None else out.posterior_variance[0],
             statistics=out.statistics,
         )
 

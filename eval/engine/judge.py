@@ -14,8 +14,8 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, RowFrame
 if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence without ground truth need not wait for
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 
-# Of a run: UfM*, and the network alone beside it.
-UFM, ALONE = "ufm", "network_alone"
+# Of a run: UfM*, beside it the network alone, and the posterior where there is one.
+UFM, ALONE, POSTERIOR = "ufm", "network_alone", "posterior"
 # Of a row's sums.
 METRICS, BY_ERROR = "metrics", "nll_by_error"
 Key = TypeVar("Key", bound=Hashable)
@@ -62,9 +62,9 @@ class Figures(Generic[Key]):
 
 
 class RunMetrics(FrameSink):
-    """The figures of a run's row, ``UFM``, and beside them those of its network alone, ``ALONE``.
+    """The figures of a run's row, ``UFM``, beside them those of its network alone, ``ALONE``, and of its ``POSTERIOR``.
 
-    Both are of the pixels that the row uses; the others are masked.
+    All are of the pixels that the row uses; the others are masked.
 
     Args:
         key: of the row.
@@ -88,6 +88,9 @@ class RunMetrics(FrameSink):
         own = row.prediction.variance
         if own is not None:
             self.figures.of(ALONE).update(estimate.depth, own.cpu(), target, estimate.valid)
+        if estimate.posterior_depth is not None:
+            depth, variance = estimate.posterior_depth, estimate.posterior_variance
+            self.figures.of(POSTERIOR).update(depth, variance, target, estimate.valid)
 
 
 class RowMetrics(FrameSink):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import Prediction
-from ufmstar_torch.eval.methods.setting import OF_NETWORK, RESIZE
+from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
@@ -96,7 +96,7 @@ class NetworkSource:
             return self
         if not isinstance(own, Preprocess):
             raise ValueError(f'preprocess = "{how}" needs networks that declare their input by a Preprocess')
-        changed = own.of_whole_frame() if how == RESIZE else own.of_nyu_crop()
+        changed = prepared_as(own, how)
         if changed == own:
             return self
         other = copy.copy(self)
@@ -143,6 +143,11 @@ class NetworkSource:
                 self._generator.manual_seed(frame.index)
             self._input = (frame, x, K)
         return self._input[1], self._input[2]
+
+
+def prepared_as(own: Preprocess, how: str) -> Preprocess:
+    """The preprocessing of a network under ``Setting.preprocess``."""
+    return {OF_NETWORK: own, RESIZE: own.of_whole_frame(), CROP: own.of_nyu_crop()}[how]
 
 
 def stochastic(networks: Iterable[nn.Module]) -> list[MonteCarloDropout]:

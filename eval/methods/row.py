@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,12 @@ class Row:
     Attributes:
         method: which network, how often it is run, and what judges its views.
         setting: what an ablation changes about it.
+        title: what tables and figures call it; "" = by method and setting. It makes no other row of it.
     """
 
     method: Method
     setting: Setting = DEFAULT
+    title: str = field(default="", compare=False)
 
     @property
     def slug(self) -> str:
@@ -32,9 +34,11 @@ class Row:
 
     @property
     def name(self) -> str:
-        """The method's name, with what anchors it if that are tracked corners: "UfM*-Anchored-Ensemble"."""
-        anchored = self.setting.anchors == TRACKED
-        return self.method.name.replace("UfM*-", "UfM*-Anchored-", 1) if anchored else self.method.name
+        """The method's name, and what tracked corners serve: "UfM*-Anchored-Ensemble", "UfM*-Posterior-Ensemble"."""
+        if self.setting.anchors != TRACKED:
+            return self.method.name
+        kind = "Posterior" if self.setting.posterior else "Anchored"
+        return self.method.name.replace("UfM*-", f"UfM*-{kind}-", 1)
 
     @property
     def changed(self) -> dict[str, Any]:
@@ -42,7 +46,8 @@ class Row:
         values = self.setting.to_dict()
         if self.setting.recalibration:  # without the folder
             values["recalibration"] = Path(split_name(self.setting.recalibration)[0]).name
-        return {name: value for name, value in values.items() if (name, value) != ("anchors", TRACKED)}
+        named = {"anchors", "posterior"} if self.setting.anchors == TRACKED else set()
+        return {name: value for name, value in values.items() if name not in named}
 
     @property
     def label(self) -> str:
@@ -57,7 +62,8 @@ class Row:
 
     def to_dict(self) -> dict[str, Any]:
         """The row as plain values, as eval.json has it."""
-        return {"method": self.method.name, "setting": self.setting.to_dict()}
+        named = {"label": self.title} if self.title else {}
+        return {"method": self.method.name, "setting": self.setting.to_dict(), **named}
 
 
 def plain_rows(rows: Iterable[Row]) -> list[Row]:

@@ -49,6 +49,7 @@ class Setting(Checked):
         anchor_count: anchors of a frame at most, drawn at random; None = all that are tracked, 100 of ground truth.
         track_noise: standard deviation of noise on tracked positions [px of the image]; see ``engine.anchors``.
         corrected: judge the depth corrected by the anchors' bias, and the variance that remains.
+        posterior: judge the posterior's depth and variance (``UfMStarConfig.posterior`` follows).
         recalibration: FILE or FILE@DIGEST of a map of the variance (``ufmstar recalibrate``); "" = none.
 
     Raises:
@@ -69,6 +70,7 @@ class Setting(Checked):
     anchor_count: int | None = number(None, "", "1", 0)
     track_noise: float = number(0.0, "", "px", 0.0, open_high=True)
     corrected: bool = False
+    posterior: bool = False
     recalibration: str = ""
 
     def __post_init__(self) -> None:
@@ -79,8 +81,10 @@ class Setting(Checked):
         count = self.anchor_count
         if count is not None and not isinstance(count, int):
             raise ValueError(f"Setting.anchor_count must be a whole number, got {count!r}")
-        if not self.anchors and (count is not None or self.corrected):
-            raise ValueError("anchor_count and corrected go with anchors")
+        if not self.anchors and (count is not None or self.corrected or self.posterior):
+            raise ValueError("anchor_count, corrected and posterior go with anchors")
+        if self.corrected and self.posterior:
+            raise ValueError("corrected and posterior contradict each other")
         if self.track_noise and self.anchors != TRACKED:
             raise ValueError('track_noise goes with anchors = "tracked"')
         if "anchored" in self.overrides:
@@ -203,7 +207,7 @@ def configured(setting: Setting) -> UfMStarConfig:
         default_of(name)
         group, _, field = name.rpartition(".")
         (nested.setdefault(group, {}) if group else nested)[field] = value
-    config = _start(setting.ufm_preset).replace(anchored=bool(setting.anchors))
+    config = _start(setting.ufm_preset).replace(anchored=bool(setting.anchors), posterior=setting.posterior)
     if setting.aleatoric_in_h:
         config = config.replace(features=2, add_aleatoric=False)
     groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}

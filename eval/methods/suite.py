@@ -52,6 +52,7 @@ _KEYS: dict[str, type] = {
 }
 _KEYS |= {"datasets": list, "sequences": int, "network": str, "size": list, "efficiency": bool}
 _ROW_KEYS: dict[str, type] = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict}
+_ROW_KEYS |= {"label": str}
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,10 @@ class Suite:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Suite:
         """The suite of :meth:`to_dict`, also after a way through JSON."""
-        rows = [Row(Method.parse(row["method"]), setting_from(row["setting"])) for row in values["rows"]]
+        rows = [
+            Row(Method.parse(row["method"]), setting_from(row["setting"]), row.get("label", ""))
+            for row in values["rows"]
+        ]
         plain = {name: _plain(value) for name, value in values.items()}
         return cls(**{**plain, "rows": tuple(rows)})
 
@@ -258,11 +262,14 @@ def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
             ranges[name] = points if kind == "each" else [factor * default_of(name, start) for factor in points]
     if base is not None and base not in _words(part, "bases", (base,)):
         return
+    label = part.get("label", "")
+    if label and (ranges or (len(methods) > 1 and "{method}" not in label)):
+        raise ValueError(f"label {label!r} names one row: of several methods, write {{method}} in it; not with each")
     for point in itertools.product(*ranges.values()):
         setting = {**part.get("setting", {}), **dict(zip(ranges, point, strict=True))}
         for method in map(Method.parse, methods):
             started = {"ufm_preset": preset} if preset is not None and method.fusion == UFM_STAR else {}
-            yield Row(method, setting_from(setting | started))
+            yield Row(method, setting_from(setting | started), label.replace("{method}", method.name))
 
 
 def _check(values: Any, kinds: Mapping[str, type], where: str) -> None:

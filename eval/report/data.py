@@ -178,7 +178,10 @@ def setting_of(values: Mapping[str, Any]) -> Setting:
 
 def listed_rows(about: Mapping[str, Any]) -> list[Row]:
     """The suite's rows, as ``eval.json`` lists them."""
-    rows = (Row(Method.parse(r["method"]), setting_of(r.get("setting", {}))) for r in about.get("rows", []))
+    rows = (
+        Row(Method.parse(r["method"]), setting_of(r.get("setting", {})), str(r.get("label", "")))
+        for r in about.get("rows", [])
+    )
     return list(dict.fromkeys(rows))
 
 

@@ -63,6 +63,10 @@ UNCERTAINTY_MS = Quantity("ms.uncertainty", "uncertainty", "Uncertainty", 1, Non
 NETWORK_MS = Quantity("ms.network", "network", "Network", 1, None, "ms")
 TOTAL_MS = Quantity("ms.total", "time per frame", "Time per frame", 1, None, "ms")
 
+# What uncertainty costs, where it was measured.
+ENERGY = Quantity("energy_mj", "energy", "Energy", None, LOWER, "mJ")
+MEMORY = Quantity("memory_mb", "memory", "Memory", None, LOWER, "MB")
+
 # The paper's columns, and those that the field expects beside them.
 MAIN = (DELTA1, NLL, ECE_DELTA, ECE_Q, STATE)
 EXTRA = (
@@ -100,6 +104,7 @@ SETTINGS = {
     "anchor_shrinkage": ("shrinkage κ", "anchors"),
     "track_noise": ("track noise", "px"),
     "corrected": ("depth corrected", ""),
+    "posterior": ("posterior", ""),
     "overlap_weighted": ("fusion weighted by overlap", ""),
     "disagreement": ("disagreement", ""),
     "regression": ("regression", ""),
@@ -152,8 +157,8 @@ def setting_label(values: Mapping[str, Any]) -> str:
 
 
 def row_label(row: Row) -> str:
-    """A row for people: "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
-    return ", ".join(filter(None, (row.name, setting_label(row.changed))))
+    """A row for people: its own title, or "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
+    return row.title or ", ".join(filter(None, (row.name, setting_label(row.changed))))
 
 
 def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
@@ -166,7 +171,7 @@ def row_labels(rows: Iterable[Row]) -> dict[Row, str]:
     for row in listed:
         ours = "our defaults" if row.method in papers and row.setting.ufm_preset != PAPER else ""
         changed = {name: value for name, value in row.changed.items() if not (shared and name == "preprocess")}
-        labels[row] = ", ".join(filter(None, (row.name, ours, setting_label(changed))))
+        labels[row] = row.title or ", ".join(filter(None, (row.name, ours, setting_label(changed))))
     return labels
 
 

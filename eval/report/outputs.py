@@ -38,7 +38,7 @@ SHEET, CURVES, PLY, ELLIPSOIDS, NPZ = (
     "mixture.npz",
 )
 DEMO_FILES = (SHEET, CURVES, PLY, ELLIPSOIDS, NPZ, "curves.json")
-SHEET_ROWS, SCALE_FRAMES = 6, 12
+SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12
 # Without timestamps; and the range in which a recording's own rate is kept.
 DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
 
@@ -72,8 +72,14 @@ class Finished:
         if "anchored" in stored:
             maps["anchored"] = np.sqrt(stored["anchored"])
             note += f", {record['anchors']['used']} anchors"
+        if "posterior_depth" in stored:
+            maps["posterior"] = stored["posterior_depth"]
+            maps["posterior_sigma"] = np.sqrt(stored["posterior_variance"])
+            del maps["anchored"]
         if truth is not None:
-            maps["error"] = np.where(truth > 0, np.abs(stored["depth"] - truth), np.nan).astype(np.float32)
+            pairs = {"error": "depth", "posterior_error": "posterior"}
+            errors = {name: np.abs(maps[of] - truth) for name, of in pairs.items() if of in maps}
+            maps |= {name: np.where(truth > 0, error, np.nan).astype(np.float32) for name, error in errors.items()}
         shown = {name: resample_nearest(value, K, K_square, size_square) for name, value in maps.items()}
         image = None if frame is None or frame.image is None else field_of_view(frame.image, frame.intrinsics, K, size)
         if image is None:
@@ -105,6 +111,8 @@ def draw_sheet(finished: Finished, scales: PanelScales, title: str, rows: int = 
 
     The first is not, unless it is the only one: it was compared with nothing, so its disagreement is 0.
     """
+    if "posterior" in finished.records[-1]:
+        rows = min(rows, POSTERIOR_ROWS)  # wide: before and after
     numbers = finished.spread(rows + 1)
     panels = [finished.panel(number) for number in numbers[1:] or numbers]
     contact_sheet(panels, finished.out / SHEET, title=title, scales=scales)

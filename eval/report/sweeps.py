@@ -21,7 +21,7 @@ Rest = tuple[tuple[str, Any], ...]
 # Rows that say no number of anchors have at most so many.
 _COUNTS = {"": 0, TRACKED: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
 # What a row without anchors cannot have, beside what begins with "anchor_".
-_OF_ANCHORS = ("anchors", "track_noise", "corrected")
+_OF_ANCHORS = ("anchors", "track_noise", "corrected", "posterior")
 _ANCHORED = {TRACKED: "anchored", TRUTH: "truth anchors"}
 
 

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.report.means import (
     references,
     value_of,
 )
-from ufmstar_torch.eval.report.names import DIFFERENCES, EXTRA, MAIN, Quantity, row_labels, shared_words
+from ufmstar_torch.eval.report.names import DIFFERENCES, ENERGY, EXTRA, MAIN, MEMORY, Quantity, row_labels, shared_words
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
 from ufmstar_torch.eval.report.table import (
     Cell,
@@ -132,9 +132,15 @@ def _means(
     on = {row: {(r.dataset, r.sequence) for r in listed} for row, listed in records.items()}
     alike = len({frozenset(where) for where in on.values()}) == 1
     cells = {row: _cells(listed, quantities) for row, listed in records.items()}
+    costs = {row: _costs(results.efficiency, row, listed) for row, listed in records.items()} if name == "main" else {}
+    if any(cell.value for pair in costs.values() for cell in pair):
+        quantities = (*quantities, ENERGY, MEMORY)
+        cells = {row: [*listed, *costs[row]] for row, listed in cells.items()}
     group = "Ours" if quoted else ""
     columns = _columns(quantities, group)
     notes = [_network_note(results), _prepared_note(records), _interval_note(records), _nll_note(records, quantities)]
+    if ENERGY in quantities:
+        notes.append(_cost_note(results.efficiency or {}))
     if not alike:
         columns = [Column(group, "sequences", "Sequences"), *columns]
         cells = {row: [Cell(str(len(on[row]))), *listed] for row, listed in cells.items()}
@@ -158,6 +164,35 @@ def _means(
 
 def _cells(records: Sequence[Record], quantities: Sequence[Quantity]) -> list[Cell]:
     return [Cell.of(mean_of(records, q), q.decimals) for q in quantities]
+
+
+def _costs(efficiency: Mapping[str, Any] | None, row: Row, records: Sequence[Record]) -> tuple[Cell, Cell]:
+    """Energy and memory of a row's uncertainty: energy over the sequences that were measured, memory over all of them;
+    dashes where nothing was measured."""
+    line = next((line for line in (efficiency or {}).get("rows", ()) if line["row"] == row.label), None)
+    if efficiency is None or line is None:
+        return Cell(), Cell()
+    where = {(record.dataset, record.sequence) for record in records}
+    of_row = (
+        one["energy_mj"].get(row.label)
+        for one in efficiency.get("sequences", ())
+        if (one["dataset"], one["sequence"]) in where
+    )
+    spent = mean_over([value for value in of_row if value is not None])
+    network = line["memory"].get("network_uncertainty_bytes")
+    if network is None:
+        return Cell.of(spent, ENERGY.decimals), Cell()
+    kept = [1e-6 * (network + (record.state.get("bytes_mean") or 0.0)) for record in records]
+    return Cell.of(spent, ENERGY.decimals), Cell.of(mean_over(kept), MEMORY.decimals)
+
+
+def _cost_note(efficiency: Mapping[str, Any]) -> str:
+    measured = len(efficiency.get("sequences", ()))
+    used = set(efficiency["devices"]["units"].values())
+    reasons = [why for unit, why in efficiency["power"]["missing"].items() if unit in used]
+    missing = "; ".join(dict.fromkeys(reasons))
+    words = f"; energy is not measurable here: {missing}" if missing else f", energy on {measured} of them"
+    return f"Energy and memory are what uncertainty adds to depth alone, memory on all sequences{words}."
 
 
 def _columns(quantities: Sequence[Quantity], group: str) -> list[Column]:

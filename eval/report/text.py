@@ -121,6 +121,8 @@ def run_table(summary: Mapping[str, Any]) -> str:
         rows = [(name, summary["metrics"], uncertainty["mean_sigma"])]
         if summary["network_alone"] is not None:
             rows.append(("network alone", summary["network_alone"], uncertainty["mean_network_sigma"]))
+        if "posterior" in summary:
+            rows.append(("posterior", summary["posterior"]["metrics"], summary["posterior"]["mean_sigma"]))
         head = ["", *_RUN_COLUMNS.values(), "sigma [m]"]
         body = [
             [name, *(number(figures.get(key)) for key in _RUN_COLUMNS), number(sigma)] for name, figures, sigma in rows

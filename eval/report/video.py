@@ -39,7 +39,8 @@ def preview_frame(
     from PIL import Image, ImageDraw
 
     error = panel.error is not None if with_error is None else with_error
-    columns = map_columns(scales, with_error=error, with_anchored=panel.anchored is not None)
+    others = {"with_anchored": panel.anchored is not None, "with_posterior": panel.posterior is not None}
+    columns = map_columns(scales, with_error=error, **others)
     height, width = panel.depth.shape
     if cell_height is None:
         cell_height = min(240, max(1, round(427 * height / width)))

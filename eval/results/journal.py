@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from time import perf_counter
 from typing import Any
@@ -46,7 +47,8 @@ class MapWriter(FrameSink):
         """
         if self._key in result.rows:
             estimate = result.rows[self._key].estimate
-            names = ("depth", "variance", "disagreement", "anchored", "bias", "valid")
+            anchored = ("anchored", "bias", "posterior_depth", "posterior_variance")
+            names = ("depth", "variance", "disagreement", *anchored, "valid")
             maps = {name: getattr(estimate, name) for name in names}
             self.written = self._writer.write(result.name, **maps)
 
@@ -181,7 +183,22 @@ def _anchor_figures(row: RowFrame) -> dict[str, Any]:
         "anchors": _corners(anchors, estimate),
         "mean_anchored": _mean(estimate.anchored, estimate.valid),
         "mean_bias": _mean(estimate.bias, estimate.valid),
+        **_posterior_figures(estimate),
     }
+
+
+def _posterior_figures(estimate: Estimate) -> dict[str, Any]:
+    """Of a run with a posterior: its mean sigma [m], and what held-out anchors say (``FrameStatistics``)."""
+    variance, statistics = estimate.posterior_variance, estimate.statistics
+    if variance is None or statistics is None or statistics.calibration is None or statistics.unseen is None:
+        return {}
+    calibration = float(statistics.calibration[0])
+    figures = {
+        "mean_sigma": _mean(variance.sqrt(), estimate.valid),
+        "calibration": calibration if math.isfinite(calibration) else None,
+        "unseen": float(statistics.unseen[0]),
+    }
+    return {"posterior": figures}
 
 
 def _corners(anchors: FrameAnchors, estimate: Estimate) -> dict[str, Any]:

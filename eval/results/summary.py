@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from statistics import mean, median
 from typing import Any
 
-from ufmstar_torch.eval.engine.judge import ALONE, UFM
+from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
 from ufmstar_torch.eval.results import machine
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
@@ -72,6 +72,7 @@ def summarise(
         "metrics_reason": None if UFM in figures else "no ground truth",
         "network_alone": figures.get(ALONE),
         "network_alone_reason": None if ALONE in figures else _why_not_alone(done, UFM in figures),
+        **_posterior(done, figures.get(POSTERIOR)),
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
         "mixture": _mixture(done, mixture),
@@ -81,6 +82,15 @@ def summarise(
         "settings": settings,
         "versions": versions(),
     }
+
+
+def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
+    """Of a run with a posterior: its metrics, and what held-out anchors said in the end; {} of another run."""
+    records = [record["posterior"] for record in done if "posterior" in record]
+    if not records:
+        return {}
+    sigma = mean(record["mean_sigma"] for record in records)
+    return {"posterior": {**records[-1], "mean_sigma": sigma, "metrics": figures}}
 
 
 def versions() -> dict[str, str | None]:

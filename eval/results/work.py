@@ -76,6 +76,11 @@ class EvalJob:
     runtime: str = "auto"
     precision: str = "float32"
 
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Bases with a network that no row of the suite has."""
+        return tuple(base for base in self.networks if base not in self.suite.bases)
+
     def load(self, device: torch.device) -> dict[str, DepthSource]:
         """The networks that the rows need.
 

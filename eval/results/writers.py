@@ -2,7 +2,8 @@
 
 ```
 OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with
-                      anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is the depth corrected)
+                      anchors also anchored [m^2] (B) and bias (r: depth (1 + r) is the depth corrected), with a
+                      posterior also posterior_depth [m] and posterior_variance [m^2]
 OUT/depth/NAME.png    depth, 16 bit, 0 = invalid; metres per count in the PNG's text
 OUT/sigma/NAME.png    standard deviation, likewise
 OUT/summary.json
@@ -101,6 +102,8 @@ class FrameWriter:
         disagreement: Any,
         anchored: Any = None,
         bias: Any = None,
+        posterior_depth: Any = None,
+        posterior_variance: Any = None,
         valid: Any = None,
     ) -> WrittenFrame:
         """Write one frame; none of its files appears before all are written.
@@ -112,13 +115,18 @@ class FrameWriter:
             disagreement: [H, W] multiview disagreement [m^2].
             anchored: [H, W] what anchors add to the variance [m^2], or None.
             bias: [H, W] relative error that anchors lead to expect, or None.
+            posterior_depth: [H, W] of the posterior [m], or None.
+            posterior_variance: [H, W] likewise [m^2].
             valid: [H, W] bool, True where the pixel was used; None = where depth is finite and positive.
 
         Raises:
             ValueError: shapes disagree.
             OSError: the disk is full, say; earlier frames are untouched.
         """
-        given = {"depth": depth, "variance": variance, "disagreement": disagreement, "anchored": anchored, "bias": bias}
+        given = {
+            "depth": depth, "variance": variance, "disagreement": disagreement, "anchored": anchored, "bias": bias,
+            "posterior_depth": posterior_depth, "posterior_variance": posterior_variance,
+        }  # fmt: skip
         maps: dict[str, NDArray[Any]] = {n: _float_map(x, n) for n, x in given.items() if x is not None}
         d, v = maps["depth"], maps["variance"]
         used = np.isfinite(d) & (d > 0) if valid is None else _array(valid)
@@ -160,7 +168,7 @@ class FrameWriter:
 
 def read_frame(path: str | Path) -> dict[str, NDArray[Any]]:
     """The maps of a frame's npz: depth [m], variance [m^2], disagreement [m^2], valid, each [H, W]; with anchors
-    also anchored [m^2] and bias."""
+    also anchored [m^2] and bias, with a posterior its depth and variance."""
     with np.load(path, allow_pickle=False) as stored:
         return {name: stored[name] for name in stored.files}
 

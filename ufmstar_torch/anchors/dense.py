@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.dense_keyframes import Keyframes
+from ufmstar_torch.anchors.dense_memory import Memory
 from ufmstar_torch.anchors.tracker import Landmarks, checked
 from ufmstar_torch.checked import Checked, number
 
 if TYPE_CHECKING:
-    from ufmstar_torch.kernels.dense_cpu import Measured, Views
+    from ufmstar_torch.kernels.dense_cpu import Measured, Search, Views
 
 # Baselines of the keyframes that a frame is compared with, as shares of the median depth.
 _BASELINES = (0.04, 0.1, 0.22, 0.45)
@@ -44,6 +45,8 @@ class DenseConfig(Checked):
     Attributes:
         width: largest width of the image that is searched [px]; larger images are reduced to it.
         keyframes: how many are kept.
+        landmarks: how many are remembered.
+        searches: pixels that are searched in a frame at most; what is left has its turn in the next ones.
         start_depth: median depth of the scene before one is known [m]; right to a factor of 5.
         least_score: of a match, zero-mean normalised cross-correlation (ZNCC).
         rival: a match is unique where the best other one has this many times its 1 - ZNCC at least.
@@ -59,6 +62,8 @@ class DenseConfig(Checked):
 
     width: int = number(320, "", "px", 80, 1280)
     keyframes: int = number(50, "", "1", 2)
+    landmarks: int = number(2048, "", "1", 100)
+    searches: int = number(400, "", "1", 10)
     start_depth: float = number(2.0, "", "m", 0, open_low=True)
     least_score: float = number(0.85, "", "1", 0, 1)
     rival: float = number(1.5, "", "1", 1)
@@ -87,6 +92,7 @@ class DenseEvidence:
     def __init__(self, config: DenseConfig | None = None) -> None:
         self.config = config if config is not None else DenseConfig()
         self._keyframes = Keyframes(self.config.keyframes)
+        self._memory = Memory(self.config.landmarks)
         self.reset()
 
     @property
@@ -97,17 +103,20 @@ class DenseEvidence:
     def reset(self) -> None:
         """Forget everything."""
         self._keyframes.reset()
+        self._memory.reset()
         self._camera: tuple[tuple[int, ...], NDArray[np.float64]] | None = None
         self._depth = self.config.start_depth
         self._noise = np.full(len(_BASELINES), _FIRST_NOISE**2)
-        self._disagreement = 1.0
+        self._disagreement = self._again = 1.0
 
     def state(self) -> dict[str, Tensor]:
         """A copy of all that is remembered, for :meth:`load_state`."""
         size, K = ((0, 0), np.eye(3)) if self._camera is None else self._camera
-        numbers = np.array([self._depth, self._disagreement])
+        numbers = np.array([self._depth, self._disagreement, self._again])
         held = {"size": np.array(size), "K": K, "noise": self._noise, "numbers": numbers}
-        return {name: torch.tensor(value) for name, value in held.items()} | self._keyframes.state()
+        return (
+            {name: torch.tensor(value) for name, value in held.items()} | self._keyframes.state() | self._memory.state()
+        )
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where :meth:`state` was taken, with the same anchors to the last bit.
@@ -116,10 +125,11 @@ class DenseEvidence:
             ValueError: another number of keyframes.
         """
         self._keyframes.load_state(state)
+        self._memory.load_state(state)
         K, self._noise = (np.array(state[name].numpy()) for name in ("K", "noise"))
         height, width = state["size"].tolist()
         self._camera = ((height, width), K) if height else None
-        self._depth, self._disagreement = state["numbers"].tolist()
+        self._depth, self._disagreement, self._again = state["numbers"].tolist()
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -146,23 +156,57 @@ class DenseEvidence:
         elif gray.shape != self._camera[0] or not np.array_equal(K, self._camera[1]):
             raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
         small, scale = _reduced(gray, self.config.width)
-        found = self._measured(small, scale, T, K)
+        found = self._measured(small, scale, T, scale @ K)
         self._keyframes.add(small, T, self._depth)
         return found
 
     def _measured(self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray) -> Landmarks:
-        """The depths of a reduced image; the running estimates follow."""
-        from ufmstar_torch.kernels.dense_cpu import Search, measure  # compiles when it is first needed
+        """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, and new
+        ones in the cells between them. The running estimates follow."""
+        from ufmstar_torch.kernels.dense_cpu import measure  # compiles when it is first needed
 
-        K_small = scale @ K
-        chosen = self._keyframes.choose(T, K_small, self._depth, _BASELINES)
-        if len(chosen) < _AGREE:
-            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), 0, np.zeros(0, np.int64))
-        shares = np.array([share for share, _ in chosen])
-        views = self._views([keyframe for _, keyframe in chosen], shares, T, K_small)
-        pixel = _pixels(small)
+        cell = _cell(small.shape[1])
+        sighted = self._memory.sighted(small, T, K, cell)
+        known, searched = len(sighted.slot), 0
+        pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
+        rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
+        agreed, trusted, factor = np.zeros(len(pixel), dtype=np.bool_), True, 1.0
+        chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
+        if len(chosen) >= _AGREE:
+            wanted = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
+            every = -(-len(wanted) // self.config.searches) or 1
+            wanted = wanted[self._memory.frame % every :: every]
+            shares = np.array([share for share, _ in chosen])
+            views = self._views([keyframe for _, keyframe in chosen], shares, T, K)
+            found = measure(small, pixel[wanted], views, self._search())
+            self._learn(found, shares)
+            factor = max(self._disagreement, self._again, 1)
+            searched = len(wanted)
+            rho[wanted], variance[wanted] = found.rho, found.variance * factor
+            agreed[wanted] = (found.agreed >= _AGREE) & (found.contradicted == 0)
+            matched = int((found.agreed > 0).sum())
+            trusted = matched < _ENOUGH or agreed.sum() >= self.config.min_share * matched
+        agreed &= (rho > np.sqrt(variance)) & trusted
+        both, fine, differ = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
+        if len(differ) >= _ENOUGH:
+            self._again = self._faded(self._again, factor * np.median(differ) / _MEDIAN_SQUARE)
+        again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
+        self._memory.write(both.slot[again], small, both.pixel[again], both.rho[again], both.variance[again], T, K)
+        self._memory.write(None, small, pixel[new], rho[new], variance[new], T, K)
+        rho[:known], variance[:known] = both.rho, both.variance
+        kept = np.concatenate([np.flatnonzero(fine), new]) if trusted else new
+        if len(kept) >= _ENOUGH:
+            step = (1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)
+            self._depth *= float(np.exp(step))
+        confirmed = np.concatenate([self._memory.confirmed[both.slot[fine & trusted]], np.zeros(len(new), np.int64)])
+        depth, position = 1 / rho[kept], (pixel[kept] - scale[:2, 2]) / scale.diagonal()[:2]
+        return Landmarks(position, depth, variance[kept] * depth**4, searched + known, confirmed)
+
+    def _search(self) -> Search:
+        from ufmstar_torch.kernels.dense_cpu import Search
+
         config, over = self.config, 1 / self._depth
-        search = Search(
+        return Search(
             start=over,
             low=_FARTHEST * over,
             high=_NEAREST * over,
@@ -171,17 +215,6 @@ class DenseEvidence:
             rival=config.rival,
             match=config.match_noise,
         )
-        found = measure(small, pixel, views, search)
-        self._learn(found, shares)
-        variance = found.variance * max(self._disagreement, 1)
-        matched, agreed = found.agreed > 0, (found.agreed >= _AGREE) & (found.contradicted == 0)
-        fine = agreed & (found.rho > np.sqrt(variance)) & (agreed.sum() >= config.min_share * matched.sum())
-        if fine.sum() >= _ENOUGH:
-            step = (1 - config.memory) * np.log(np.median(1 / found.rho[fine]) / self._depth)
-            self._depth *= float(np.exp(step))
-        depth = 1 / found.rho[fine]
-        position = (pixel[fine] - scale[:2, 2]) / scale.diagonal()[:2]
-        return Landmarks(position, depth, variance[fine] * depth**4, len(pixel), np.zeros(len(depth), np.int64))
 
     def _views(self, keyframes: list[int], shares: NDArray, T: NDArray, K: NDArray) -> Views:
         """The chosen keyframes, and how pixels of the camera T [4, 4] get into them."""
@@ -193,19 +226,20 @@ class DenseEvidence:
         b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
         return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), self._noise[shares])
 
+    def _faded(self, before: float, now: float) -> float:
+        return self.config.memory * before + (1 - self.config.memory) * float(now)
+
     def _learn(self, found: Measured, shares: NDArray) -> None:
         """Running estimates of the poses' noise by baseline, and of how far keyframes disagree."""
-        memory = self.config.memory
         for column, share in enumerate(shares):
             shown = np.isfinite(found.across[:, column]) & (found.agreed >= _AGREE)
             if shown.sum() >= _ENOUGH:
                 seen = np.median(np.square(found.across[shown, column])) / _MEDIAN_SQUARE
                 noise = max(seen - np.median(found.across_noise[shown, column]), 0.0)
-                self._noise[share] = memory * self._noise[share] + (1 - memory) * noise
+                self._noise[share] = self._faded(self._noise[share], noise)
         differ = found.differ[np.isfinite(found.differ)]
         if len(differ) >= _ENOUGH:
-            seen = float(np.median(differ)) / _MEDIAN_SQUARE
-            self._disagreement = memory * self._disagreement + (1 - memory) * seen
+            self._disagreement = self._faded(self._disagreement, np.median(differ) / _MEDIAN_SQUARE)
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
@@ -221,14 +255,18 @@ def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], ND
     return np.asarray(small, dtype=np.uint8), scale
 
 
-def _pixels(small: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """[N, 2] the pixel (u, v) of the largest gradient in every cell that has one: 8 px wide in an image 160 wide, 10 in
-    one of 320."""
+def _cell(width: int) -> int:
+    """Side of a cell [px]: 8 in an image 160 wide, 10 in one of 320."""
+    return max(round(8 * 1.25 ** np.log2(width / 160)), 4)
+
+
+def _pixels(small: NDArray[np.uint8], cell: int, taken: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N, 2] the pixel (u, v) of the largest gradient in every cell that has one, and none of those taken [M, 2]."""
     from ufmstar_torch.kernels.dense_cpu import best_pixels
 
-    height, width = small.shape
-    cell = max(round(8 * 1.25 ** np.log2(width / 160)), 4)
-    shape = (-(-height // cell), -(-width // cell))
+    shape = (-(-small.shape[0] // cell), -(-small.shape[1] // cell))
     pixel, strength = np.zeros((*shape, 2)), np.zeros(shape)
     best_pixels(small, cell, pixel, strength)
+    column, row = (taken / cell).astype(np.int64).T
+    strength[row, column] = 0
     return pixel[strength > 0]

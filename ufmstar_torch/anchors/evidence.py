@@ -45,21 +45,21 @@ from ufmstar_torch.fixed_order import total
 # Entries of a row of sums.
 COUNT, BIAS, EXCESS = 0, 1, 2
 SUMS = 3
-# A wrong track stands alone: an anchor is believed where at least _SUPPORT of its _NEIGHBOURS nearest ones in the image
+# A wrong track stands alone: an anchor is believed where at least SUPPORT of its NEIGHBOURS nearest ones in the image
 # have a similar ratio g/d. Not a distance from the frame's median: a network may be wrong by another factor on each
 # surface, and a small region that differs from the rest is what anchors are to find.
-_NEIGHBOURS, _SUPPORT = 8, 3
+NEIGHBOURS, SUPPORT = 8, 3
 # [px^2] By which an anchor counts as farther away than the one given before it: more than the rounding of a squared
 # distance in an image, less than tells.
-_TIE = 1e-6
+TIE = 1e-6
 # "Similar" is within 2.5 sigma of what neighbours differ by; sigma is from the lower quartile of all such differences,
 # .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
-_SIMILAR_SIGMAS, _LOWER_QUARTILE = 2.5, 0.4506
+SIMILAR_SIGMAS, LOWER_QUARTILE = 2.5, 0.4506
 # Claims of more than so many times the mean square error of the frame's other anchors count less; an anchor with less
 # than _COUNTS of its weight is not reported as used.
 _CLAIM, _COUNTS = 4.0, 0.5
 # Least sigma of log g/d: tracked landmarks are right to some 2 %, whatever variance they state.
-_LEAST_SIGMA = 0.02
+LEAST_SIGMA = 0.02
 
 
 @dataclass(frozen=True)
@@ -94,23 +94,23 @@ def inliers(anchors: AnchorInput) -> Tensor:
     With fewer anchors than have neighbours enough to ask, all valid ones are believed.
     """
     n = anchors.valid.shape[1]
-    few = anchors.valid.sum(1, keepdim=True) <= _SUPPORT
-    if n <= _SUPPORT:
+    few = anchors.valid.sum(1, keepdim=True) <= SUPPORT
+    if n <= SUPPORT:
         return anchors.valid
     log_ratio = (anchors.depth / anchors.predicted).log()
     u, v = anchors.pixel.unbind(-1)
     apart = (u[:, :, None] - u[:, None]).square_().add_((v[:, :, None] - v[:, None]).square_())
     # Of neighbours equally near the first given counts: which of them topk takes depends on how far a row is padded.
-    apart += _TIE * torch.arange(n, device=few.device)
+    apart += TIE * torch.arange(n, device=few.device)
     apart.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
-    distance, neighbour = apart.topk(min(_NEIGHBOURS, n - 1), dim=2, largest=False)
+    distance, neighbour = apart.topk(min(NEIGHBOURS, n - 1), dim=2, largest=False)
     asked = (distance < torch.inf) & anchors.valid[:, :, None]
     differ = (log_ratio[:, :, None] - _take(log_ratio, neighbour)).abs()
     quartile = torch.where(asked, differ, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
     noise = anchors.variance / anchors.depth.square()  # of log g: no reason for mistrust
-    sigma2 = (quartile / _LOWER_QUARTILE).square()[:, None, None] + 2 * _LEAST_SIGMA**2
-    similar = differ <= _SIMILAR_SIGMAS * (sigma2 + noise[:, :, None] + _take(noise, neighbour)).sqrt()
-    return anchors.valid & (few | ((similar & asked).sum(2) >= _SUPPORT))
+    sigma2 = (quartile / LOWER_QUARTILE).square()[:, None, None] + 2 * LEAST_SIGMA**2
+    similar = differ <= SIMILAR_SIGMAS * (sigma2 + noise[:, :, None] + _take(noise, neighbour)).sqrt()
+    return anchors.valid & (few | ((similar & asked).sum(2) >= SUPPORT))
 
 
 def _take(value: Tensor, index: Tensor) -> Tensor:
@@ -119,7 +119,11 @@ def _take(value: Tensor, index: Tensor) -> Tensor:
 
 
 def observe(
-    evidence: Evidence, anchors: AnchorInput, distribute: Callable[[Tensor], Tensor], memory: float
+    evidence: Evidence,
+    anchors: AnchorInput,
+    distribute: Callable[[Tensor], Tensor],
+    memory: float,
+    supported_by_neighbours: Callable[[AnchorInput], Tensor] = inliers,
 ) -> tuple[Evidence, Tensor]:
     """Let old evidence fade and add a frame's.
 
@@ -129,11 +133,12 @@ def observe(
         distribute: sums rows [B, N, 3] at the anchors' points by component, [B, K, 3], each row by the component's
             share in explaining the point.
         memory: in (0, 1], by which the old evidence of a stream is multiplied when there is new.
+        supported_by_neighbours: an implementation of :func:`inliers`.
 
     Returns:
         The evidence, and [B, N] which anchors were used: supported by their neighbours, with half their weight or more.
     """
-    supported = inliers(anchors)
+    supported = supported_by_neighbours(anchors)
     r = anchors.depth / anchors.predicted - 1
     claim = (anchors.variance + anchors.own_variance) / anchors.predicted.square()
     w = _weight(r.square(), claim, supported)
@@ -153,7 +158,7 @@ def _weight(r2: Tensor, claim: Tensor, supported: Tensor) -> Tensor:
     r2 = torch.where(supported, r2, torch.zeros_like(r2))
     others = (supported.sum(1, keepdim=True) - 1).clamp_min(0)
     mean = (total(r2, 1)[:, None] - r2) / others.clamp_min(1)
-    limit = others.clamp_max(_CLAIM) * mean.clamp_min(_LEAST_SIGMA**2)
+    limit = others.clamp_max(_CLAIM) * mean.clamp_min(LEAST_SIGMA**2)
     limit = torch.where(others > 0, limit, torch.ones_like(limit))
     return (limit / claim.clamp_min(torch.finfo(claim.dtype).tiny)).clamp_max(1).square()
 

@@ -148,10 +148,11 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
         own_variance: [B, H, W] A + E [m^2], or None.
 
     Raises:
-        TypeError: a field is no tensor or of the wrong kind of dtype.
+        TypeError: something else than anchors; a field is no tensor or of the wrong kind of dtype.
         ValueError: a field has the wrong shape or lies on another device.
     """
     b, (height, width) = frame.depth.shape[0], frame.size
+    anchors = require_anchors(anchors)
     pixel = require_float("anchors.pixel", anchors.pixel, like=frame.depth).detach().double()
     if pixel.dim() != 3 or pixel.shape[0] != b or pixel.shape[2] != 2:
         raise ValueError(f"anchors.pixel must be [{b}, N, 2], got {tuple(pixel.shape)}")
@@ -183,6 +184,17 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
         valid=valid,
         confirmed=confirmed,
     )
+
+
+def require_anchors(anchors: object) -> Anchors:
+    """The argument ``anchors``.
+
+    Raises:
+        TypeError: it is something else.
+    """
+    if not isinstance(anchors, Anchors):
+        raise TypeError(f"anchors must be Anchors or None, got {type(anchors).__name__}")
+    return anchors
 
 
 def _inside(pixel: Tensor, size: tuple[int, int]) -> Tensor:

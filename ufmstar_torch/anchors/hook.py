@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.anchors.evidence import SUMS as EVIDENCE_SUMS
-from ufmstar_torch.anchors.evidence import Evidence, means, observe
+from ufmstar_torch.anchors.evidence import Evidence, inliers, means, observe
 from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.camera import unproject_at
 from ufmstar_torch.config import UfMStarConfig
@@ -44,6 +44,7 @@ def before_regression(
     anchors: AnchorInput | None,
     config: UfMStarConfig,
     distribute: Distribute,
+    supported: Callable[[AnchorInput], Tensor] = inliers,
 ) -> tuple[Evidence, Tensor, GaussianMixture, Tensor | None]:
     """Add a frame's anchors to the evidence, and make the mixture ready to regress it.
 
@@ -54,6 +55,7 @@ def before_regression(
         anchors: of this frame, or None.
         config: ``anchored`` False = everything is returned as it is.
         distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
+        supported: which anchors their neighbours support (``evidence.inliers``).
 
     Returns:
         The evidence, this frame's included; how many anchors were used [B]; the mixture with two more features, the
@@ -70,7 +72,9 @@ def before_regression(
             return distribute(mixture_cam, points, rows, config)
 
         memory = 0.5 ** (1 / config.anchor_half_life)
-        evidence, each = observe(evidence, anchors, by_component, memory)  # a faulty frame's anchors are not valid
+        evidence, each = observe(
+            evidence, anchors, by_component, memory, supported
+        )  # a faulty frame's anchors are not valid
         used = each.sum(1)
     beyond, stream = means(evidence, config.anchor_shrinkage)
     return evidence, used, mixture_cam.replace(features=torch.cat([mixture_cam.features, beyond], dim=-1)), stream

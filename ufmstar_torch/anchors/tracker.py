@@ -20,6 +20,12 @@ from ufmstar_torch.anchors.given import Anchors
 
 # Tracks by which a frame's poses are judged.
 _ENOUGH = 5
+# Errors of a tracked position add up from view to view: the variance of a track of v views is _DRIFT (v - 1) times that
+# of independent positions. On four rendered tours the squared errors grow with v like this, and of the size.
+_DRIFT = 0.6
+# Share of the running estimate of the residuals' variance that remains after a frame; views of the tracks that it is
+# from.
+_MEMORY, _LONG = 0.8, 4
 
 
 @dataclass(frozen=True)
@@ -32,11 +38,13 @@ class TrackerConfig:
         min_views: of a corner, before it is triangulated.
         spacing: least distance between two corners [px] in an image 640 wide; it follows the width.
         back_tolerance: a corner tracked forward and back must return this near to where it was [px].
-        pixel_noise: standard deviation of a tracked position [px], poses' errors included.
+        pixel_noise: standard deviation of a tracked position [px], poses' errors included, until the residuals of the
+            tracks tell it.
         max_error: largest root mean square reprojection error of a track [px]. Poses err too; a track that fits
-            worse than ``pixel_noise`` gets a variance by as much larger.
-        max_relative_sigma: largest standard deviation of the depth, as a share of it: less parallax is no anchor. Not
-            less than needed: what is far away has little parallax, and to leave it out would hide the error there.
+            worse than the others gets a variance by as much larger.
+        max_relative_sigma: largest standard deviation of the depth, as a share of it, that independent errors of
+            ``pixel_noise`` would make: less parallax is no anchor. Not less than needed: what is far away has little
+            parallax, and to leave it out would hide the error there.
         min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer do, poses and image contradict
             each other, and those that fit do so by chance: none is believed.
 
@@ -160,13 +168,16 @@ class LandmarkTracker:
         self._seen = np.zeros((n, w), dtype=bool)
         self._poses = np.tile(np.eye(4), (w, 1, 1))
         self._view = -1
+        self._noise = self.config.pixel_noise**2
 
     def state(self) -> dict[str, Tensor]:
         """A copy of all that is remembered, for :meth:`load_state`: the window, and the last image in gray."""
         gray = np.zeros((0, 0), dtype=np.uint8) if self._gray is None else self._gray
         K = np.eye(3) if self._K is None else self._K
         held = {"gray": gray, "K": K, "pixel": self._pixel, "seen": self._seen, "poses": self._poses}
-        return {**{name: torch.tensor(value) for name, value in held.items()}, "view": torch.tensor(self._view)}
+        own = {name: torch.tensor(value) for name, value in held.items()}
+        noise = torch.tensor(self._noise, dtype=torch.float64)
+        return own | {"view": torch.tensor(self._view), "noise": noise}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where :meth:`state` was taken, with the same landmarks to the last bit.
@@ -181,7 +192,7 @@ class LandmarkTracker:
             np.array(state[name].numpy()) for name in ("gray", "K", "pixel", "seen", "poses")
         )
         self._gray, self._K = (gray, K) if gray.size else (None, None)
-        self._view = int(state["view"])
+        self._view, self._noise = int(state["view"]), float(state["noise"])
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -252,17 +263,21 @@ class LandmarkTracker:
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (found.point - T[:3, 3]) @ axis
+        fits, views = found.error <= config.max_error, self._seen[chosen].sum(1)
+        residual = np.square(found.error) * 2 * views / np.maximum(2 * views - 3, 1)
+        long = fits & found.ahead & (views >= _LONG)
+        if long.sum() >= _ENOUGH:
+            self._noise = _MEMORY * self._noise + (1 - _MEMORY) * float(np.median(residual[long]))
         # A track that fits worse than the noise allows is as uncertain as it fits.
-        views = self._seen[chosen].sum(1)
-        excess = np.square(found.error) * 2 * views / np.maximum(2 * views - 3, 1) / config.pixel_noise**2
-        variance = config.pixel_noise**2 * np.maximum(excess, 1) * np.einsum("i,nij,j->n", axis, found.covariance, axis)
+        one_pixel = np.einsum("i,nij,j->n", axis, found.covariance, axis)
+        variance = _DRIFT * (views - 1) * np.maximum(residual, self._noise) * one_pixel
         safe = np.maximum(depth, 1e-9)
-        fits = found.error <= config.max_error
         # Two views contradict each other across the epipolar line only; three tell, if enough tracks have them.
         telling = fits[views > 2] if (views > 2).sum() >= _ENOUGH else fits
         fine = fits & found.ahead & (depth > 0) & (telling.mean() >= config.min_share)
         # Hopeless geometry can make the covariance indefinite.
-        fine &= (variance >= 0) & (variance <= np.square(config.max_relative_sigma * safe))
+        independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
+        fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
         return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
 
 

@@ -47,7 +47,7 @@ def check_values(
     safe_depth, T_safe, K_safe, valid, codes, deviations, beyond, out_of_range = tensors
     return FrameInput(
         safe_depth, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, valid, codes, deviations, beyond,
-        out_of_range,
+        out_of_range, codes,
     )  # fmt: skip
 
 

@@ -162,8 +162,8 @@ def _measure(
                 half = max(sigmas * np.sqrt(variance[n] + noise[k] / speed**2), 1 / speed)
                 low, high = at - half, at + half
             if not (
-                _warped(image, u, v, H[k], b[k], at, template)
-                and _normalised(template, patch, along_u, along_v)
+                warped(image, u, v, H[k], b[k], at, template)
+                and normalised(template, patch, along_u, along_v)
                 and _search(patch, keys[k], x, y, z, b[k], low, high, scores, place)
             ):
                 continue
@@ -209,7 +209,7 @@ def _inverse_depth(x, y, z, b, u, v):
 
 
 @compiled
-def _warped(image, u, v, H, b, rho, template):
+def warped(image, u, v, H, b, rho, template):
     """The patch around (u, v) as a view sees it at inverse depth rho, a pixel wider than the window on each side. False
     where it leaves the image or changes its scale too much."""
     z = H[2, 0] * u + H[2, 1] * v + H[2, 2] + rho * b[2]
@@ -241,7 +241,7 @@ def _warped(image, u, v, H, b, rho, template):
 
 
 @compiled
-def _normalised(template, patch, along_u, along_v):
+def normalised(template, patch, along_u, along_v):
     """The window of a template with mean 0 and length 1; its gradients, of mean 0 [1/px]. False without contrast."""
     mean = mean_u = mean_v = squares = np.float32(0)
     half = np.float32(0.5)
@@ -344,10 +344,11 @@ def _refined(patch, along_u, along_v, key, u, v, eu, ev, out):
         fu, fv = np.float32(left - iu), np.float32(top - iv)
         w00, w01, w10, w11 = (one - fv) * (one - fu), (one - fv) * fu, fv * (one - fu), fv * fu
         total = squares = cross = down_u = down_v = np.float32(0)
+        window = key[iv : iv + SIDE + 1, iu : iu + SIDE + 1]
         for j in range(SIDE):
             for i in range(SIDE):
-                upper = w00 * np.float32(key[iv + j, iu + i]) + w01 * np.float32(key[iv + j, iu + i + 1])
-                lower = w10 * np.float32(key[iv + j + 1, iu + i]) + w11 * np.float32(key[iv + j + 1, iu + i + 1])
+                upper = w00 * np.float32(window[j, i]) + w01 * np.float32(window[j, i + 1])
+                lower = w10 * np.float32(window[j + 1, i]) + w11 * np.float32(window[j + 1, i + 1])
                 value = upper + lower
                 total += value
                 squares += value * value

@@ -7,6 +7,7 @@ import warnings
 from dataclasses import fields, replace
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
@@ -14,11 +15,14 @@ from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
+from ufmstar_torch.posterior.update import PosteriorKernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
 
 _TRITON_DEVICES = ("cuda", "xpu")  # "cuda" is ROCm's name as well
+_LEAST_CAPABILITY = (8, 0)  # of an NVIDIA GPU that triton supports
 
 
 @runtime_checkable
@@ -62,6 +66,10 @@ def select_check(name: str, device_type: str) -> CheckKernel:
         from ufmstar_torch.kernels import check_cpu
 
         return check_cpu.check_values
+    if _on_gpu(name, device_type):
+        from ufmstar_torch.kernels.triton import check
+
+        return check.check_values
     return check_values
 
 
@@ -104,7 +112,17 @@ def _on_gpu(name: str, device_type: str) -> bool:
         if device_type not in _TRITON_DEVICES and not (device_type == "cpu" and interpreted()):
             raise ValueError(f"backend='triton' needs tensors of a GPU, got device type {device_type!r}")
         return True
-    return name == "auto" and device_type in _TRITON_DEVICES and _has_triton()
+    return name == "auto" and device_type in _TRITON_DEVICES and _has_triton(device_type)
+
+
+def select_posterior(name: str, device_type: str) -> PosteriorKernels:
+    """The posterior's kernels for a device; arguments and errors as :func:`select_kernels`. An accelerator takes the
+    reference."""
+    if device_type != "cpu" or select_kernels(name, device_type) is REFERENCE:
+        return POSTERIOR_REFERENCE
+    from ufmstar_torch.kernels import posterior_cpu
+
+    return PosteriorKernels(solve=posterior_cpu.solve, distance=posterior_cpu.distance, read=posterior_cpu.read)
 
 
 @functools.cache
@@ -123,12 +141,16 @@ def _triton() -> Kernels:
 
 
 @functools.cache
-def _has_triton() -> bool:
-    """Whether triton can be imported; one warning where it cannot."""
+def _has_triton(device_type: str) -> bool:
+    """Whether triton can be imported and supports the device; one warning where not."""
     try:
         import triton as triton
     except ImportError as error:
         warnings.warn(f"triton cannot be imported ({error}); the slower torch reference serves", stacklevel=4)
+        return False
+    nvidia = device_type == "cuda" and torch.version.hip is None and torch.cuda.is_initialized()
+    if nvidia and torch.cuda.get_device_capability() < _LEAST_CAPABILITY:
+        warnings.warn("triton needs compute capability 8.0; the slower torch reference serves", stacklevel=4)
         return False
     return True
 

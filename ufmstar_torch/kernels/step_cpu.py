@@ -22,6 +22,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
+from ufmstar_torch.kernels.anchors_cpu import inliers
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
 from ufmstar_torch.kernels.regress_cpu import distribute, regress_image
@@ -120,8 +121,9 @@ def step(
     mixture = updated.mixture()
     moved = mixture.replace(mean=torch.from_numpy(in_camera[0]), covariance=torch.from_numpy(in_camera[1]))
     evidence, used, mixture_cam, stream = before_regression(
-        Evidence(state.evidence, state.overall_evidence), moved.to(torch.float64), frame, anchors, config, distribute
-    )
+        Evidence(state.evidence, state.overall_evidence), moved.to(torch.float64), frame, anchors, config, distribute,
+        inliers,
+    )  # fmt: skip
     mixture_cam = unmeasured.before_regression(mixture_cam, config)
     stage("append")
 
@@ -156,6 +158,7 @@ def step(
         smoothed=smoothed,
         evidence=evidence.component,
         overall_evidence=evidence.overall,
+        posterior=state.posterior,
     )
     stage("average")
     return state, StepOutput(disagreement, result.features, residual, measured, labels, current_cam, statistics)

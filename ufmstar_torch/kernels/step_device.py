@@ -179,15 +179,14 @@ def device_step(
         anchors=torch.zeros_like(frame.fault),
         anchors_used=torch.zeros_like(frame.fault),
     )
-    updated = UfMStarState(
+    updated = replace(
+        state,
         **mixture.tensors(),
         T_world_first=here.first,
         started=here.started,
         frames=here.frames,
         skipped=here.skipped,
         smoothed=result.memory,
-        evidence=state.evidence,
-        overall_evidence=state.overall_evidence,
     )
     out = StepOutput(result.disagreement, result.features, None, result.measured, labels.long(), current, statistics)
     return updated, out, waiting

@@ -1,0 +1,237 @@
+"""The posterior of ``ufmstar_torch/posterior`` as NumPy loops: dense matrices, one stream, float64."""
+
+from __future__ import annotations
+
+import heapq
+import math
+
+import numpy as np
+
+SIDE, HATS, GLOBALS = 28, 3, 4
+START = {
+    "amplitude": (1.0, 20.0, 0.1, 100.0),
+    "roughness": (0.0025, 60.0, 1e-4, 0.04),
+    "noise": (1.0, 60.0, 0.25, 16.0),
+    "unseen": (0.15, 1000.0, 0.0, 4.0),
+    "calibration": (0.0, 0.0, 0.0, 1e6),
+}
+PRIOR, DRIFT = np.array([0.5, 0.45, 0.2, 0.2]) ** 2, np.array([0.12, 0.12, 0.08, 0.06]) ** 2
+MEMORY = 0.5 ** (1 / 20)
+
+
+def start():
+    return {"frames": 0, "m0": 0.0, "b": np.zeros(4), "C": np.diag(PRIOR),
+            "sums": {k: [v * n, n] for k, (v, n, _, _) in START.items()}}  # fmt: skip
+
+
+def ratio(state, name):
+    value, _, low, high = START[name]
+    above, below = state["sums"][name]
+    return min(max(above / below, low), high) if below > 0 else value
+
+
+def nodes(depth):
+    """Mean log depth of R x C cells; a cell covers every pixel that it touches."""
+    h, w = depth.shape
+    rows, cols = min(SIDE, h), min(SIDE, w)
+    mean = np.full((rows, cols), np.nan)
+    for r in range(rows):
+        for c in range(cols):
+            top, bottom = r * h // rows, -(-(r + 1) * h // rows)
+            left, right = c * w // cols, -(-(c + 1) * w // cols)
+            inside = depth[top:bottom, left:right]
+            if (inside > 0).any():
+                mean[r, c] = np.log(inside[inside > 0]).mean()
+    return np.where(np.isnan(mean), 0.0 if np.isnan(mean).all() else np.nanmean(mean), mean)
+
+
+def links(logs):
+    """(i, j, variance, length) of all links."""
+    rows, cols = logs.shape
+    for r in range(rows):
+        for c in range(cols):
+            for dr, dc, n in ((0, 1, cols), (1, 0, rows)):
+                if r + dr < rows and c + dc < cols:
+                    d = abs(logs[r + dr, c + dc] - logs[r, c])
+                    i = r * cols + c
+                    yield i, i + dr * cols + dc, 0.004 + 2 * d * d, 1 / n + 2 * max(d - 0.03, 0)
+
+
+def features(logs, u, v):
+    """logs less m_0; u and v from 0 to 1."""
+    hat = lambda x, i: max(1 - abs(x * (HATS - 1) - i), 0.0)  # noqa: E731
+    return np.array([1, logs, 2 * u - 1, 2 * v - 1, *(hat(u, i) * hat(v, j) for j in range(HATS) for i in range(HATS))])
+
+
+def node_features(logs):
+    rows, cols = logs.shape
+    m0 = logs.mean()
+    return np.array([features(logs[r, c] - m0, (c + 0.5) / cols, (r + 0.5) / rows)
+                     for r in range(rows) for c in range(cols)])  # fmt: skip
+
+
+def joint_prior(logs, state):
+    """Mean and precision of (b, hats, f)."""
+    n, m0, amplitude = logs.size, logs.mean(), ratio(state, "amplitude")
+    T = np.eye(4)
+    T[0, 1] = m0 - state["m0"] if state["frames"] else 0.0
+    C = T @ state["C"] @ T.T
+    if state["frames"]:
+        C = C + np.diag(DRIFT * np.clip(1 - np.diag(C) / PRIOR, 0, 1))
+    q = GLOBALS + HATS * HATS
+    Q = np.zeros((q + n, q + n))
+    Q[:4, :4] = np.linalg.inv(C)
+    Q[4:q, 4:q] = np.eye(q - 4) / (0.01 * amplitude)
+    Q[q:, q:] = np.eye(n) * 2 / amplitude
+    for i, j, variance, _ in links(logs):
+        w = 1 / (variance * amplitude)
+        for a, b, s in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            Q[q + a, q + b] += s * w
+    mean = np.zeros(q + n)
+    mean[:4] = T @ state["b"]
+    return mean, Q
+
+
+def condition(mean, Q, H, y, w):
+    """Posterior mean and covariance given y = H x + noise of precision w."""
+    covariance = np.linalg.inv(Q + (H * w[:, None]).T @ H)
+    return mean + covariance @ (H.T @ (w * (y - H @ mean))), covariance
+
+
+def design(x, node, n):
+    H = np.zeros((len(x), x.shape[1] + n))
+    H[:, : x.shape[1]] = x
+    H[np.arange(len(x)), x.shape[1] + node] = 1
+    return H
+
+
+def pull(t):
+    t = min(max(t, -0.7), 2.0)
+    return 1 - 1.5 * t if abs(t) < 1e-3 else (1 - math.exp(-t)) * math.exp(-t) / t
+
+
+def distances(logs, source):
+    """Dijkstra, up to .6."""
+    n = logs.size
+    near = [[] for _ in range(n)]
+    for i, j, _, length in links(logs):
+        near[i].append((j, length))
+        near[j].append((i, length))
+    way, heap = np.full(n, 0.6), [(0.0, i) for i in source]
+    for i in source:
+        way[i] = 0.0
+    while heap:
+        d, i = heapq.heappop(heap)
+        for j, length in near[i]:
+            if d + length < way[j]:
+                way[j] = d + length
+                heapq.heappush(heap, (way[j], j))
+    return way
+
+
+def update(state, depth, claimed, pixel, g, variance):
+    """One frame: depth [H, W] (0 = not valid), claimed V [m^2], anchors (pixel [N, 2], depth, variance), all valid.
+
+    Returns the state after it, posterior depth and variance [H, W].
+    """
+    logs = nodes(depth)
+    rows, cols = logs.shape
+    n, m0, (h, w_) = logs.size, logs.mean(), depth.shape
+    mean0, Q = joint_prior(logs, state)
+    X, N = node_features(logs), len(g)
+    u, v = (pixel[:, 0] + 0.5) / w_, (pixel[:, 1] + 0.5) / h
+    node = np.minimum((v * rows).astype(int), rows - 1) * cols + np.minimum((u * cols).astype(int), cols - 1)
+    at = np.rint(pixel).astype(int)
+    d = np.array([depth[r, c] for c, r in at])
+    y = np.log(g / d)
+    stated, roughness = ratio(state, "noise") * variance / g**2, ratio(state, "roughness")
+    blur = np.zeros(N)
+    for k, (c, r) in enumerate(at):
+        around = depth[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
+        around = np.log(around[around > 0])
+        blur[k] = (around.max() - around.min()) / 2
+    other = roughness + blur**2
+    x = np.array([features(math.log(d[k]) - m0, u[k], v[k]) for k in range(N)])
+    H = design(x, node, n)
+    weight = 1 / (stated + other)
+    for round_ in range(3):
+        mean, C = condition(mean0, Q, H, y, weight)
+        fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
+        left = np.maximum(1 - weight * var, 0.05)
+        residual, var = (y - fit) / left, var / left
+        noise = other + stated / np.array([pull(-r) for r in residual])
+        total = var + noise
+        if round_ < 2:
+            weight = 5 / (4 + residual**2 / total) / noise
+    share = distances(logs, set(node[weight * 0.09 >= 1])) / 0.6
+    count = np.bincount(node, minlength=n)[node]
+    square = np.minimum(residual**2, 9 * total) / 0.995
+    new = {}
+    for name, part in (("roughness", np.full(N, roughness)), ("noise", stated)):
+        weights = (part / total) ** 2 / count
+        unit = ratio(state, name) / np.maximum(part, 1e-12)
+        new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
+    half = 0.5 * np.nan_to_num(claimed)
+    new |= discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([half[r, c] for c, r in at]) / d**2)
+    q = GLOBALS + HATS * HATS
+    after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
+    for name, (value, prior, low, high) in START.items():
+        above, below = state["sums"][name]
+        below = MEMORY * below + (1 - MEMORY) * prior + new[name][1]
+        above = MEMORY * above + (1 - MEMORY) * prior * value + new[name][0]
+        after["sums"][name] = [min(max(above, low * below), high * below), below]
+    HX = design(X, np.arange(n), n)
+    spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness + 0.0009 + share * ratio(state, "unseen")
+    offset = HX[:, 4:] @ mean[4:]
+    return after, *read(depth, half, logs, mean[:q], offset, spread, share)
+
+
+def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
+    held = np.zeros(len(y), bool)
+    for k in range(3):
+        number = state["frames"] * 3 + k + 1
+        cu, cv = (number * 0.7548776662466927) % 1, (number * 0.5698402909980532) % 1
+        held |= (u - cu) ** 2 + (v - cv) ** 2 < (5 / 28) ** 2
+    rest = ~held
+    if rest.sum() < 5:
+        held[:] = False
+    mean, C = condition(mean0, Q, H, y, weight * rest)
+    fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
+    share = (distances(logs, set(node[rest])) / 0.6)[node]
+    total, error = var + noise, (y - fit) ** 2
+    square = np.minimum(error, 9 * total) / 0.995
+    believed = np.where(held, 1 / (1 + noise / 0.04), 0.0)
+    area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
+    final = total + 0.0009 + share * (ratio(state, "unseen") + claimed)
+    return {
+        "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
+        "unseen": (
+            (area * (square - total - share * claimed) * share / total).sum(),
+            (area * share**2 / total).sum(),
+        ),
+        "calibration": ((area * error / final).sum(), area.sum()),
+    }
+
+
+def read(depth, claimed, logs, b, offset, spread, share):
+    h, w = depth.shape
+    rows, cols = logs.shape
+    out, variance = np.full((h, w), np.nan), np.full((h, w), np.nan)
+    for i in range(h):
+        for j in range(w):
+            if depth[i, j] <= 0:
+                continue
+            v, u, g = (i + 0.5) / h, (j + 0.5) / w, math.log(depth[i, j])
+            y = b[0] + b[1] * (g - logs.mean()) + b[2] * (2 * u - 1) + b[3] * (2 * v - 1)
+            r, c = (min(max(x * n - 0.5, 0), n - 1) for x, n in ((v, rows), (u, cols)))
+            top, left = (min(int(x), max(n - 2, 0)) for x, n in ((r, rows), (c, cols)))
+            sums = np.zeros(4)
+            for row, by_row in ((top, 1 - (r - top)), (min(top + 1, rows - 1), r - top)):
+                for col, by_col in ((left, 1 - (c - left)), (min(left + 1, cols - 1), c - left)):
+                    k = row * cols + col
+                    weight = by_row * by_col / (1 + ((g - logs[row, col]) / 0.1) ** 2)
+                    sums += weight * np.array([1, offset[k], spread[k], share[k]])
+            offset_, spread_, share_ = sums[1:] / sums[0]
+            out[i, j] = depth[i, j] * math.exp(min(max(y + offset_, -math.log(100)), math.log(100)))
+            variance[i, j] = out[i, j] ** 2 * (spread_ + share_ * claimed[i, j] / depth[i, j] ** 2)
+    return out, variance

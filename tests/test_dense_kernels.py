@@ -1,0 +1,154 @@
+"""The search of dense evidence against NumPy loops and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle_dense
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.kernels.dense_cpu import Search, Views, best_pixels, measure
+from ufmstar_torch.kernels.sight_cpu import patches, sight
+
+K = np.array([[90.0, 0, 47.5], [0, 90.0, 35.5], [0, 0, 1]])
+SEARCH = Search(start=0.5, low=-0.01, high=2.0, sigmas=3.5, least_score=0.85, rival=1.2, match=1.0)
+
+
+def plane(seed, T, z=2.0, shape=(72, 96)):
+    """What a camera T [4, 4] sees of a textured plane at depth z of the world, uint8."""
+    texture = gaussian_filter(np.random.default_rng(seed).standard_normal((400, 400)), 4)
+    texture = 127 + 45 * texture / texture.std()
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T @ T[:3, :3].T
+    hit = T[:3, 3] + rays * ((z - T[2, 3]) / rays[..., 2])[..., None]
+    x, y = 200 + 90 * hit[..., 0], 200 + 90 * hit[..., 1]
+    i, j = x.astype(int), y.astype(int)
+    a, c = x - i, y - j
+    top, bottom = (
+        (1 - a) * texture[j, i] + a * texture[j, i + 1],
+        (1 - a) * texture[j + 1, i] + a * texture[j + 1, i + 1],
+    )
+    return np.clip((1 - c) * top + c * bottom + 0.5, 0, 255).astype(np.uint8)
+
+
+def pose(x=0.0, y=0.0, z=0.0, turned=(0.0, 0.0, 0.0)):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(turned).as_matrix(), (x, y, z)
+    return T
+
+
+def views(images, poses, T, noise=0.0):
+    H = np.stack([K @ p[:3, :3].T @ T[:3, :3] @ np.linalg.inv(K) for p in poses])
+    b = np.stack([K @ p[:3, :3].T @ (T[:3, 3] - p[:3, 3]) for p in poses])
+    return Views(np.stack(images), H, b, np.full(len(poses), noise))
+
+
+MOVED = [pose(0.06, 0.01), pose(0.16, -0.03, 0.02, (0.01, -0.02, 0.03)), pose(0.35, 0.02, -0.05, (0.0, 0.03, -0.05))]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    image = plane(0, np.eye(4))
+    pixel, strength = np.zeros((9, 12, 2)), np.zeros((9, 12))
+    best_pixels(image, 8, pixel, strength)
+    return image, pixel[strength > 0], [plane(0, T) for T in MOVED]
+
+
+def test_one_view_agrees_with_the_loops(scene):
+    image, pixel, others = scene
+    for k in range(3):
+        given = views(others[k : k + 1], MOVED[k : k + 1], np.eye(4))
+        search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0)
+        found = measure(image, pixel, given, search)
+        chosen = np.flatnonzero(found.agreed == 1)[:6]
+        assert len(chosen) == 6
+        for n in chosen:
+            rho, score = oracle_dense.along_line(image, others[k], pixel[n], given.H[0], given.b[0], 0.4, 0.6)
+            assert score > 0.95
+            ends = [oracle_dense.project(pixel[n], r, given.H[0], given.b[0]) for r in (0.4, 0.6)]
+            speed = np.linalg.norm(ends[1] - ends[0]) / 0.2
+            assert abs(found.rho[n] - rho) * speed < 0.1, "a tenth of a pixel"
+
+
+def test_a_plane_is_where_it_is_and_as_uncertain_as_stated(scene):
+    image, pixel, others = scene
+    found = measure(image, pixel, views(others, MOVED, np.eye(4)), SEARCH)
+    fine = (found.agreed >= 2) & (found.contradicted == 0)
+    assert fine.mean() > 0.5
+    error = found.rho[fine] - 0.5
+    assert np.median(np.abs(error)) < 0.004
+    assert np.abs(error / np.sqrt(found.variance[fine])).max() < 8
+    assert np.nanmedian(np.abs(found.across[fine])) < 0.1, "the poses are exact"
+
+
+def test_the_variance_is_the_smallest_of_the_views_and_follows_the_poses_noise(scene):
+    image, pixel, others = scene
+    each = [
+        measure(image, pixel, views([o], [T], np.eye(4)), Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0))
+        for o, T in zip(others, MOVED, strict=True)
+    ]
+    together = measure(image, pixel, views(others, MOVED, np.eye(4)), Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0))
+    all_agree = (together.agreed == 3) & np.all([one.agreed > 0 for one in each], axis=0)
+    assert all_agree.sum() > 20
+    smallest = np.min([np.where(one.agreed > 0, one.variance, np.inf) for one in each], axis=0)
+    # the patch is warped at the depth known so far, so that residuals differ a little
+    np.testing.assert_allclose(together.variance[all_agree], smallest[all_agree], rtol=0.5)
+    noisy = measure(image, pixel, views(others[2:], MOVED[2:], np.eye(4), noise=0.25), SEARCH)
+    clean = measure(image, pixel, views(others[2:], MOVED[2:], np.eye(4)), SEARCH)
+    both = (noisy.agreed > 0) & (clean.agreed > 0)
+    speed = 90 * 0.35  # [px m]
+    assert (noisy.variance - clean.variance)[both].min() > 0.8 * 0.25 / speed**2
+
+
+def test_poses_that_are_wrong_show_across_the_line(scene):
+    image, pixel, others = scene
+    wrong = [T.copy() for T in MOVED]
+    for T in wrong:
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec([0.008, 0, 0]).as_matrix()  # .7 px, across
+    found = measure(image, pixel, views(others, wrong, np.eye(4)), SEARCH)
+    assert 0.4 < np.nanmedian(np.abs(found.across[found.agreed > 0])) < 1.0
+
+
+def test_no_contrast_no_depth():
+    flat = np.full((72, 96), 90, np.uint8)
+    pixel = np.array([[40.0, 30.0]])
+    found = measure(flat, pixel, views([flat] * 3, MOVED, np.eye(4)), SEARCH)
+    assert found.agreed.tolist() == [0]
+    strength = np.zeros((9, 12))
+    best_pixels(flat, 8, np.zeros((9, 12, 2)), strength)
+    assert (strength == 0).all()
+
+
+def test_the_best_pixel_of_a_cell_has_the_largest_gradient():
+    image = np.random.default_rng(3).integers(0, 255, (40, 48)).astype(np.uint8)
+    pixel, strength = np.zeros((5, 6, 2)), np.zeros((5, 6))
+    best_pixels(image, 8, pixel, strength)
+    x = image.astype(int)
+    for j in range(5):
+        for i in range(6):
+            inside = [
+                ((x[v, u + 1] - x[v, u - 1]) ** 2 + (x[v + 1, u] - x[v - 1, u]) ** 2, u, v)
+                for v in range(max(8 * j, 6), min(8 * j + 8, 34))
+                for u in range(max(8 * i, 6), min(8 * i + 8, 42))
+            ]
+            assert strength[j, i] == max(inside)[0]
+            assert (strength[j, i], *pixel[j, i]) in inside
+
+
+def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene):
+    image, _, others = scene
+    pixel = np.array([[40.0, 30.0], [60.0, 44.0]])
+    point = np.concatenate([pixel, np.ones((2, 1))], 1) @ np.linalg.inv(K).T * 2.0
+    kept = (point, np.tile(np.eye(4), (2, 1, 1)), np.full(2, 0.01), patches(image, pixel))
+    for view, T in zip(others, MOVED, strict=True):
+        found, depth, spread, shown = sight(view, *kept, T, K)
+        cam = (point - T[:3, 3]) @ T[:3, :3]
+        np.testing.assert_allclose(found, cam[:, :2] / cam[:, 2:] * 90 + K[:2, 2], atol=1e-9)
+        np.testing.assert_allclose(depth, cam[:, 2], atol=1e-12)
+        np.testing.assert_allclose(spread, 0.01 * np.abs(point @ T[:3, 2]), atol=1e-12)
+        assert shown.tolist() == [1, 1]
+    hidden = others[0].copy()
+    hidden[20:60, 30:50] = plane(9, np.eye(4))[20:60, 30:50]
+    assert sight(hidden, *kept, MOVED[0], K)[3].tolist() == [-1, 1]
+    assert sight(others[0], *kept, pose(turned=(0, np.pi, 0)), K)[3].tolist() == [0, 0], "behind the camera"

@@ -1,0 +1,229 @@
+"""Frames that nobody should send, thousands of them: state, streams and errors stay in order.
+
+``pytest -m slow tests/test_hostile.py`` takes in 1,000 frames, ``UFMSTAR_HOSTILE_FRAMES=10000`` as many as it says.
+Frames come in sessions of 20, one seed each, so that a failure repeats by its session's number alone.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import torch
+
+import scenes
+from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.state import UfMStarState
+
+H, W, LENGTH = 24, 32, 20
+FRAMES = int(os.environ.get("UFMSTAR_HOSTILE_FRAMES", "1000"))
+DOCUMENTED = (TypeError, ValueError)  # UfMStar.forward's "Raises"
+EXTREME = (0.0, -1.0, np.nan, np.inf, -np.inf, 1e-45, 1e-30, 1e-7, 1e-6, 1e-3, 1e3, 1e6, 1.1e6, 1e12, 1e20, 3e38)
+K = scenes.intrinsics(H, W)
+
+
+def spread(rng, shape):
+    """Values from 1e-8 to 1e8, and a few that are extreme."""
+    values = 10 ** rng.uniform(-8, 8, shape)
+    return np.where(rng.random(shape) < 0.05, rng.choice(EXTREME, shape), values)
+
+
+def depth_map(rng):
+    """[H, W] a scene at any scale, a plane, steps, noise or rubbish, with holes and extreme pixels."""
+    v, u = np.mgrid[:H, :W]
+    kind = rng.integers(6)
+    if kind == 0:
+        depth = scenes.render(scenes.look(rng.normal(size=3) * 0.2, rng.normal() * 0.3), K, H, W)
+    elif kind == 1:
+        depth = 1 + rng.normal() * 0.02 * u + rng.normal() * 0.02 * v
+    elif kind == 2:
+        depth = rng.uniform(0.5, 5) + rng.choice([0.0, 1.0, 50.0]) * ((u // rng.integers(1, 9) + v // 4) % 2)
+    elif kind == 3:
+        depth = np.full((H, W), rng.choice(EXTREME))
+    else:
+        depth = spread(rng, (H, W)) if kind == 4 else rng.uniform(0.5, 4) + rng.normal(size=(H, W)) * rng.uniform(0, 1)
+    depth = depth * rng.choice([1.0, 1.0, 1.0, 1e-4, 1e3, 1e5])
+    at = rng.random((H, W)) < rng.choice([0.0, 0.01, 0.5])
+    return np.where(at, rng.choice(EXTREME, (H, W)), depth)
+
+
+def pose(rng, i):
+    """[4, 4] along a path, or far away, turned about, not rigid, not finite."""
+    T = scenes.look([0.02 * i, 0, 0], 0.01 * i)
+    kind = rng.integers(12)
+    if kind == 0:
+        T[:3, 3] = rng.normal(size=3) * 10 ** rng.uniform(0, 11)
+    elif kind == 1:
+        T = scenes.look(rng.normal(size=3), rng.uniform(-4, 4), rng.uniform(-4, 4))
+    elif kind == 2:
+        T[:3, :3] += rng.normal(size=(3, 3)) * 10 ** rng.uniform(-6, 0)
+    elif kind == 3:
+        T[rng.integers(4), rng.integers(4)] = rng.choice(EXTREME)
+    elif kind == 4:
+        T[:3, 0] *= -1
+    return T
+
+
+def camera(rng):
+    """[3, 3] as it is, or off in one entry."""
+    matrix = K.copy()
+    if rng.integers(8) == 0:
+        matrix[rng.integers(3), rng.integers(3)] = rng.choice([*EXTREME, 5.0, 31.0, 400.0])
+    return matrix
+
+
+def anchors(rng, count):
+    """(pixel, depth, variance, valid) of one stream."""
+    pixel = np.stack([rng.uniform(-3, W + 3, count), rng.uniform(-3, H + 3, count)], -1)
+    odd = rng.random(count) < 0.1
+    pixel[odd] = rng.choice(EXTREME, (int(odd.sum()), 2))
+    plain = rng.uniform(0.5, 5, count), rng.uniform(0, 0.01, count)
+    depth, variance = (np.where(rng.random(count) < 0.2, spread(rng, count), values) for values in plain)
+    return pixel, depth, variance, rng.random(count) < 0.9
+
+
+def one_stream(rng, i, config, dtype):
+    """The arguments of one stream, without a batch dimension."""
+    made = {
+        "depth": depth_map(rng), "pose": pose(rng, i), "intrinsics": camera(rng),
+        "aleatoric": spread(rng, (H, W)), "epistemic": 10 ** rng.uniform(-6, 0, (H, W)),
+        "features": spread(rng, (config.features, H, W)),
+    }  # fmt: skip
+    exact = ("pose", "intrinsics")
+    with np.errstate(over="ignore"):
+        given = {n: torch.tensor(value, dtype=torch.float64 if n in exact else dtype) for n, value in made.items()}
+    given["valid"] = torch.tensor(rng.random((H, W)) < rng.choice([0.0, 0.5, 1.0]))
+    given["anchors"] = tuple(torch.tensor(part) for part in anchors(rng, 30))
+    return given
+
+
+def batch(streams, names):
+    """Arguments of UfMStar for several streams; those optional ones that are named."""
+    given = {
+        n: torch.stack([one[n] for one in streams]) for n in ("depth", "pose", "intrinsics", *names) if n != "anchors"
+    }
+    if "anchors" in names:
+        parts = zip(*(one["anchors"] for one in streams), strict=True)
+        given["anchors"] = Anchors(*(torch.stack(part) for part in parts))
+    return given
+
+
+def configuration(rng):
+    """Any of the settings that change what happens to a frame."""
+    return UfMStarConfig(
+        segment=SPGFConfig(
+            min_pixels=int(rng.choice([1, 20])), min_rows=1, prune=str(rng.choice(["both", "none"])),
+            max_depth=[None, 20.0][rng.integers(2)], scale_with_image=bool(rng.integers(2)),
+        ),
+        aleatoric_in_moments=bool(rng.integers(2)),
+        disagreement=str(rng.choice(["w2", "overlap"])),
+        overlap_weighted=bool(rng.integers(2)),
+        unmeasured=str(rng.choice(["paper", "prior", "relative", "nan"])), prior_mean=0.25,
+        regression=str(rng.choice(["exact", "neighbourhood"])),
+        variance_floor=float(rng.choice([0.0, 1e-4])),
+        ema_alpha=float(rng.choice([0.5, 1.0])),
+        anchored=bool(rng.integers(2)),
+        features=int(rng.integers(2)),
+        max_components=[None, 1, 30][rng.integers(3)],
+        initial_capacity=int(rng.choice([1, 64])),
+        merge=float(rng.choice([0.0, 1.0])), merge_every=3,
+        on_bad_frame=str(rng.choice(["skip", "skip", "raise"])),
+        backend="torch" if rng.integers(10) == 0 else "auto",
+    )  # fmt: skip
+
+
+def spoil(rng, given):
+    """One argument of a wrong kind, size or device."""
+    name = str(rng.choice(list(given)))
+    value = given[name]
+    wrong = ["a map", 3, None, [1.0], np.ones((2, 3))]
+    if isinstance(value, torch.Tensor):
+        wrong += [value[:1, 1:], value.flatten(), value.to(torch.complex64), value.to("meta"), value[:0]]
+    return given | {name: wrong[rng.integers(len(wrong))]}
+
+
+def same(one, other):
+    """Equal bits, NaN where NaN."""
+    return torch.equal(torch.nan_to_num(one, nan=-1.0), torch.nan_to_num(other, nan=-1.0))
+
+
+def assert_in_order(ufm, session):
+    """The state is one that a run may have."""
+    try:
+        UfMStarState(**{name: getattr(ufm, name) for name in ufm.STATE}).require(ufm.config)
+    except ValueError as error:
+        raise AssertionError(f"session {session}: {error}") from error
+
+
+def assert_sound(out, config, session):
+    """No NaN where a pixel was used, unless it was asked for; no value below 0."""
+    values = out.variance[out.valid]
+    assert bool(out.variance[~out.valid].isnan().all()), session
+    assert not bool(values.isinf().any()), session
+    if config.unmeasured != "nan":
+        assert not bool(values.isnan().any()), session
+    assert not bool((values < 0).any()), session
+
+
+def run_session(session):
+    """20 frames of two streams, beside a twin whose first stream sees other frames."""
+    rng = np.random.default_rng(session)
+    config, dtype = configuration(rng), [torch.float32, torch.float64, torch.float16, torch.bfloat16][rng.integers(4)]
+    ufm, twin = UfMStar(config), UfMStar(config)
+    taken, compared = 0, config.on_bad_frame == "skip"
+    for i in range(LENGTH):
+        hostile, watched, other = (one_stream(rng, i, config, dtype) for _ in range(3))
+        names = [n for n in ("aleatoric", "epistemic", "valid", "anchors") if rng.integers(2)]
+        names = [n for n in names if n != "anchors" or config.anchored] + ["features"] * config.features
+        given, spoilt = batch([hostile, watched], names), rng.integers(6) == 0
+        before = {name: value.clone() for name, value in ufm.state_dict().items()}
+        try:
+            out = ufm(**(spoil(rng, given) if spoilt else given))
+        except DOCUMENTED:
+            after = ufm.state_dict()
+            assert all(same(after[name], value) for name, value in before.items()), f"session {session}, {i}"
+            continue
+        taken += 1
+        assert_in_order(ufm, session)
+        assert_sound(out, config, session)
+        compared = compared and not spoilt  # an optional argument that was left out is taken in, but by one of them
+        if compared:
+            beside = twin(**batch([other, watched], names))
+            for name in ("variance", "disagreement", "labels"):
+                assert same(*(getattr(one, name)[1] for one in (out, beside))), f"session {session}, {i}: {name}"
+    return taken
+
+
+@pytest.mark.parametrize("session", range(2))
+def test_a_few_hostile_frames(session):
+    assert run_session(session) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("part", range(10))
+def test_thousands_of_hostile_frames(part):
+    sessions = range(part, max(FRAMES // LENGTH, 10), 10)
+    taken = sum(run_session(session) for session in sessions)
+    assert taken > 0.3 * LENGTH * len(sessions), "most frames must get as far as the algorithm"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("aleatoric_in_moments", [False, True])
+def test_covariances_are_positive_definite_after_3000_fusions(aleatoric_in_moments):
+    """A camera that moves to and fro before noisy boxes, whose network is sure at some pixels and lost at others."""
+    segment = SPGFConfig(min_pixels=10, min_rows=1, prune="none")
+    ufm = UfMStar(UfMStarConfig(segment=segment, aleatoric_in_moments=aleatoric_in_moments, merge=1.0))
+    rng, fusions = np.random.default_rng(0), 0
+    for i in range(400):
+        T = scenes.look([0.3 * np.sin(0.2 * i), 0.02 * np.cos(0.3 * i), 0], 0.1 * np.sin(0.11 * i))
+        depth = scenes.render(T, K, H, W) * (1 + 0.02 * rng.normal(size=(H, W)))
+        A = torch.tensor(10 ** rng.uniform(-9, 4, (1, H, W)))
+        out = ufm(torch.tensor(depth)[None], torch.tensor(T), torch.tensor(K), A)
+        fusions += int(out.statistics.pairs)
+        if i % 20 == 0:
+            assert_in_order(ufm, i)
+    assert_in_order(ufm, "last")
+    assert fusions > 3000

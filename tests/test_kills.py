@@ -1,0 +1,174 @@
+"""``ufmstar eval``, ``report``, ``train`` and ``demo`` killed at any moment: finished work stays, and a second start
+completes as if nothing had happened. (``ufmstar run``: tests/test_run.py.)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import torch
+from suite_runs import TRUTH, kept, write_rooms
+from test_demo import weights  # noqa: F401 (a fixture)
+from trainings import write_frames
+
+from ufmstar_torch.models.checkpoints import read_safetensors
+from ufmstar_torch.train.member import RESULT, WEIGHTS
+
+KILLS = 2
+SUITE = """
+title = "Kills"
+[[rows]]
+methods = ["DepthOnly", "UfM-DepthOnly", "UfM*-DepthOnly"]
+"""
+TRAINING = (
+    "--preset fastdepth-ensemble --members 2 --data sequences --part 0:12 --validation-part 12:16 --epochs 2 "
+    "--batch-size 4 --network.widths 0.05 --network.size [32,32] --network.preprocess resize --checkpoint-every 2"
+)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+def start(words):
+    """The program in a process of its own, one thread."""
+    command = [sys.executable, "-P", "-m", "ufmstar_torch.cli", *map(str, words)]
+    alone = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, env=os.environ | alone, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+    )
+
+
+def finish(words):
+    """An undisturbed process."""
+    process = start(words)
+    _, said = process.communicate(timeout=300)
+    assert process.returncode == 0, said.decode()
+
+
+def kill_at(words, out, files, delay):
+    """SIGKILL to the process and its children, ``delay`` [s] after it has written so many files to ``out``; whether it
+    was still at it."""
+    began, process = time.time(), start(words)
+    while process.poll() is None and written_since(out, began) < files:
+        time.sleep(0.02)
+    time.sleep(delay)
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    return process.returncode == -signal.SIGKILL
+
+
+def written_since(out, began):
+    """Files in a folder that are younger than a time [s]."""
+    count = 0
+    for path in out.rglob("*"):
+        with suppress(FileNotFoundError):  # a temporary file
+            count += path.is_file() and path.stat().st_mtime >= began
+    return count
+
+
+def killed_and_finished(words, again, out, whole, seed, finished):
+    """Kill a command a few times at random moments of its work, then let it finish.
+
+    Args:
+        words: of the first start.
+        again: of the others.
+        out: its folder.
+        whole: the folder of an undisturbed one.
+        seed: of the moments.
+        finished: what is finished so far, by name: it must stay as it is.
+    """
+    draw, kills, known = random.Random(seed), 0, {}
+    files = written_since(whole, 0)
+    for _ in range(KILLS):
+        at, delay = 1 + draw.randrange(max(1, int(0.6 * files))), draw.uniform(0, 0.3)
+        kills += kill_at(again if kills else words, out, at, delay)
+        after = finished()
+        assert {name: after.get(name) for name in known} == known, "finished work is lost"
+        known = after
+    finish(again)
+    assert {name: finished().get(name) for name in known} == known, "finished work was done again otherwise"
+    assert kills > 0
+
+
+def content(folder, *patterns):
+    """The bytes of files by name."""
+    files = sorted(path for pattern in patterns for path in folder.glob(pattern) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def without_clock(value):
+    """Plain values without what a clock or a path says, at any depth."""
+    if isinstance(value, dict):
+        dropped = ("ms", "time", "seconds", "out", "memory", "versions", "machine")
+        return {key: without_clock(item) for key, item in value.items() if key not in dropped}
+    return [without_clock(item) for item in value] if isinstance(value, list) else value
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory):
+    """Words of an evaluation but for its folder, and that folder after an undisturbed one."""
+    place = tmp_path_factory.mktemp("evaluation")
+    rooms = write_rooms(place / "rooms", frames=6)
+    (place / "kills.toml").write_text(SUITE)
+    words = ["eval", "--suite", place / "kills.toml", "--network", TRUTH, "--root", f"rooms={rooms}", "--threads", 1]
+    finish([*words, "--out", place / "whole"])
+    return words, place / "whole"
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_eval(evaluation, tmp_path, seed):
+    words, whole = evaluation
+    out = tmp_path / "out"
+    words = [*words, "--out", out]
+    killed_and_finished(words, [*words, "--resume"], out, whole, seed, lambda: content(out, "records/*/*/*.json"))
+    assert kept(out) == kept(whole)
+    assert content(out, "tables/*").keys() == content(whole, "tables/*").keys()
+    assert not list(out.rglob(".*.tmp"))
+
+
+def test_report(evaluation, tmp_path):
+    whole = evaluation[1]
+    first, again = tmp_path / "first", tmp_path / "again"
+    for copy in (first, again):
+        shutil.copytree(whole, copy)
+        for made in ("tables", "figures"):
+            shutil.rmtree(copy / made)
+    words = ["report", again]
+    finish(["report", first])
+    killed_and_finished(words, words, again, first / "tables", 3, lambda: content(again, "records/*/*/*"))
+    made = ("tables/*", "figures/*.json", "results.csv", "table.csv", "figures/*.png")
+    assert content(again, *made) == content(first, *made)
+    assert (again / "report.html").stat().st_size == (first / "report.html").stat().st_size
+    assert not list(again.rglob(".*.tmp"))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_train(tmp_path, seed):
+    frames = write_frames(tmp_path / "frames")
+    words = ["train", *TRAINING.split(), "--root", frames, "--threads", 1, "--out"]
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    finish([*words, whole])
+    again = [*words, out, "--resume"]
+    killed_and_finished([*words, out], again, out, whole, seed, lambda: content(out, f"member_*/{RESULT}"))
+    for member in ("member_0", "member_1"):
+        mine, theirs = (read_safetensors(folder / member / WEIGHTS)[0] for folder in (out, whole))
+        assert [name for name in theirs if not torch.equal(mine[name], theirs[name])] == []
+
+
+def test_demo(weights, tmp_path):  # noqa: F811
+    words = ["demo", "--weights", weights, "--frames", 5, "--seed", 5, "--threads", 1, "--out"]
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    finish([*words, whole])
+    killed_and_finished([*words, out], [*words, out, "--overwrite"], out, whole, 4, dict)
+    assert content(out, "*.ply", "*.png") == content(whole, "*.ply", "*.png")
+    mine, theirs = (json.loads(Path(folder / "summary.json").read_text()) for folder in (out, whole))
+    assert without_clock(mine) == without_clock(theirs)

@@ -1,0 +1,187 @@
+"""The posterior: three tiers against each other, closed forms, and what UfM* makes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import oracle_posterior as oracle
+import pytest
+import torch
+
+from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.anchors.given import check_anchors
+from ufmstar_torch.frame import check_frame
+from ufmstar_torch.kernels import posterior_cpu
+from ufmstar_torch.posterior.distance import distance
+from ufmstar_torch.posterior.field import solve
+from ufmstar_torch.posterior.running import SIZE
+from ufmstar_torch.posterior.update import REFERENCE, PosteriorKernels, update
+
+COMPILED = PosteriorKernels(posterior_cpu.solve, posterior_cpu.distance, posterior_cpu.read)
+CONFIG = UfMStarConfig(anchored=True, posterior=True)
+K = torch.tensor([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
+
+
+def scene(seed, size=(36, 48), n=60):
+    """Depth [H, W] with a step and a hole, the true factor g/d at every pixel, V, and anchors."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: size[0], : size[1]] / np.array(size)[:, None, None]
+    depth = np.where((u > 0.4) & (v < 0.7), 1.2, 3.0) + 0.3 * v
+    factor = np.exp(0.3 + 0.2 * u - 0.1 * np.cos(5 * v) + np.where(depth < 2, 0.2, 0))
+    depth[3:6, 5:7] = 0
+    rows, cols = np.nonzero(depth)
+    chosen = rng.permutation(len(rows))[:n]
+    rows, cols = rows[chosen], cols[chosen]
+    g = depth[rows, cols] * factor[rows, cols] * np.exp(0.02 * rng.standard_normal(n))
+    g[: n // 20] *= 2.5  # outliers
+    pixel = np.stack([cols, rows], -1) + rng.uniform(-0.4, 0.4, (n, 2))
+    return depth, factor, np.full(size, 0.04), pixel, g, (rng.uniform(0.01, 0.3, n) * g) ** 2
+
+
+def checked(depth, pixel, g, variance):
+    frame = check_frame(torch.from_numpy(depth)[None], torch.eye(4)[None], K[None], None, None, None, None,
+                        feature_count=0, rotation_tolerance=0.01)  # fmt: skip
+    given = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, variance)))
+    return frame, check_anchors(given, frame, None)
+
+
+@pytest.mark.parametrize("kernels", [REFERENCE, COMPILED], ids=["torch", "numba"])
+def test_values_against_the_oracle_over_frames(kernels):
+    state, packed = oracle.start(), torch.zeros(1, SIZE, dtype=torch.float64)
+    for seed in range(2):
+        depth, _, claimed, *anchors = scene(seed, (12, 16), 40)
+        state, expected, variance = oracle.update(state, depth, claimed, *anchors)
+        packed, out = update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], kernels)
+        np.testing.assert_allclose(out.depth[0], expected, rtol=1e-8)
+        np.testing.assert_allclose(out.variance[0], variance, rtol=1e-7)
+        assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
+        assert float(out.unseen) == pytest.approx(oracle.ratio(state, "unseen"), rel=1e-7)
+
+
+def test_compiled_field_and_distance_equal_the_reference():
+    rng = np.random.default_rng(0)
+    rows, cols = 5, 9
+    n = rows * cols
+    right, down, diagonal = (torch.from_numpy(rng.uniform(0.1, 9, (2, n))) for _ in range(3))
+    right[:, cols - 1 :: cols] = down[:, -cols:] = 0
+    Y = torch.from_numpy(rng.standard_normal((2, n, 4)))
+    one, other = solve(diagonal, right, down, Y, cols), posterior_cpu.solve(diagonal, right, down, Y, cols)
+    torch.testing.assert_close(one.columns, other.columns, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(one.variance, other.variance, rtol=1e-10, atol=0)
+    across, along = (torch.where(x > 0, x / 20, torch.inf) for x in (right, down))
+    source = torch.from_numpy(rng.random((2, n)) < 0.05)
+    one, other = (tier(source, across, along, cols, 0.6) for tier in (distance, posterior_cpu.distance))
+    assert torch.equal(one, other)
+
+
+def test_anchors_correct_a_wrong_scale_and_the_variance_covers_what_is_left():
+    packed = torch.zeros(1, SIZE, dtype=torch.float64)
+    for seed in range(4):
+        depth, factor, claimed, *anchors = scene(seed, n=120)
+        packed, out = update(packed, *checked(depth, *anchors), torch.from_numpy(claimed)[None], COMPILED)
+    seen, truth = depth > 0, depth * factor
+    error = (out.depth[0].numpy() - truth)[seen]
+    assert np.sqrt((error**2).mean()) < 0.25 * np.sqrt(((depth - truth)[seen] ** 2).mean())
+    assert 0.02 < (error**2 / out.variance[0].numpy()[seen]).mean() < 1.5  # of few anchors it is cautious
+
+
+def test_a_weak_anchor_pulls_what_is_nearer_and_hardly_what_is_farther():
+    """sigma = .6 of the depth: without parallax 1/g may be almost 0, but not two times as large."""
+    depth, claimed = np.full((36, 48), 2.0), np.full((36, 48), 0.04)
+    pixel = np.array([[24.0, 18.0]])
+    moved = []
+    for factor in (2.0, 0.5):
+        g = np.full(len(pixel), 2.0 * factor)
+        out = update(torch.zeros(1, SIZE), *checked(depth, pixel, g, (0.6 * g) ** 2), torch.from_numpy(claimed)[None])[
+            1
+        ]
+        moved.append(abs(float((out.depth / 2).log().mean())))
+    assert moved[0] > 1.5 * moved[1]
+
+
+def test_far_from_evidence_the_variance_is_larger_and_contains_what_ufm_star_claims():
+    depth, _, _, pixel, g, variance = scene(0, n=120)
+    near = pixel[:, 0] < 12
+    frame, anchors = checked(depth, pixel[near], g[near], variance[near])
+    small, large = (
+        update(torch.zeros(1, SIZE), frame, anchors, torch.full((1, 36, 48), v).double(), COMPILED)[1].variance[0]
+        for v in (0.0, 0.5)
+    )
+    assert float(small[:, 44:].mean() / small[8:, :10].mean()) > 4
+    assert float((large - small)[:, 44:].mean()) > 0.2
+    assert float((large - small)[8:, :8].mean()) < 0.1
+
+
+def ufm_frames(n=3, streams=1):
+    for seed in range(n):
+        depth, _, _, pixel, g, variance = scene(seed)
+        T = torch.eye(4, dtype=torch.float64)
+        T[0, 3] = 0.05 * seed
+        anchors = Anchors(*(torch.from_numpy(x)[None].repeat(streams, *[1] * x.ndim) for x in (pixel, g, variance)))
+        yield torch.from_numpy(depth)[None].repeat(streams, 1, 1).float(), T, anchors
+
+
+def test_before_the_first_anchor_it_is_plain_ufm_star_to_the_bit():
+    plain, posterior = UfMStar(), UfMStar(CONFIG)
+    for depth, T, _ in ufm_frames():
+        a, b = plain(depth, T, K), posterior(depth, T, K)
+        assert torch.equal(a.variance.nan_to_num(), b.posterior()[1].nan_to_num())
+        assert torch.equal(torch.where(b.valid, depth, 0), b.posterior()[0].nan_to_num())
+        assert torch.equal(a.variance.nan_to_num(), b.variance.nan_to_num())
+        assert bool(b.statistics.calibration.isnan())
+    with pytest.raises(ValueError, match="posterior needs"):
+        a.posterior()
+
+
+def test_a_frame_without_anchors_keeps_the_correction_and_learns_nothing():
+    ufm = UfMStar(CONFIG)
+    for depth, T, anchors in ufm_frames():
+        ufm(depth, T, K, anchors=anchors)
+    learnt = ufm.posterior.clone()
+    out = ufm(depth, T, K)
+    assert torch.equal(learnt, ufm.posterior)
+    ratio = (out.posterior()[0] / depth)[out.valid]
+    assert 1.1 < float(ratio.median()) < 2
+
+
+def test_state_saved_and_loaded_goes_on_to_the_bit():
+    frames = list(ufm_frames(4))
+    whole, first, second = (UfMStar(CONFIG) for _ in range(3))
+    for depth, T, anchors in frames[:2]:
+        whole(depth, T, K, anchors=anchors)
+        first(depth, T, K, anchors=anchors)
+    second.load_state_dict(first.state_dict())
+    for depth, T, anchors in frames[2:]:
+        a, b = (m(depth, T, K, anchors=anchors).posterior() for m in (whole, second))
+        assert all(torch.equal(x.nan_to_num(), y.nan_to_num()) for x, y in zip(a, b, strict=True))
+    second.reset([0])
+    assert not bool(second.posterior.any())
+    whole.reset(keep_evidence=True)
+    assert bool(whole.posterior.any())
+
+
+def test_a_state_from_before_there_was_a_posterior_loads():
+    old = UfMStar(UfMStarConfig(anchored=True))
+    for depth, T, anchors in ufm_frames(2, streams=2):
+        old(depth, T, K, anchors=anchors)
+    state = {k: v for k, v in old.state_dict().items() if k != "posterior"}
+    new = UfMStar(UfMStarConfig(anchored=True))
+    new.load_state_dict(state)
+    assert new.posterior.shape == (2, 0)
+
+
+def test_streams_are_independent():
+    together, alone = UfMStar(CONFIG), UfMStar(CONFIG)
+    for depth, T, anchors in ufm_frames(streams=2):
+        silent = dataclasses.replace(anchors, valid=torch.stack([torch.ones(60), torch.zeros(60)]).bool())
+        both = together(depth, T, K, anchors=silent)
+        one = alone(depth[:1], T, K, anchors=Anchors(anchors.pixel[:1], anchors.depth[:1], anchors.variance[:1]))
+        torch.testing.assert_close(both.posterior()[0][:1], one.posterior()[0], rtol=1e-5, atol=0, equal_nan=True)
+    assert torch.equal(both.posterior()[1][1].nan_to_num(), both.variance[1].nan_to_num())
+
+
+def test_posterior_needs_anchors():
+    with pytest.raises(ValueError, match="posterior needs anchored"):
+        UfMStarConfig(posterior=True)

@@ -1,0 +1,192 @@
+"""Landmarks that a camera has measured: remembered, seen again, confirmed or refuted. Of fixed size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+# A landmark is measured again where the camera has moved by this share of its depth since; times one more for every
+# confirmation, up to _SELDOM.
+_DUE, _SELDOM = 0.04, 4
+# Confirmed where two measurements differ by at most so many standard deviations, and this share of the inverse depth.
+_SIGMAS, _SHARE = 3.5, 0.01
+# Failures in a row, beyond the number of confirmations, after which a landmark is forgotten.
+_FAILURES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Sighted:
+    """Landmarks as the present view shows them.
+
+    Attributes:
+        slot: [n] in the memory.
+        pixel: [n, 2] (u, v).
+        rho: [n] inverse depth [1/m].
+        variance: [n] of ``rho`` [1/m^2].
+        due: [n] bool, to be measured again.
+    """
+
+    slot: NDArray[np.int64]
+    pixel: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    due: NDArray[np.bool_]
+
+
+class Memory:
+    """At most ``count`` landmarks.
+
+    Attributes:
+        confirmed: [count] in how many later views each was confirmed.
+        frame: images so far.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        from ufmstar_torch.kernels.dense_cpu import SIDE
+
+        n = self._count
+        self._point, self._pose = np.zeros((n, 3)), np.tile(np.eye(4), (n, 1, 1))
+        self._sigma = np.zeros(n)  # of the distance from the camera that measured it, as a share
+        self._patch = np.zeros((n, SIDE, SIDE), np.float32)
+        self._used = np.zeros(n, dtype=np.bool_)
+        self.confirmed, self._failed, self._seen = (np.zeros(n, np.int64) for _ in range(3))
+        self.frame = 0
+
+    def state(self) -> dict[str, Tensor]:
+        """A copy of all that is remembered, for :meth:`load_state`."""
+        held = {name: torch.tensor(getattr(self, attribute)) for name, attribute in _HELD.items()}
+        return held | {"landmark_frame": torch.tensor(self.frame)}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where :meth:`state` was taken.
+
+        Raises:
+            ValueError: another number of landmarks.
+        """
+        if len(state["landmark_point"]) != self._count:
+            raise ValueError(f"state must be of {self._count} landmarks, got {len(state['landmark_point'])}")
+        for name, attribute in _HELD.items():
+            setattr(self, attribute, np.array(state[name].numpy()))
+        self.frame = int(state["landmark_frame"])
+
+    def sighted(
+        self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64], cell: int
+    ) -> Sighted:
+        """The landmarks that an image shows, at most one in a cell; those that it should show and does not, fail.
+
+        Args:
+            image: [H, W].
+            T_world_cam: [4, 4] [m].
+            K: [3, 3] [px].
+            cell: side of a cell [px].
+        """
+        from ufmstar_torch.kernels.sight_cpu import sight
+
+        self.frame += 1
+        used = np.flatnonzero(self._used)
+        pixel, depth, spread, shown = sight(
+            image, self._point[used], self._pose[used], self._sigma[used], self._patch[used], T_world_cam, K
+        )
+        self._seen[used[shown > 0]] = self.frame
+        self._failed[used[shown > 0]] = 0
+        self._failed[used[shown < 0]] += 1
+        self._forget(used[shown < 0])
+        # In every cell the one that is confirmed most often, the least uncertain one of them.
+        order = np.lexsort((spread / np.maximum(depth, 1e-9), -self.confirmed[used]))
+        order = order[shown[order] > 0]
+        column, row = (pixel[order] / cell).astype(np.int64).T
+        _, first = np.unique(row * 100_000 + column, return_index=True)
+        kept = order[first]
+        self._used[np.setdiff1d(used[order], used[kept])] = False
+        slot = used[kept]
+        moved = np.linalg.norm(self._pose[slot, :3, 3] - T_world_cam[:3, 3], axis=1)
+        due = moved >= _DUE * depth[kept] * np.minimum(1 + self.confirmed[slot], _SELDOM)
+        rho = 1 / depth[kept]
+        return Sighted(slot, pixel[kept], rho, np.square(spread[kept] * rho * rho), due)
+
+    def _forget(self, slot: NDArray[np.int64]) -> None:
+        self._used[slot[self._failed[slot] > _FAILURES + self.confirmed[slot]]] = False
+
+    def compare(
+        self, sighted: Sighted, rho: NDArray[np.float64], variance: NDArray[np.float64], measured: NDArray[np.bool_]
+    ) -> tuple[Sighted, NDArray[np.bool_], NDArray[np.float64]]:
+        """Confirm or refute landmarks by new measurements.
+
+        Args:
+            sighted: n of them.
+            rho: [n] measured now [1/m].
+            variance: [n] of ``rho`` [1/m^2].
+            measured: [n] which were.
+
+        Returns:
+            The landmarks with both measurements together; [n] which of them are not refuted; [m] of those measured,
+            the squared difference by its variance.
+        """
+        spread, difference = sighted.variance + variance, np.square(rho - sighted.rho)
+        alike = difference <= _SIGMAS**2 * spread + np.square(_SHARE * sighted.rho)
+        confirmed, refuted = measured & alike, measured & ~alike
+        self.confirmed[sighted.slot[confirmed]] += 1
+        self._failed[sighted.slot[refuted]] += 2
+        self._used[sighted.slot[refuted & (self.confirmed[sighted.slot] == 0)]] = False
+        self._forget(sighted.slot[refuted])
+        old, new = 1 / sighted.variance, 1 / np.where(confirmed, variance, 1)
+        both = np.where(confirmed, (sighted.rho * old + rho * new) / (old + new), sighted.rho)
+        # Measurements share keyframes and patches: together they are as certain as the better one.
+        least = np.where(confirmed, np.minimum(sighted.variance, variance), sighted.variance)
+        return Sighted(sighted.slot, sighted.pixel, both, least, sighted.due), ~refuted, (difference / spread)[measured]
+
+    def write(
+        self,
+        slot: NDArray[np.int64] | None,
+        image: NDArray[np.uint8],
+        pixel: NDArray[np.float64],
+        rho: NDArray[np.float64],
+        variance: NDArray[np.float64],
+        T_world_cam: NDArray[np.float64],
+        K: NDArray[np.float64],
+    ) -> None:
+        """Keep landmarks as the present view measured them.
+
+        Args:
+            slot: [n] of those that are kept already; None = new ones, in the place of those not seen for longest.
+            image: [H, W].
+            pixel: [n, 2] (u, v).
+            rho: [n] > 0 [1/m].
+            variance: [n] of ``rho`` [1/m^2].
+            T_world_cam: [4, 4] [m].
+            K: [3, 3] [px].
+        """
+        from ufmstar_torch.kernels.sight_cpu import patches
+
+        if slot is None:
+            age = np.where(self._used, self._seen, -1)
+            slot = np.argsort(age, kind="stable")[: len(rho)]
+            self.confirmed[slot] = 0
+        n = len(slot)
+        rays = np.concatenate([pixel[:n], np.ones((n, 1))], axis=1) @ np.linalg.inv(K).T
+        self._point[slot] = rays / rho[:n, None] @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+        self._pose[slot], self._sigma[slot] = T_world_cam, np.sqrt(variance[:n]) / rho[:n]
+        self._patch[slot] = patches(image, pixel[:n])
+        self._used[slot], self._failed[slot], self._seen[slot] = True, 0, self.frame
+
+
+_HELD = {
+    "landmark_point": "_point",
+    "landmark_pose": "_pose",
+    "landmark_sigma": "_sigma",
+    "landmark_patch": "_patch",
+    "landmark_used": "_used",
+    "landmark_confirmed": "confirmed",
+    "landmark_failed": "_failed",
+    "landmark_seen": "_seen",
+}

@@ -1,0 +1,132 @@
+"""A Gaussian field on the nodes, given what was observed at some: mean, and variance at every node.
+
+    y = x . b + f + noise,      b ~ N(b_0, P),      f ~ N(0, Q^-1)
+
+with the features x and the field f of precision Q: f^T Q f = kappa |f|^2 + sum over links (f_i - f_j)^2 / variance of
+the link. An observation of variance 1/w at node i adds w to Q_ii. b is integrated out by its Schur complement, so the
+only large system is that of the nodes, whose band is as wide as a row of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class SolveKernel(Protocol):
+    """A^-1 columns and the diagonal of A^-1, for A = the diagonal and the links of a grid (:func:`solve`)."""
+
+    def __call__(self, diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: int, /) -> Solved: ...
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Of A x = y on n nodes.
+
+    Attributes:
+        columns: [B, n, q] A^-1 Y.
+        variance: [B, n] diagonal of A^-1.
+    """
+
+    columns: Tensor
+    variance: Tensor
+
+
+def solve(diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: int) -> Solved:
+    """The reference: dense.
+
+    Args:
+        diagonal: [B, n] without the links, positive.
+        right, down: [B, n] precision of the link to the next node in the row, in the column; 0 where there is none.
+        columns: [B, n, q] Y.
+        cols: nodes in a row.
+    """
+    n = diagonal.shape[1]
+    A = torch.diag_embed(diagonal)
+    for step, link in ((1, right[:, : n - 1]), (cols, down[:, : n - cols])):
+        ends = torch.nn.functional.pad(link, (0, step)) + torch.nn.functional.pad(link, (step, 0))
+        beside = torch.diag_embed(link, step) + torch.diag_embed(link, -step)
+        A = A + torch.diag_embed(ends) - beside
+    L = torch.linalg.cholesky(A)
+    return Solved(torch.cholesky_solve(columns, L), torch.cholesky_inverse(L).diagonal(dim1=1, dim2=2))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Before the observations.
+
+    Attributes:
+        diagonal: [B, n] kappa.
+        right, down: [B, n] precisions of the links.
+        mean: [B, F] b_0.
+        precision: [B, F, F] P^-1.
+        cols: nodes in a row.
+    """
+
+    diagonal: Tensor
+    right: Tensor
+    down: Tensor
+    mean: Tensor
+    precision: Tensor
+    cols: int
+
+
+@dataclass(frozen=True)
+class Observed:
+    """N observations, of which some may have the weight 0.
+
+    Attributes:
+        node: [B, N] int64.
+        features: [B, N, F] x.
+        value: [B, N] y.
+    """
+
+    node: Tensor
+    features: Tensor
+    value: Tensor
+
+
+@dataclass(frozen=True)
+class Field:
+    """After the observations.
+
+    Attributes:
+        coefficients: [B, F] mean of b.
+        covariance: [B, F, F] of b.
+        offset: [B, n] mean of f.
+        response: [B, n, F] by how much f gives way to a change of b.
+        variance: [B, n] of f where b is known.
+    """
+
+    coefficients: Tensor
+    covariance: Tensor
+    offset: Tensor
+    response: Tensor
+    variance: Tensor
+
+    @classmethod
+    def given(cls, prior: Prior, observed: Observed, weight: Tensor, kernel: SolveKernel) -> Field:
+        """Condition the prior on the observations with the precisions ``weight`` [B, N]."""
+        weighted = weight[..., None] * observed.features
+        left = observed.value - (observed.features * prior.mean[:, None]).sum(-1)
+        rows = torch.cat([weighted, (weight * left)[..., None], weight[..., None]], -1)
+        nodes = torch.zeros(*prior.diagonal.shape, rows.shape[-1], dtype=rows.dtype, device=rows.device)
+        nodes = nodes.scatter_add(1, observed.node[..., None].expand_as(rows), rows)
+        solved = kernel(prior.diagonal + nodes[..., -1], prior.right, prior.down, nodes[..., :-1], prior.cols)
+        response, offset = solved.columns[..., :-1], solved.columns[..., -1]
+        to_features = nodes[..., :-2].mT
+        precision = prior.precision + weighted.mT @ observed.features - to_features @ response
+        covariance = torch.linalg.inv_ex(precision).inverse
+        right_side = (weighted * left[..., None]).sum(1) - (to_features @ offset[..., None])[..., 0]
+        b = (covariance @ right_side[..., None])[..., 0]
+        field = offset - (response @ b[..., None])[..., 0]
+        return cls(prior.mean + b, covariance, field, response, solved.variance)
+
+    def at(self, node: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance [B, N] of x . b + f at nodes [B, N] with features [B, N, F]."""
+        x = features - torch.gather(self.response, 1, node[..., None].expand_as(features))
+        variance = torch.gather(self.variance, 1, node) + ((x @ self.covariance) * x).sum(-1)
+        return (features * self.coefficients[:, None]).sum(-1) + torch.gather(self.offset, 1, node), variance

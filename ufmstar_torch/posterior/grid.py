@@ -1,0 +1,108 @@
+"""The nodes on which the error of a depth map is estimated: cells of the image, and how closely neighbours are linked.
+
+The image is cut into at most 28 x 28 cells. Neighbouring nodes are linked the more loosely, the more the predicted
+depth differs between them: across an edge of the depth map the network may err by another factor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, pad
+
+from ufmstar_torch.frame import FrameInput
+
+SIDE = 28
+# Variance of the difference of y = log(g/d) between neighbouring nodes, _FLAT + _EDGE D^2, with D their difference of
+# log d: on rendered tours the variogram of y over one cell is .003 to .005 where D < .05, and grows as D^2.
+_FLAT, _EDGE = 0.004, 2.0
+# Length of a link, in widths of the image: a cell, and _CLIMB times the depth edge beyond _SMOOTH, by which log d
+# changes on a slanted surface. On tours the error grows with both by about 1 to 2.
+_CLIMB, _SMOOTH = 2.0, 0.03
+# Columns and rows of the coarse hats among the features.
+_HATS = 3
+GLOBALS = 4
+FEATURES = GLOBALS + _HATS * _HATS
+
+
+@dataclass(frozen=True)
+class Grid:
+    """R x C nodes of B depth maps.
+
+    Attributes:
+        size: (R, C).
+        log_depth: [B, R C] mean of log d in the cell; of the map where the cell has no valid pixel.
+        mean: [B] m_0, mean of ``log_depth``.
+        right, down: [B, R C] variance of the difference of y to the next node in the row, in the column; infinite where
+            there is none.
+        far_right, far_down: [B, R C] lengths of the same links, infinite likewise.
+    """
+
+    size: tuple[int, int]
+    log_depth: Tensor
+    mean: Tensor
+    right: Tensor
+    down: Tensor
+    far_right: Tensor
+    far_down: Tensor
+
+    @classmethod
+    def of(cls, frame: FrameInput) -> Grid:
+        """The nodes of a frame, float64."""
+        rows, cols = (min(SIDE, n) for n in frame.size)
+        valid = frame.valid.double()[:, None]
+        logs = torch.where(frame.valid, frame.depth, torch.ones_like(frame.depth)).log().double()[:, None] * valid
+        covered = adaptive_avg_pool2d(valid, (rows, cols)).flatten(1)
+        inside = adaptive_avg_pool2d(logs, (rows, cols)).flatten(1) / covered.clamp_min(1e-9)
+        used = (covered > 0).double()
+        whole = (inside * used).sum(1, keepdim=True) / used.sum(1, keepdim=True).clamp_min(1)
+        log_depth = torch.where(covered > 0, inside, whole)
+        shaped = log_depth.view(-1, rows, cols)
+        across = pad(shaped[:, :, 1:] - shaped[:, :, :-1], (0, 1), value=torch.inf).flatten(1)
+        along = pad(shaped[:, 1:] - shaped[:, :-1], (0, 0, 0, 1), value=torch.inf).flatten(1)
+        return cls(
+            (rows, cols), log_depth, log_depth.mean(1),
+            _FLAT + _EDGE * across.square(), _FLAT + _EDGE * along.square(),
+            1 / cols + _CLIMB * (across.abs() - _SMOOTH).clamp_min(0),
+            1 / rows + _CLIMB * (along.abs() - _SMOOTH).clamp_min(0),
+        )  # fmt: skip
+
+    def node(self, pixel: Tensor, size: tuple[int, int]) -> Tensor:
+        """[B, N] index of the cell in which a position [B, N, 2] of an image of ``size`` (H, W) lies."""
+        rows, cols = self.size
+        u, v = _relative(pixel, size)
+        column = (u * cols).long().clamp(0, cols - 1)
+        return (v * rows).long().clamp(0, rows - 1) * cols + column
+
+    def features_at(self, pixel: Tensor, log_depth: Tensor, size: tuple[int, int]) -> Tensor:
+        """[B, N, F] the features at positions [B, N, 2] of an image of ``size`` (H, W) with ``log_depth`` [B, N]."""
+        return _features(log_depth - self.mean[:, None], *_relative(pixel, size))
+
+    def features(self) -> Tensor:
+        """[B, R C, F] the features at the nodes: 1, log d - m_0, u and v from -1 to 1, and 3 x 3 bilinear hats."""
+        rows, cols = self.size
+        v, u = torch.meshgrid(_centres(rows, self.mean), _centres(cols, self.mean), indexing="ij")
+        shape = self.log_depth.shape
+        return _features(self.log_depth - self.mean[:, None], u.flatten().expand(shape), v.flatten().expand(shape))
+
+
+def _centres(count: int, like: Tensor) -> Tensor:
+    return (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) / count
+
+
+def _relative(pixel: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Positions as shares of the image's width and height, 0 to 1."""
+    u, v = pixel.unbind(-1)
+    return (u + 0.5) / size[1], (v + 0.5) / size[0]
+
+
+def _features(log_depth: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    ones = torch.ones_like(log_depth)
+    hats = [_hat(u, i) * _hat(v, j) for j in range(_HATS) for i in range(_HATS)]
+    return torch.stack([ones, log_depth, 2 * u - 1, 2 * v - 1, *hats], -1)
+
+
+def _hat(x: Tensor, i: int) -> Tensor:
+    return (1 - (x * (_HATS - 1) - i).abs()).clamp_min(0)

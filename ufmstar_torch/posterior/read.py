@@ -1,0 +1,75 @@
+"""From the nodes to the pixels: a depth and a variance at every pixel, without smearing across depth edges."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.posterior.grid import GLOBALS
+
+# Difference of log d at which a node counts half at a pixel.
+ALIKE = 0.1
+# No correction by more than this factor's logarithm: anchors off by more are not valid.
+LARGEST_LOG = 4.605170185988092
+
+
+class ReadKernel(Protocol):
+    """See :func:`read`."""
+
+    def __call__(
+        self, depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
+        size: tuple[int, int], /,
+    ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
+
+
+def read(
+    depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
+    size: tuple[int, int],
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """The reference.
+
+    The four nodes around a pixel count by their bilinear weights and by 1/(1 + (D/.1)^2), with D the difference between
+    the pixel's log d and the node's.
+
+    Args:
+        depth, valid: [B, H, W].
+        claimed: [B, H, W] UfM*'s variance [m^2]; counts where a pixel has no evidence.
+        nodes: [B, n, 4] log d, y less the coefficients' part, variance of y, and share without evidence.
+        coefficients: [B, 4] of 1, log d - m_0, u, v.
+        mean: [B] m_0.
+        size: R and C of the nodes.
+
+    Returns:
+        Depth d e^y [m] and variance (d e^y)^2 (v + share claimed/d^2) [m^2], [B, H, W] in depth's dtype, NaN where not
+        valid.
+    """
+    rows, cols = size
+    b, height, width = depth.shape
+    d = torch.where(valid, depth, torch.ones_like(depth)).double()
+    logs = d.log()
+    v, u = ((torch.arange(n, dtype=d.dtype, device=d.device) + 0.5) / n for n in (height, width))
+    (top, below), (left, beside) = _between(v, rows), _between(u, cols)
+    total = torch.zeros_like(d)
+    sums = torch.zeros(3, *d.shape, dtype=d.dtype, device=d.device)
+    for row, by_row in ((top, 1 - below), ((top + 1).clamp_max(rows - 1), below)):
+        for column, by_column in ((left, 1 - beside), ((left + 1).clamp_max(cols - 1), beside)):
+            at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 4)
+            alike = 1 / (1 + ((logs - at[..., 0]) / ALIKE).square())
+            weight = by_row[:, None] * by_column * alike
+            total = total + weight
+            sums = sums + weight * at[..., 1:].permute(3, 0, 1, 2)
+    offset, variance, unseen = sums / total
+    c = coefficients[:, None, None].expand(b, height, width, GLOBALS).unbind(-1)
+    y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
+    corrected = d * y.clamp(-LARGEST_LOG, LARGEST_LOG).exp()
+    spread = corrected.square() * (variance + unseen * claimed.double() / d.square())
+    return tuple(torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread))  # type: ignore
+
+
+def _between(x: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Index of the node before each position in [0, 1], and by how much the one after it counts."""
+    at = (x * count - 0.5).clamp(0, count - 1)
+    before = at.floor().long().clamp_max(max(count - 2, 0))
+    return before, at - before

@@ -1,0 +1,324 @@
+"""One frame: p(depth | network, UfM*, anchors), and what the stream learns from it.
+
+At an anchor of depth g the network's error is y = log(g/d). Over the image it is modelled as
+
+    y = b . (1, log d - m_0, u, v) + hats + f,
+
+with b carried from frame to frame as a random walk, three by three coarse bilinear hats, and a Gaussian field f on a
+grid whose links loosen across edges of the predicted depth (``grid``, ``field``). An anchor observes it with the
+variance
+
+    n = roughness + blur^2 + noise s^2/g^2,
+
+where blur is half the range of log d among the pixel's neighbours, and ``noise`` the factor by which anchors state
+their variances too small. The error of an anchor without parallax is normal in 1/g and not in log g: with t the
+prediction beyond the anchor, its part of n is divided by (1 - e^-t) e^-t / t, so that a weak anchor pulls what is too
+near, and hardly what is too far. Two rounds of Student-t weights (5/(4 + z^2), z from the leave-one-out residual) take
+outliers out.
+
+Variance of y at a node: the field's, the roughness, a common .03^2 of the poses' scale, and where evidence is far
+
+    share (unseen + V/(2 d^2)),     share = min(1, distance/.6),
+
+with V = M + A + E: a surface without evidence is as uncertain as held-out anchors show, and more where UfM* says so.
+The distance is geodesic, in widths of the image, and depth edges lengthen it. All amplitudes are learnt (``running``)
+from anchors of three discs that move over the image: the field is fitted without them, and they count by area and not
+by number, since corners cluster on what is well textured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ufmstar_torch.anchors.given import AnchorInput
+from ufmstar_torch.fixed_order import total
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.posterior.distance import DistanceKernel, distance
+from ufmstar_torch.posterior.field import Field, Observed, Prior, SolveKernel, solve
+from ufmstar_torch.posterior.grid import FEATURES, GLOBALS, Grid
+from ufmstar_torch.posterior.read import ReadKernel, read
+from ufmstar_torch.posterior.running import RATIOS, Running
+
+# kappa of f, and variance of a hat, both times the amplitude.
+_KAPPA, _HAT = 2.0, 0.1**2
+_ROUNDS, _STUDENT = 2, 4.0
+# Range of t, within which the weight of a weak anchor is evaluated, and the share of its weight that always stays.
+_NEARER, _FARTHER = -0.7, 2.0
+# Largest z^2 of an anchor in what is learnt, and the mean of min(z^2, 9) for normal z.
+_CLIP, _CLIPPED = 9.0, 0.9950
+_COMMON = 0.03**2
+# Share of the variance that UfM* claims in that of a surface far from all evidence.
+_CLAIMED = 0.5
+# Discs of held-out anchors: how many, and their radius in widths of the image; the frame's number moves them along a
+# sequence of low discrepancy. Fewer anchors than _LEFT beside them: nothing is held out.
+_DISCS, _RADIUS, _STEPS, _LEFT = 3, 5 / 28, (0.7548776662466927, 0.5698402909980532), 5
+# Distance from which on a surface counts as unseen [widths of the image].
+_FAR = 0.6
+# An anchor whose noise has this standard deviation counts half by area, and is evidence only if it is no larger.
+_WEAK, _EVIDENCE = 0.2, 0.3
+
+
+@dataclass(frozen=True)
+class PosteriorKernels:
+    """The replaceable parts."""
+
+    solve: SolveKernel
+    distance: DistanceKernel
+    read: ReadKernel
+
+
+REFERENCE = PosteriorKernels(solve, distance, read)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Of B streams.
+
+    Attributes:
+        depth: [B, H, W] [m]; as predicted before the first anchor. NaN where not valid.
+        variance: [B, H, W] [m^2]; UfM*'s before the first anchor.
+        calibration: [B] mean z^2 of held-out anchors lately: 1 = as predicted, more = too certain; NaN before any.
+        unseen: [B] variance of y that held-out anchors show where evidence is far.
+    """
+
+    depth: Tensor
+    variance: Tensor
+    calibration: Tensor
+    unseen: Tensor
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A frame's nodes and anchors, before they are fitted.
+
+    Attributes:
+        grid: the nodes.
+        prior: of b and f.
+        observed: the anchors.
+        stated: [B, N] noise s^2/g^2 of y, as learnt.
+        other: [B, N] roughness and blur^2.
+        valid: [B, N] bool.
+    """
+
+    grid: Grid
+    prior: Prior
+    observed: Observed
+    stated: Tensor
+    other: Tensor
+    valid: Tensor
+
+    @classmethod
+    def of(cls, grid: Grid, frame: FrameInput, anchors: AnchorInput, running: Running) -> _Scene:
+        node = grid.node(anchors.pixel, frame.size)
+        log_depth = anchors.predicted.log()
+        observed = Observed(
+            node, grid.features_at(anchors.pixel, log_depth, frame.size),
+            torch.where(anchors.valid, anchors.depth.log() - log_depth, torch.zeros_like(log_depth)),
+        )  # fmt: skip
+        stated = running.ratio("noise")[:, None] * anchors.variance / anchors.depth.square()
+        other = running.ratio("roughness")[:, None] + (_range(frame, anchors) / 2).square()
+        return cls(grid, _prior(grid, running), observed, stated, other, anchors.valid)
+
+    def counted(self, values: Tensor) -> Tensor:
+        """[B, N] values, summed over the anchors of the same cell."""
+        kept = torch.where(self.valid, values, torch.zeros_like(values))
+        nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, kept)
+        return torch.gather(nodes, 1, self.observed.node)
+
+
+@dataclass(frozen=True)
+class _Near:
+    """What the anchors say of each other.
+
+    Attributes:
+        noise: [B, N] n, without parallax as it counts for the present residual.
+        left_out: [B, N] residual from the field of the other anchors.
+        total: [B, N] variance that is predicted for it.
+    """
+
+    noise: Tensor
+    left_out: Tensor
+    total: Tensor
+
+
+def update(
+    packed: Tensor,
+    frame: FrameInput,
+    anchors: AnchorInput | None,
+    claimed: Tensor,
+    kernels: PosteriorKernels = REFERENCE,
+) -> tuple[Tensor, Posterior]:
+    """Take in a frame.
+
+    Args:
+        packed: [B, running.SIZE] what was learnt; not modified.
+        frame: checked.
+        anchors: of the frame, or None.
+        claimed: [B, H, W] V of UfM* without B [m^2], NaN where not valid.
+        kernels: which implementation.
+
+    Returns:
+        What is known after the frame, and the posterior. A stream without a usable anchor keeps what it knew.
+    """
+    anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
+    running, grid, claimed_share = Running.of(packed), Grid.of(frame), _CLAIMED * claimed.nan_to_num()
+    scene = _Scene.of(grid, frame, anchors, running)
+    field, weight, near = _fitted(scene, kernels)
+    share = _share(scene, anchors.valid & (weight * _EVIDENCE**2 >= 1), kernels)
+    after = _learnt(scene, field, weight, near, _relative(claimed_share, frame, anchors), running, kernels)
+    features, b = grid.features(), field.coefficients
+    mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(share), features)
+    offset = mean - (features[..., :GLOBALS] * b[:, None, :GLOBALS]).sum(-1)
+    variance = variance + running.ratio("roughness")[:, None] + _COMMON + share * running.ratio("unseen")[:, None]
+    nodes = torch.stack([grid.log_depth, offset, variance, share], -1)
+    depth, spread = kernels.read(frame.depth, frame.valid, claimed_share, nodes, b[:, :GLOBALS], grid.mean, grid.size)
+    some = anchors.valid.any(1)
+    known = (some | (running.frames > 0))[:, None, None]
+    plain = torch.where(frame.valid, frame.depth, torch.nan)
+    kept = torch.where(some[:, None], after.packed().to(packed.dtype), packed)
+    now = Running.of(kept)
+    calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
+    return kept, Posterior(
+        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen")
+    )
+
+
+def _none(frame: FrameInput) -> AnchorInput:
+    """One anchor a stream that is not valid."""
+    b, like = len(frame.depth), frame.intrinsics
+    one, zero = like.new_ones(b, 1), like.new_zeros(b, 1)
+    index = torch.zeros(b, 1, dtype=torch.int64, device=like.device)
+    return AnchorInput(like.new_zeros(b, 1, 2), index, one, one, zero, zero, index.bool())
+
+
+def _prior(grid: Grid, running: Running) -> Prior:
+    """Of b and f, in the frame to come."""
+    amplitude = running.ratio("amplitude")[:, None]
+    mean, covariance = running.expected(grid.mean)
+    b, hats = len(mean), FEATURES - GLOBALS
+    P = covariance.new_zeros(b, FEATURES, FEATURES)
+    P[:, :GLOBALS, :GLOBALS] = torch.linalg.inv_ex(covariance).inverse
+    P[:, GLOBALS:, GLOBALS:] = torch.diag_embed((1 / (_HAT * amplitude)).expand(b, hats))
+    return Prior(
+        (_KAPPA / amplitude).expand_as(grid.log_depth), 1 / (grid.right * amplitude), 1 / (grid.down * amplitude),
+        torch.nn.functional.pad(mean, (0, hats)), P, grid.size[1],
+    )  # fmt: skip
+
+
+def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
+    """[B, N] largest less smallest log d of the valid pixels among an anchor's pixel and its eight neighbours."""
+    height, width = frame.size
+    low = high = anchors.predicted.log()
+    depth, valid = frame.depth.flatten(1), frame.valid.flatten(1)
+    row, column = anchors.index // width, anchors.index % width
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            index = (row + down).clamp(0, height - 1) * width + (column + right).clamp(0, width - 1)
+            fine = torch.gather(valid, 1, index) & anchors.valid
+            near = torch.where(fine, torch.gather(depth, 1, index).double(), anchors.predicted).log()
+            low, high = torch.minimum(low, near), torch.maximum(high, near)
+    return high - low
+
+
+def _fitted(scene: _Scene, kernels: PosteriorKernels) -> tuple[Field, Tensor, _Near]:
+    """The field, the anchors' weights in it, and what they say of each other."""
+    zero = torch.zeros_like(scene.stated)
+    weight = torch.where(scene.valid, 1 / (scene.stated + scene.other), zero)
+    for round_ in range(_ROUNDS + 1):
+        field = Field.given(scene.prior, scene.observed, weight, kernels.solve)
+        mean, variance = field.at(scene.observed.node, scene.observed.features)
+        left = (1 - weight * variance).clamp_min(0.05)
+        residual, variance = (scene.observed.value - mean) / left, variance / left
+        noise = scene.other + scene.stated / _pull(-residual)
+        near = _Near(noise, residual, variance + noise)
+        if round_ < _ROUNDS:
+            student = (_STUDENT + 1) / (_STUDENT + residual.square() / near.total)
+            weight = torch.where(scene.valid, student / noise, zero)
+    return field, weight, near
+
+
+def _pull(t: Tensor) -> Tensor:
+    """(1 - e^-t) e^-t / t, the weight of an anchor from which the prediction is t beyond in log depth."""
+    t = t.clamp(_NEARER, _FARTHER)
+    small = t.abs() < 1e-3
+    safe = torch.where(small, torch.ones_like(t), t)
+    return torch.where(small, 1 - 1.5 * t, -torch.expm1(-safe) * torch.exp(-safe) / safe)
+
+
+def _share(scene: _Scene, evidence: Tensor, kernels: PosteriorKernels) -> Tensor:
+    """[B, n] how far every node is from the anchors of the mask [B, N], 0 to 1."""
+    grid = scene.grid
+    source = torch.zeros_like(grid.log_depth).scatter_add(1, scene.observed.node, evidence.to(grid.log_depth)) > 0
+    return kernels.distance(source, grid.far_right, grid.far_down, grid.size[1], _FAR) / _FAR
+
+
+def _relative(claimed: Tensor, frame: FrameInput, anchors: AnchorInput) -> Tensor:
+    """[B, N] V/d^2 at the anchors."""
+    at = torch.gather(claimed.flatten(1), 1, anchors.index).double()
+    return torch.where(anchors.valid, at / anchors.predicted.square(), torch.zeros_like(at))
+
+
+def _learnt(
+    scene: _Scene, field: Field, weight: Tensor, near: _Near, claimed: Tensor, running: Running,
+    kernels: PosteriorKernels,
+) -> Running:  # fmt: skip
+    """What is known after the frame."""
+    sums = _of_neighbours(scene, near, running) | _of_discs(scene, weight, near, claimed, running, kernels)
+    added = {name: running.added(name, *sums[name]) for name in RATIOS}
+    return Running(
+        running.frames + 1, scene.grid.mean,
+        {name: above for name, (above, _) in added.items()}, {name: below for name, (_, below) in added.items()},
+        field.coefficients[:, :GLOBALS], field.covariance[:, :GLOBALS, :GLOBALS],
+    )  # fmt: skip
+
+
+def _of_neighbours(scene: _Scene, near: _Near, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
+    """Sums for roughness and noise from leave-one-out residuals: what they are beyond the rest of their variance, each
+    weighted by the squared share that the quantity has in it."""
+    square = torch.minimum(near.left_out.square(), _CLIP * near.total) / _CLIPPED
+    excess, once = square - near.total, torch.where(scene.valid, 1 / scene.counted(torch.ones_like(square)), 0.0)
+    sums = {}
+    for name, part in (("roughness", running.ratio("roughness")[:, None]), ("noise", scene.stated)):
+        w = once * (part / near.total).square()
+        unit = running.ratio(name)[:, None] / part.clamp_min(1e-12)
+        sums[name] = (total(w * (part + excess) * unit, 1), total(w, 1))
+    return sums
+
+
+def _of_discs(
+    scene: _Scene, weight: Tensor, near: _Near, claimed: Tensor, running: Running, kernels: PosteriorKernels
+) -> dict[str, tuple[Tensor, Tensor]]:
+    """Sums for amplitude, unseen and calibration from anchors whose whole region is left out."""
+    held = _discs(scene, running.frames) & scene.valid
+    rest = scene.valid & ~held
+    held = held & (rest.sum(1, keepdim=True) >= _LEFT)
+    field = Field.given(scene.prior, scene.observed, weight * rest, kernels.solve)
+    mean, variance = field.at(scene.observed.node, scene.observed.features)
+    share = torch.gather(_share(scene, rest, kernels), 1, scene.observed.node)
+    tot = variance + near.noise
+    error = (scene.observed.value - mean).square()
+    square = torch.minimum(error, _CLIP * tot) / _CLIPPED
+    believed = torch.where(held, 1 / (1 + near.noise / _WEAK**2), 0.0)
+    area = believed / scene.counted(believed).clamp_min(1e-12)
+    final = tot + _COMMON + share * (running.ratio("unseen")[:, None] + claimed)
+    return {
+        "amplitude": (
+            total(area * (square - near.noise) / tot, 1),
+            total(area * variance / tot, 1) / running.ratio("amplitude"),
+        ),
+        "unseen": (total(area * (square - tot - share * claimed) * share / tot, 1), total(area * share**2 / tot, 1)),
+        "calibration": (total(area * error / final, 1), total(area, 1)),
+    }
+
+
+def _discs(scene: _Scene, frames: Tensor) -> Tensor:
+    """[B, N] whether an anchor lies in one of the frame's discs."""
+    at = (scene.observed.features[..., 2:4] + 1) / 2
+    inside = torch.zeros_like(scene.valid)
+    for disc in range(_DISCS):
+        centre = torch.stack([((frames * _DISCS + disc + 1) * step) % 1 for step in _STEPS], -1)
+        inside = inside | ((at - centre[:, None]).square().sum(-1) < _RADIUS**2)
+    return inside
