@@ -93,7 +93,7 @@ class OnnxNetwork(DepthNetwork):
 
     def _open(self) -> None:
         """Start a session and check the spec's names against the graph."""
-        self.session = _session(self.path, self.threads, self.providers)
+        self.session = open_session(self.path, self.threads, self.providers)
         inputs = {i.name: i for i in self.session.get_inputs()}
         name = self.spec.input
         if name is None and len(inputs) == 1:
@@ -228,7 +228,8 @@ class OnnxNetwork(DepthNetwork):
         self._open()
 
 
-def _session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSession:
+def open_session(path: str, threads: int, providers: tuple[str, ...]) -> InferenceSession:
+    """A session on a file; arguments and errors as :class:`OnnxNetwork`."""
     ort = _onnxruntime()
     from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 

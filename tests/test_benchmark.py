@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 
 import numba
@@ -12,11 +13,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from layouts import write_tum
+from onnx_files import small_network
 
 from ufmstar_torch import UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.bench import benchmark
+from ufmstar_torch.eval.bench.compare import compare, measure_peer
+from ufmstar_torch.eval.bench.floors import stage_floors
 from ufmstar_torch.eval.bench.frames import PosedDepth, RecordedSequence, RenderedRoom
 from ufmstar_torch.eval.bench.memory import state_memory
+from ufmstar_torch.eval.bench.runtimes import fastest
 from ufmstar_torch.eval.bench.step import build_up, components_in_view, measure_long_run
 from ufmstar_torch.eval.bench.text import format_report
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
@@ -330,14 +335,81 @@ def test_machine_facts():
     assert versions()["numpy"] == np.__version__
 
 
+# ---- beside something else ----
+
+# Prints the height of every frame that it gets as its time.
+PEER = """
+import json, os, pathlib
+import numpy as np
+for file in sorted(pathlib.Path(os.environ["UFMSTAR_BENCH_FRAMES"]).iterdir()):
+    with np.load(file) as frame:
+        assert frame["T_world_cam"].shape == (4, 4) and frame["K"].shape == (3, 3)
+        print(json.dumps({"ms": frame["depth"].shape[0]}))
+"""
+
+
+def small_report(step=2.0, cores=2):
+    times = {"median_ms": step}
+    result = {"size": 224, "backend": "numba", "step": times, "stages": {"segment": {"median_ms": 1.0}}, "ratios": {}}
+    hardware = {"cpu": "a", "cores": cores, "machine": "x86_64"}
+    return {
+        "schema": 1, "date": "then", "hardware": hardware, "settings": {"threads": 2}, "results": [result]
+    }  # fmt: skip
+
+
+def test_against_an_earlier_report(tmp_path):
+    file = tmp_path / "earlier.json"
+    file.write_text(json.dumps(small_report(step=4.0)))
+    found = compare(small_report(), file)
+    assert found == {"file": "earlier.json", "date": "then", "ratios": {"224 numba": {"step": 0.5, "segment": 1.0}}}
+    with pytest.raises(ValueError, match="other hardware: cores 2, here 4"):
+        compare(small_report(cores=4), file)
+    file.write_text("{}")
+    with pytest.raises(ValueError, match="no report of ufmstar bench with schema 1"):
+        compare(small_report(), file)
+
+
+def test_a_peer_that_fails():
+    with pytest.raises(ValueError, match=r"--peer 'false' failed: .*non-zero exit status 1"):
+        measure_peer("false", [])
+
+
+@pytest.mark.slow
+def test_the_faster_runtime_of_a_network_is_taken():
+    """Exported by torch, both give the same depth."""
+    forward = fastest(small_network().folded(), 64)
+    about = forward.about
+    names = {"torch": "torch", "onnx": "onnxruntime"}
+    assert about["runtimes"].keys() == names.keys()
+    assert about["runtime"] == names[min(about["runtimes"], key=about["runtimes"].get)]
+    assert about["version"] == (torch.__version__ if about["runtime"] == "torch" else versions()["onnxruntime"])
+    assert about["apart"] < 1e-3
+    assert forward.call().shape == (1, 64, 64)
+
+
+def test_floors_grow_with_what_they_count():
+    """The larger of traffic and arithmetic, at rates that are known."""
+    counts = {name: {"median": 10.0} for name in ("segments", "matched", "new", "in_view")}
+    slow_memory = stage_floors(100, counts, {"bytes_per_second": 1e6, "flops_per_second": 1e12})
+    assert slow_memory["average"] == {"bytes": 120_000, "flops": 30_000, "ms": 120.0}
+    assert slow_memory["append"]["ms"] == pytest.approx(1000 * 2 * 44 * 10 / 1e6)
+    slow_processor = stage_floors(100, counts, {"bytes_per_second": 1e12, "flops_per_second": 1e6})
+    assert slow_processor["average"]["ms"] == pytest.approx(30.0)
+    larger = stage_floors(200, counts, {"bytes_per_second": 1e6, "flops_per_second": 1e12})
+    assert larger["average"]["ms"] == 4 * slow_memory["average"]["ms"]
+
+
 # ---- end to end ----
 
 
 def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     path = tmp_path / "bench.json"
+    peer = tmp_path / "peer.py"
+    peer.write_text(PEER)
     words = "--sizes 64 --frames 3 --history 4 --in-view 5 --backends numba torch --skip-compile --threads 1"
+    words = [*words.split(), "--runtime", "torch", "--peer", f"{sys.executable} {peer}"]
     before = torch.get_num_threads(), numba.get_num_threads()
-    assert bench_command.main(bench_command.read([*words.split(), "--json", str(path)])) == 0
+    assert bench_command.main(bench_command.read([*words, "--json", str(path)])) == 0
     assert (torch.get_num_threads(), numba.get_num_threads()) == before
     report = json.loads(path.read_text())
     assert report["settings"]["threads"] == 1
@@ -350,8 +422,12 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     for result in report["results"]:
         check_result(result)
     assert {row["met"] for row in report["targets"]} == {None}, "targets are for 224 x 224"
+    assert report["peer"]["process"]["count"] == 3
+    assert (report["peer"]["frame"]["median_ms"], report["peer"]["frame"]["count"]) == (64, 9), "3 runs of 3 frames"
     told = capsys.readouterr()
     assert "whole step" in told.out
+    assert "floor" in told.out
+    assert "peer" in told.out
     assert "64 x 64, numba" in told.err
 
 
@@ -365,7 +441,14 @@ def check_result(result):
         assert 0 <= times["min_ms"] <= times["median_ms"]
     assert result["mean_uncertainty"]["pixels"] == 1000
     assert set(result["networks"]) == {"fastdepth", "resnet50"}
-    assert set(result["ratios"]) == {"step/fastdepth", "step/resnet50", "mean_uncertainty/step"}
+    beside = {"step/ufm"} if result["backend"] == "numba" else set()
+    assert set(result["ratios"]) == {"step/fastdepth", "step/resnet50", "mean_uncertainty/step", *beside}
+    for name, about in result["networks_about"].items():
+        assert (about["runtime"], about["version"]) == ("torch", torch.__version__), name
+        assert about["runtimes"].keys() == {"torch"}
+    assert all(floor["ms"] > 0 for stage, floor in result["floors"].items() if stage not in ("append", "fuse"))
+    assert set(result["floors"]) == set(STAGES)
+    assert result["allocations"]["python_peak"] > 0
     assert result["networks_about"]["fastdepth"]["size"] == 64
     # torchvision's ResNet50 without its classifier
     assert result["networks_about"]["resnet50"]["parameters"] == 25_557_032 - (2048 * 1000 + 1000)
@@ -376,7 +459,7 @@ def check_result(result):
 
 def test_backends_see_the_same_mixture():
     options = bench_command.read(
-        ["--sizes", "48", "--frames", "2", "--history", "3", "--skip-compile", "--threads", "1"]
+        ["--sizes", "48", "--frames", "2", "--history", "3", "--skip-compile", "--threads", "1", "--runtime", "torch"]
     )
     numba_run, torch_run = benchmark.run_benchmark(options)["results"]
     assert numba_run["counts"]["segments"]["max"] > 3
@@ -471,6 +554,9 @@ def test_a_busy_machine_is_mentioned():
         "long_run": None,
         "growth": [],
         "anchors": None,
+        "peer": None,
+        "against": None,
+        "rates": {"bytes_per_second": 1e10, "flops_per_second": 1e11},
         "targets": [],
     }
     assert "the machine was busy" in format_report(report)

@@ -105,6 +105,9 @@ def test_the_scripts_run(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: p
     for table in tables.values():
         table(ensemble, 4)
     script("measure_views").share(resting(script, np.linspace(-0.1, 0.1, 6)))
+    precision = script("measure_precision")
+    half, brain = (np.median(precision.changes(clip, dtype)) for dtype in precision.DTYPES.values())
+    assert 0 < half < brain < 1
     factors = script("measure_factors")
     monkeypatch.setattr(factors, "CHANGES", {"alpha = 1 (no average)": {"ema_alpha": 1.0}})
     figures = [factors.figures(clip), factors.figures(ensemble)]

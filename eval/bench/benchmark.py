@@ -38,6 +38,10 @@ class BenchSettings:
     Attributes:
         sequence: recorded sequence instead of a rendered room
         weights: FastDepth's weights instead of random ones; with --sequence it then predicts the depth
+        runtime: of the networks; auto: the one that is faster here
+        peer: another program, timed on the same frames: whole processes, and the frames for which it prints
+            {"ms": TIME} on a line; they lie in the folder that UFMSTAR_BENCH_FRAMES names
+        against: an earlier report of the same machine, with which this one is compared
         sizes: sizes of the square images [px]
         backends: kernels that are timed
         frames: number of timed frames (the torch backend: at most 3)
@@ -57,6 +61,9 @@ class BenchSettings:
 
     sequence: Path | None = None
     weights: Path | None = None
+    runtime: str = field(default="auto", metadata={"choices": ("auto", "torch", "onnx")})
+    peer: str | None = None
+    against: Path | None = None
     sizes: tuple[int, ...] = (224, 518)
     backends: tuple[str, ...] = field(default=("numba", "torch"), metadata={"choices": ("numba", "torch")})
     frames: int = 40
@@ -91,17 +98,22 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         progress: is called with a description of what is measured next.
 
     Returns:
-        The report: settings, versions, hardware, "results" per size and backend, "compilation", "long_run", "growth"
-        (a long run for each limit of merging), "anchors" and "device" where asked for, and "targets".
+        The report: settings, versions, hardware, "results" per size and backend, "rates" of the machine, "compilation",
+        "long_run", "growth" (a long run for each limit of merging), "anchors", "device", "peer" and "against" where
+        asked for, and "targets".
 
     Raises:
         ValueError: an option is out of range.
         FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
     """
     from ufmstar_torch import UfMStarConfig
+    from ufmstar_torch.eval.bench.compare import compare, measure_peer
+    from ufmstar_torch.eval.bench.floors import machine_rates
     from ufmstar_torch.eval.bench.step import measure_compilation, measure_long_run
     from ufmstar_torch.eval.results import machine
 
+    if options.against is not None and not options.against.is_file():
+        raise FileNotFoundError(f"--against {options.against} does not exist")
     config = UfMStarConfig()
     threads = machine.available_cores() if options.threads is None else options.threads
     report: dict[str, Any] = {
@@ -115,6 +127,9 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         "long_run": None,
         "growth": [],
         "anchors": None,
+        "peer": None,
+        "against": None,
+        "rates": None,
         "device": None,
         "results": [],
     }
@@ -128,9 +143,13 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         progress("compilation")
         report["compilation"] = measure_compilation()
     with pinned_threads(threads):
+        report["rates"] = machine_rates()
         fastdepth, source = _inputs(options)
         report["settings"]["source"] = source.describe()
-        report["results"] = _results(options, config, fastdepth, source, progress)
+        report["results"] = _results(options, config, fastdepth, source, report["rates"], progress)
+        if options.peer is not None:
+            progress("the peer")
+            report["peer"] = measure_peer(options.peer, source.frames(options.sizes[0], options.frames))
         if options.long is not None:
             backend = config.replace(backend=options.backends[0])
             for limit in options.merge:
@@ -142,6 +161,8 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
             report["anchors"] = _anchors(options, config, source, progress)
     report["load_average"]["after"] = machine.load_average()
     report["targets"] = targets(report)
+    if options.against is not None:
+        report["against"] = compare(report, options.against)
     return report
 
 
@@ -164,14 +185,19 @@ def _inputs(options: BenchSettings) -> tuple[Any, Any]:
 
 
 def _results(
-    options: BenchSettings, config: Any, fastdepth: Any, source: Any, progress: Callable[[str], object]
+    options: BenchSettings,
+    config: Any,
+    fastdepth: Any,
+    source: Any,
+    rates: dict[str, float],
+    progress: Callable[[str], object],
 ) -> list[dict[str, Any]]:
     from ufmstar_torch.eval.bench.step import build_up, measure_step, reference_networks
 
     results = []
     for size in options.sizes:
         progress(f"{size} x {size}, building up the mixture")
-        networks, about = reference_networks(size, fastdepth)
+        networks, about = reference_networks(size, fastdepth, options.runtime)
         built, frames, history = build_up(
             source, config, size=size, in_view=options.in_view, history=options.history,
             rounds=_WARM_UP + options.frames,
@@ -181,7 +207,9 @@ def _results(
             warm_up, timed = _WARM_UP, options.frames
             if backend == "torch":
                 warm_up, timed = 1, min(timed, _TORCH_ROUNDS)
-            result = measure_step(built, frames[: warm_up + timed], networks, backend=backend, warm_up=warm_up)
+            result = measure_step(
+                built, frames[: warm_up + timed], networks, backend=backend, warm_up=warm_up, rates=rates
+            )
             results.append({**result, "history": history, "networks_about": about})
     return results
 

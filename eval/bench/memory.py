@@ -5,7 +5,9 @@ A megabyte is 10^6 bytes, as in the paper: 100,000 points of 40 bytes are its 4.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import resource
+import tracemalloc
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,3 +80,20 @@ def overhead_percent(uncertainty: float, depth: float) -> float:
     if uncertainty < 0 or depth < 0 or uncertainty + depth <= 0:
         raise ValueError(f"uncertainty and depth must be amounts, at least one positive, got {uncertainty} and {depth}")
     return 100 * uncertainty / (uncertainty + depth)
+
+
+def step_allocations(step: Callable[[], object]) -> dict[str, int]:
+    """What one call takes of fresh memory: "page_faults" of the process, and "python_peak" [bytes] of Python and NumPy.
+
+    Tensors are not among the latter: torch does not report them; what they take anew shows in the page faults.
+    """
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    step()
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+    tracemalloc.start()
+    try:
+        step()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    return {"page_faults": faults, "python_peak": peak}

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.util import find_spec
 from itertools import islice
@@ -20,13 +20,17 @@ import torch
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.camera import focal_and_centre, relative_pose
+from ufmstar_torch.eval.bench.floors import stage_floors
 from ufmstar_torch.eval.bench.frames import FrameSource, PosedDepth, RenderedRoom
-from ufmstar_torch.eval.bench.memory import state_memory
+from ufmstar_torch.eval.bench.memory import state_memory, step_allocations
+from ufmstar_torch.eval.bench.runtimes import fastest
 from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls, spread_of_counts
+from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.models import FastDepth
 from ufmstar_torch.models.fastdepth import MULTIPLE
 
 _RECENT = 20  # frames over which the components in view are averaged
+POINTS = 100_000  # of UfM
 _PIXELS = 1000  # of the image average
 _COMPILED_STEPS = 3  # the kernels of the fusion meet a mixture from the second on
 _FIRST_STEPS = "import json; from ufmstar_torch.eval.bench.step import first_steps; print(json.dumps(first_steps({})))"
@@ -69,8 +73,9 @@ def measure_step(
     *,
     backend: str,
     warm_up: int,
+    rates: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Time the whole step, its stages, the image average and the networks, one after the other per frame.
+    """Time the whole step, its stages, the image average, UfM and the networks, one after the other per frame.
 
     The whole step, the stages and the average run on copies of one state, so that timing the stages cannot slow the
     whole. All of them get the same frames, and each follows a network as in use (caches and threads are as the network
@@ -81,34 +86,42 @@ def measure_step(
         frames: of which the first ``warm_up`` are not counted.
         networks: forward passes by name, on the arguments of a step; may be empty.
         backend: "numba" or "torch".
-        warm_up: see ``frames``.
+        warm_up: see ``frames``; three of them at 224 x 224 fill UfM's points.
+        rates: of the machine (``machine_rates``), for the floors.
     """
     start = copy.deepcopy(built)
     start.config = built.config.replace(backend=backend)
     whole, staged, average = copy.deepcopy(start), StagedStep(copy.deepcopy(start)), copy.deepcopy(start)
+    pointwise = UfM(UfMConfig(max_points=POINTS))
     size = frames[0].depth.shape[-1]
     pixels = min(_PIXELS, size**2)
     calls: dict[str, Callable[..., Any]] = {
         "step": whole,
         "staged": staged,
         "mean_uncertainty": partial(average.mean_uncertainty, pixels=pixels),
+        **({} if backend == "torch" else {"ufm": pointwise}),
     }
     timed = TimedCalls(before=networks)
-    counts = _Counts("components", "segments", "new")
+    counts = _Counts("components", "segments", "matched", "new")
     for frame in timed.frames(frames, warm_up=warm_up):
         counts.add(timed.call(calls, *frame)["step"].statistics, whole, frame)
     times = timed.times
-    pairs = [("step", name) for name in networks] + [("mean_uncertainty", "step")]
+    pairs = [("step", name) for name in (*networks, *(["ufm"] if "ufm" in calls else []))]
+    pairs.append(("mean_uncertainty", "step"))
+    spreads = {name: spread_of_counts(values[warm_up:]) for name, values in counts.items()}
     return {
         "size": size,
         "backend": backend,
         "frames": {"warm_up": warm_up, "timed": len(frames) - warm_up},
-        "counts": {name: spread_of_counts(values[warm_up:]) for name, values in counts.items()},
+        "counts": spreads,
         "step": times.spread("step"),
         "staged_step": times.spread("staged"),
         **staged.summary(warm_up=warm_up),
         "mean_uncertainty": {"pixels": pixels, **times.spread("mean_uncertainty")},
         "networks": {name: times.spread(name) for name in networks},
+        "ufm": {"points": POINTS, **times.spread("ufm")} if "ufm" in calls else None,
+        "floors": stage_floors(size, spreads, rates),
+        "allocations": step_allocations(lambda: average(*frames[-1])),
         "memory": state_memory(whole),
         "ratios": {f"{a}/{b}": times.ratio(a, b) for a, b in pairs},
     }
@@ -222,33 +235,31 @@ def components_in_view(ufm: UfMStar, frame: PosedDepth) -> int:
     return int((seen & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)).sum())
 
 
-def reference_networks(size: int, fastdepth: FastDepth) -> tuple[dict[str, Callable[..., Any]], dict[str, Any]]:
-    """Forward passes to compare with, on a fixed random image, and what they are.
+def reference_networks(
+    size: int, fastdepth: FastDepth, runtime: str = "auto"
+) -> tuple[dict[str, Callable[..., Any]], dict[str, Any]]:
+    """Forward passes to compare with, each in the runtime that is fastest here, and what they are.
 
     FastDepth with its batch norms folded, at the nearest size it takes (multiples of 32); torchvision's
     ResNet50 up to and including layer4, with random weights, where torchvision is installed.
+
+    Args:
+        size: of the step's depth maps [px].
+        fastdepth: in torch.
+        runtime: see ``fastest``.
     """
-    side = max(MULTIPLE, MULTIPLE * round(size / MULTIPLE))
-    calls = {"fastdepth": _forward(fastdepth.folded(), side)}
-    about: dict[str, Any] = {"fastdepth": {"size": side, "parameters": _parameters(fastdepth)}, "resnet50": None}
+    networks: dict[str, tuple[torch.nn.Module, int]] = {
+        "fastdepth": (fastdepth.folded(), max(MULTIPLE, MULTIPLE * round(size / MULTIPLE)))
+    }
+    about: dict[str, Any] = {"resnet50": None}
     if find_spec("torchvision") is not None:
         from torchvision.models import resnet50
 
-        encoder = torch.nn.Sequential(*list(resnet50(weights=None).children())[:-2]).eval()
-        calls["resnet50"] = _forward(encoder, size)
-        about["resnet50"] = {"size": size, "parameters": _parameters(encoder)}
+        networks["resnet50"] = (torch.nn.Sequential(*list(resnet50(weights=None).children())[:-2]).eval(), size)
+    calls = {}
+    for name, (network, side) in networks.items():
+        forward = fastest(network, side, runtime=runtime)
+        calls[name] = forward.call
+        whole = fastdepth if name == "fastdepth" else network  # with the batch norms that are folded
+        about[name] = {"size": side, "parameters": sum(p.nelement() for p in whole.parameters()), **forward.about}
     return calls, about
-
-
-def _forward(network: torch.nn.Module, size: int) -> Callable[..., Any]:
-    image = torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(0))
-
-    def call(*_: object) -> Any:
-        with torch.inference_mode():
-            return network(image)
-
-    return call
-
-
-def _parameters(network: torch.nn.Module) -> int:
-    return sum(p.nelement() for p in network.parameters())

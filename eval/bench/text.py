@@ -33,6 +33,16 @@ def format_report(report: Mapping[str, Any]) -> str:
         lines += ["", *_anchors(report["anchors"])]
     if report.get("device") is not None:
         return "\n".join([*lines, "", *device_text(report["device"])])
+    if report["peer"] is not None:
+        lines += ["", *_peer(report["peer"])]
+    if report["against"] is not None:
+        lines += ["", *_against(report["against"])]
+    rates = report["rates"]
+    lines += [
+        "",
+        f"floors: memory traffic over {rates['bytes_per_second'] / 1e9:.1f} GB/s of a copy, arithmetic over "
+        f"{rates['flops_per_second'] / 1e9:.0f} Gflop/s of a matrix product",
+    ]
     lines += ["", f"{'target (for information)':26}{'value':>12}{'target':>12}"]
     for row in report["targets"]:
         verdict = {None: "not measured", True: "met", False: "missed"}[row["met"]]
@@ -49,22 +59,59 @@ def _result(result: Mapping[str, Any]) -> list[str]:
         f"{counts['segments']['median']:.0f} segments per frame",
         f"  {'[ms]':24}{'median':>9}{'IQR':>9}{'minimum':>9}{'CPU':>9}",
         _row("whole step", result["step"]),
-        *(_row(f"  {name}", result["stages"][name]) for name in STAGES),
+        *(_row(f"  {name}", result["stages"][name]) + _floor(result, name) for name in STAGES),
         _row("  sum of stages", result["stages_total"]),
         *(_row(f"  kernel {name}", times) for name, times in result["kernels"].items()),
         _row(f"mean of {result['mean_uncertainty']['pixels']} pixels", result["mean_uncertainty"]),
-        *(_row(f"{name} forward", times) for name, times in result["networks"].items()),
+        *([] if result["ufm"] is None else [_row(f"UfM, {result['ufm']['points']} points", result["ufm"])]),
+        *(_row(f"{name} forward", t) + _runtime(result, name) for name, t in result["networks"].items()),
     ]
     ratios = (
         f"{name} {r['median']:.3f} ({r['q1']:.3f} to {r['q3']:.3f}; CPU {r['cpu_median']:.3f})"
         for name, r in result["ratios"].items()
     )
     lines.append("  ratios, median and quartiles: " + "; ".join(ratios))
+    fresh = result["allocations"]
+    lines.append(
+        f"  fresh memory of a step: {fresh['page_faults']} page faults, "
+        f"Python and NumPy {fresh['python_peak'] / 1e3:.0f} kB"
+    )
     lines.append(
         f"  memory: {memory['components']} components of {memory['bytes_per_component']} B = "
         f"{memory['in_use'] / 1e3:.1f} kB in use, {memory['allocated'] / 1e3:.1f} kB allocated, "
         f"moving average {memory['moving_average'] / 1e3:.1f} kB"
     )
+    return lines
+
+
+def _floor(result: Mapping[str, Any], stage: str) -> str:
+    """What the stage cannot fall below, where it is known."""
+    floor = result["floors"].get(stage)
+    return "" if floor is None else f"   floor {floor['ms']:.3f}"
+
+
+def _runtime(result: Mapping[str, Any], network: str) -> str:
+    """Runtime and version of a network, and the least time of the other one."""
+    about = result["networks_about"][network]
+    others = {"onnx": "onnxruntime", "torch": "torch"}
+    slower = [f"{others[n]} {ms:.1f}" for n, ms in about["runtimes"].items() if others[n] != about["runtime"]]
+    beside = f" (minimum in {slower[0]})" if slower else ""
+    return f"   {about['runtime']} {about['version']}, {about['threads']} threads{beside}"
+
+
+def _peer(peer: Mapping[str, Any]) -> list[str]:
+    frame = peer["frame"]
+    own = "it prints no times of frames" if frame is None else f"a frame {frame['median_ms']:.2f} ms ({frame['count']})"
+    process = peer["process"]
+    return [
+        f"peer {peer['command']}: a process {process['median_ms']:.0f} ms (CPU {process['cpu_median_ms']:.0f}), {own}",
+    ]
+
+
+def _against(against: Mapping[str, Any]) -> list[str]:
+    lines = [f"times over those of {against['file']} of {against['date']}"]
+    for label, ratios in against["ratios"].items():
+        lines.append(f"  {label}: " + ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items()))
     return lines
 
 

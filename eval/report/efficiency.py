@@ -11,6 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ufmstar_torch.eval.methods.method import Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.report.data import setting_of
+from ufmstar_torch.eval.report.names import row_labels
 from ufmstar_torch.eval.report.paper import PaperTable, paper_tables
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, latex, markdown
 
@@ -64,7 +67,13 @@ def _table(run: Mapping[str, Any], label: str, relative: bool, kind: str) -> Tab
     bases = list(dict.fromkeys(row["base"] for row in rows))  # a block per base, as in the paper
     units = run["devices"]["units"]
     clock = _clock(units) if relative else None
-    lines = [_line(row, block, units, clock, kind) for block, b in enumerate(bases) for row in rows if row["base"] == b]
+    labels = _labels(rows)
+    lines = [
+        _line(row, block, units, clock, kind)._replace(label=labels[row["row"]])
+        for block, b in enumerate(bases)
+        for row in rows
+        if row["base"] == b
+    ]
     network = run["networks"][bases[0]]
     return Table.of(
         f"efficiency-{''.join(c if c.isalnum() else '-' for c in label.lower())}",
@@ -74,6 +83,15 @@ def _table(run: Mapping[str, Any], label: str, relative: bool, kind: str) -> Tab
         lines,
         (_about_depth(network, units[DEPTH], relative), *_notes(run, rows, relative, kind)),
     )
+
+
+def _labels(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """The rows' labels in a table by their names; of measurements that do not state a row's setting, the names."""
+    if not all("setting" in row for row in rows):
+        return {row["row"]: row["row"] for row in rows}
+    known = {row["row"]: Row(Method.parse(row["method"]), setting_of(row["setting"])) for row in rows}
+    shown = row_labels(known.values())
+    return {name: shown[row] for name, row in known.items()}
 
 
 def _paper_table(quoted: PaperTable) -> Table:

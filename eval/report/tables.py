@@ -188,7 +188,9 @@ def _costs(efficiency: Mapping[str, Any] | None, row: Row, records: Sequence[Rec
 
 def _cost_note(efficiency: Mapping[str, Any]) -> str:
     measured = len(efficiency.get("sequences", ()))
-    missing = "; ".join(efficiency["power"]["missing"].values())
+    used = set(efficiency["devices"]["units"].values())
+    reasons = [why for unit, why in efficiency["power"]["missing"].items() if unit in used]
+    missing = "; ".join(dict.fromkeys(reasons))
     words = f"; energy is not measurable here: {missing}" if missing else f", energy on {measured} of them"
     return f"Energy and memory are what uncertainty adds to depth alone, memory on all sequences{words}."
 
