@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.load import NetworkChoice, network_source
+from ufmstar_torch.eval.results import machine
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -79,6 +80,14 @@ def test_threads_wait_without_spinning(weights: Path) -> None:
         options = network.session.get_session_options()
         assert options.intra_op_num_threads == expected
         assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
+
+
+def test_a_run_leaves_a_core_to_reading_and_writing(monkeypatch: pytest.MonkeyPatch) -> None:
+    for cores, before, expected in ((2, 2, 1), (1, 1, 1), (4, 4, 3), (8, 2, 2)):
+        monkeypatch.setattr(machine, "available_cores", lambda cores=cores: cores)
+        torch.set_num_threads(before)
+        machine.share_threads()
+        assert torch.get_num_threads() == expected
 
 
 def test_without_onnx_runtime_torch_runs_and_says_so(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:

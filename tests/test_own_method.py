@@ -13,6 +13,7 @@ from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 SPEC = NetworkSpec(widths=0.1, positive="softplus", size=(64, 96), preprocess="resize")
 
 
+@pytest.mark.slow
 def test_both_rows_are_judged(tmp_path, capsys):
     torch.manual_seed(0)
     network = build_network(SPEC).eval()

@@ -56,6 +56,7 @@ def test_rows_without_evidence_come_last():
     ]
 
 
+@pytest.mark.slow
 def test_a_pool_of_two_sequences(tmp_path, capsys):
     torch.manual_seed(0)
     network = build_network(SPEC).eval()

@@ -367,7 +367,7 @@ class TestLoading:
         for row in suite_named(name).rows:
             assert setting_of(json.loads(json.dumps(row.setting.to_dict()))) == row.setting
             assert row_label(row).startswith(row.name)
-            assert row.name.replace("-Anchored", "") == row.method.name
+            assert row.name.replace("-Anchored", "").replace("-Posterior", "") == row.method.name
 
     def test_what_is_no_evaluation(self, tmp_path):
         with pytest.raises(ResultsError, match=r"no folder of `ufmstar eval`: it has no eval\.json"):

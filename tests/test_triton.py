@@ -7,8 +7,10 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from dataclasses import fields, replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -366,3 +368,25 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
         captured(given[0][0][:, :5], *given[0][1:])
     with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a mixture that grows"):
         Captured(UfMStar(UfMStarConfig(backend="triton")), *given[0])
+
+
+def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):
+    config = UfMStarConfig(segment=SPGF, backend="triton", initial_capacity=2)
+    first, second = (tuple(moved(v) for v in frame[:3]) for frame in walks(1, 2))
+    ufm = UfMStar(config)
+    new = int(ufm(*first).statistics.new)
+    assert new > 2 == ufm.mean.shape[1], "some must wait"
+    with monkeypatch.context() as broken:
+        broken.setattr("ufmstar_torch.kernels.step_device.fuse_bits", Mock(side_effect=RuntimeError("out of memory")))
+        with pytest.raises(RuntimeError, match="out of memory"):
+            ufm(*second)
+    twin = copy.deepcopy(ufm)
+    assert int((twin.mean[0, :, 2] != 0).sum()) == new
+    assert int(ufm.state_dict()["count"].sum()) == new
+    restored = UfMStar(config, device=DEVICE)
+    restored.load_state_dict(ufm.state_dict())
+    outputs = [module(*second) for module in (ufm, restored)]
+    close(outputs[1].variance, outputs[0].variance.cpu(), 0, 0)
+    assert torch.equal(outputs[0].statistics.components, outputs[1].statistics.components)
+    ufm.reset()
+    assert ufm.state.mixture.streams == 0

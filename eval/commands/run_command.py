@@ -105,7 +105,7 @@ class RunOptions:
         no_video: leave preview.mp4 out
         no_sheet: leave contact_sheet.png out
         device: cpu, cuda or cuda:N
-        threads: number of CPU threads; default: all cores
+        threads: number of CPU threads of network and step; default: all cores but one, which reads and writes
         debug: show tracebacks
     """
 
@@ -184,7 +184,10 @@ def main(options: RunOptions) -> int:
     from ufmstar_torch.eval.commands.run_job import job_from
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
     from ufmstar_torch.eval.results.folder import FolderError
+    from ufmstar_torch.eval.results.machine import share_threads
 
+    if options.threads is None:
+        share_threads()
     try:
         job = job_from(options)
     except (ImportError, OSError, ValueError) as error:

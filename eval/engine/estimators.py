@@ -284,7 +284,7 @@ class Gaussians:
             "smoothing_bytes": smoothed.nbytes,
         }
         if self.ufm.config.anchored:
-            kept["bytes"] += (count + 1) * self.ufm.overall_evidence.nbytes
+            kept["bytes"] += (count + 1) * self.ufm.overall_evidence.nbytes + self.ufm.posterior.nbytes
             kept["anchors"] = self._anchors
         return kept
 

@@ -45,6 +45,14 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def share_threads() -> None:
+    """Leave a core to the threads that read ahead and write behind: the threads of torch, and with it of ONNX Runtime
+    and the kernels, become one fewer than the cores, and no more than before."""
+    import torch
+
+    torch.set_num_threads(max(1, min(torch.get_num_threads(), available_cores() - 1)))
+
+
 def load_average() -> float | None:
     """Mean number of running or waiting processes over the last minute; None where the system does not report it."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None

@@ -101,10 +101,12 @@ class DeviceStep:
     ) -> tuple[UfMStarState, StepOutput]:
         plain = config.disagreement == "w2" and config.regression == "exact"
         if config.anchored or config.overlap_weighted or not plain or pixels is not None or observer is not None:
-            return step(
-                self.settled(state, config), frame, config, pixels=pixels, smooth=smooth, anchors=anchors,
+            stepped = step(
+                self._with_room(state, config, 1.0), frame, config, pixels=pixels, smooth=smooth, anchors=anchors,
                 observer=observer, kernels=self._kernels,
             )  # fmt: skip
+            self._waiting = None
+            return stepped
         state = self._with_room(state, config, _ROOM)
         updated, out, self._waiting = device_step(state, frame, config, smooth=smooth)
         self._of = updated.mean
@@ -112,28 +114,25 @@ class DeviceStep:
 
     def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
         """The state with everything appended that was waiting; waits for the device."""
-        return self._with_room(state, config, 1.0)
+        state = self._with_room(state, config, 1.0)
+        self._waiting = None
+        return state
 
     def _with_room(self, state: UfMStarState, config: UfMStarConfig, room: float) -> UfMStarState:
-        """The state with ``room`` slots for each that the frame before needed, and with what was waiting for one."""
-        waiting, self._waiting = self._waiting, None
+        """The state with ``room`` slots for each that the frame before needed, and with what was waiting for one.
+
+        It is still waiting afterwards: a step that raises loses nothing.
+        """
+        waiting = self._waiting
         if waiting is None or state.mean is not self._of:
             return state
         mixture, needed = state.mixture, waiting.slots()
         grown = mixture.grown(int(needed * room), config.max_components)
         if needed > mixture.capacity:
-            chosen, motion = waiting.left, waiting.to_first
             append(
-                grown,
-                waiting.current,
-                motion,
-                chosen,
-                state.frames,
-                near_plane=config.near_plane,
-                again=True,
-                last=True,
-            )
-        self._of = grown.mean
+                grown, waiting.current, waiting.to_first, waiting.left, state.frames, near_plane=config.near_plane,
+                again=True, last=True,
+            )  # fmt: skip
         return replace(state, **grown.tensors())
 
 
