@@ -181,6 +181,7 @@ class UfMStarConfig(Checked):
         features: additional regressed quantities per Gaussian
         initial_capacity: slots for Gaussians at the start; the number grows as needed
         max_components: largest number of Gaussians; null = no limit
+        spill: folder for Gaussians beyond max_components that are out of view, or "memory"; null = new ones are dropped
         rotation_tolerance: largest deviation of a pose's rotation from an orthogonal matrix
         on_bad_frame: refuse a frame with a fault, or skip and count it
         backend: implementation of the kernels
@@ -230,6 +231,7 @@ class UfMStarConfig(Checked):
     features: int = number(0, "dim H - 1", "1", 0)
     initial_capacity: int = number(256, "K_0", "components", 1)
     max_components: int | None = number(None, "K_max", "components", 1)
+    spill: str | None = None
 
     # Input checks and speed
     rotation_tolerance: float = number(0.01, "|R^T R - I|_max", "1", 0.0, 0.1)
@@ -242,6 +244,8 @@ class UfMStarConfig(Checked):
             raise ValueError(f"UfMStarConfig.segment must be an SPGFConfig, got {type(self.segment).__name__}")
         if self.unmeasured == "prior" and not self.prior_mean:
             raise ValueError("UfMStarConfig.unmeasured = 'prior' needs a prior_mean above 0")
+        if self.spill is not None and (not self.spill or self.max_components is None):
+            raise ValueError("UfMStarConfig.spill needs a folder or 'memory', and max_components")
         if self.posterior and not self.anchored:
             raise ValueError("UfMStarConfig.posterior needs anchored = True")
         if self.far_radius < self.near_radius:

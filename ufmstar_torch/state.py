@@ -101,7 +101,7 @@ class UfMStarState:
         for name, shape in shapes.items():
             if (given := tuple(getattr(self, name).shape)) != shape:
                 raise ValueError(f"{name} must have shape {shape} beside weight {(b, k)}, got {given}")
-        if config.max_components is not None and k > max(config.max_components, 1):
+        if config.max_components is not None and config.spill is None and k > max(config.max_components, 1):
             raise ValueError(f"{k} slots exceed max_components = {config.max_components}")
         if self.weight.device.type == "meta":
             return

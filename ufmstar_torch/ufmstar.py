@@ -26,6 +26,7 @@ from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior, update
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
+from ufmstar_torch.spill import Spill
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import Step, StepObserver
@@ -87,6 +88,7 @@ class UfMStar(StatefulModule):
         if recalibration is not None:
             recalibration.require(self.config)
         self.recalibration = recalibration
+        self._spill = None if self.config.spill is None else Spill(self.config)
         for name, value in UfMStarState.initial(0, self.config, dtype, device or "cpu").tensors().items():
             self.register_buffer(name, value)
 
@@ -220,7 +222,9 @@ class UfMStar(StatefulModule):
             ValueError: a size or number of streams that is not positive.
         """
         anchored = self.config.anchored if anchored is None else anchored
-        twin = UfMStar(self.config.replace(anchored=anchored), dtype=self.mean.dtype, device=self.mean.device)
+        twin = UfMStar(
+            self.config.replace(anchored=anchored, spill=None), dtype=self.mean.dtype, device=self.mean.device
+        )
         warm_up(twin, size, streams)
 
     def query(self, points: Tensor, frame: str = "world") -> Regression:
@@ -253,7 +257,8 @@ class UfMStar(StatefulModule):
                 T = invert_rigid(self.T_world_first)
                 local = apply(T[:, None, :3, :3], local.double()) + T[:, None, :3, 3]
             dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
-            mixture = unmeasured.before_regression(self.mixture, self.config)
+            state = self.state if self._spill is None else self._spill.everything(self.state)
+            mixture = unmeasured.before_regression(state.mixture, self.config)
             result = regress(mixture, local.to(dtype), self.config)
             return unmeasured.after_regression(result, None, self.config)[0]
 
@@ -372,17 +377,22 @@ class UfMStar(StatefulModule):
                 raise_faults(known.tolist())
             if self.observer is not None:
                 self.observer.stage("check")
-            step = self._step(frame.depth.device.type)
+            step, config = self._step(frame.depth.device.type), self.config
+            if self._spill is not None:
+                state, config = self._spill.read_back(state, frame), self._spill.config
             state, out = step(
-                state, frame, self.config, pixels=pixels, smooth=average, anchors=checked_anchors,
+                state, frame, config, pixels=pixels, smooth=average, anchors=checked_anchors,
                 observer=self.observer,
             )  # fmt: skip
+            if (self.config.merge or self._spill is not None) and isinstance(step, LateStep):
+                state = step.settled(state, config)
             state, out, posterior = self._with_posterior(state, out, frame, checked_anchors, dense=pixels is None)
             if self.config.merge:
-                state = step.settled(state, self.config) if isinstance(step, LateStep) else state
                 kernels = select_merge(self.config.backend, frame.depth.device.type)
                 state = merged(state, frame.fault == 0, self.config, kernels)
                 out = replace(out, statistics=replace(out.statistics, components=state.mixture.components))
+            if self._spill is not None:
+                state = self._spill.write_out(state, frame)
             self._store(state.tensors())
             self._warn_without_segments(frame, out)
 
