@@ -20,7 +20,7 @@ from ufmstar_torch.config import UfMStarConfig
 SCALAR, ISOTONIC = "scalar", "isotonic"
 _SHOWN = 12  # digits of a digest
 # Settings of UfM* that do not change what V means.
-_HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
+_HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components", "spill")
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ def best_pixels(image, cell, pixel, strength):
     height, width = image.shape
     for j in range(strength.shape[0]):
         for i in range(strength.shape[1]):
-            best, at_u, at_v = 0, 0, 0
+            best, at_u, at_v = np.int32(0), 0, 0
             for v in range(max(j * cell, MARGIN), min((j + 1) * cell, height - MARGIN)):
                 for u in range(max(i * cell, MARGIN), min((i + 1) * cell, width - MARGIN)):
                     du = np.int32(image[v, u + 1]) - np.int32(image[v, u - 1])
