@@ -108,7 +108,7 @@ def content(folder, *patterns):
 def without_clock(value):
     """Plain values without what a clock says or the user chose, at any depth."""
     if isinstance(value, dict):
-        dropped = ("time", "seconds", "settings", "versions", "machine")
+        dropped = ("out", "time", "seconds", "settings", "versions", "machine")
         kept = {key: item for key, item in value.items() if key not in dropped and not key.endswith("ms")}
         return {key: without_clock(item) for key, item in kept.items()}
     return [without_clock(item) for item in value] if isinstance(value, list) else value
