@@ -157,7 +157,11 @@ def test_suites_and_words(tmp_path):
         "UfM*-Anchored-DepthOnly",
         "UfM*-Anchored-DepthOnly, disagreement overlap",
         "UfM*-Anchored-DepthOnly, depth corrected on",
+        "UfM*-Posterior-DepthOnly",
+        f"{NAME}, anchored by dense",
+        f"{NAME}, anchored by dense, posterior on",
         f"{NAME}, anchored by ground truth",
+        f"{NAME}, anchored by ground truth, posterior on",
     ]
     every = suite_named("all-anchored")
     assert set(every.bases) == set(BASES)
