@@ -369,6 +369,17 @@ class TestLoading:
             assert row_label(row).startswith(row.name)
             assert row.name.replace("-Anchored", "").replace("-Posterior", "") == row.method.name
 
+    def test_what_a_killed_report_left_is_removed(self, tmp_path):
+        out = write_evaluation(tmp_path, ENSEMBLE[:1], SCENES[:1])
+        (out / "figures").mkdir()
+        left = [out / "figures" / ".latency.svg.0123456789ab.tmp", out / ".results.csv.0123456789ab.tmp"]
+        of_eval = out / ".eval.json.0123456789ab.tmp"
+        for path in (*left, of_eval):
+            path.write_text("half")
+        write_report(out, figures=False)
+        assert not any(path.exists() for path in left)
+        assert of_eval.exists()
+
     def test_what_is_no_evaluation(self, tmp_path):
         with pytest.raises(ResultsError, match=r"no folder of `ufmstar eval`: it has no eval\.json"):
             load_results(tmp_path)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.report.tables import write_tables, write_tidy
+from ufmstar_torch.eval.results.files import remove_temporaries
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,9 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> R
         OSError: a file cannot be written.
     """
     results = load_results(out, with_sums=figures)
+    # What a killed report has left; eval.json and the records are those of `ufmstar eval`.
+    for pattern in ("tables/.*.tmp", "figures/.*.tmp", ".results.*.tmp", ".table.*.tmp", ".report.*.tmp"):
+        remove_temporaries(out.glob(pattern))
     files = [*write_tidy(results), *write_tables(results)]
     undrawn: dict[str, str] = {}
     if figures:
