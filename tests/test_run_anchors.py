@@ -155,6 +155,8 @@ def test_a_standing_camera_is_plain_ufm_star_and_the_summary_says_so(tour, tmp_p
     }
     assert "without anchors: 4 of 4 frames (1 x no corner followed" in run_table(summary)
     assert "; 4 before the first anchors: plain UfM*\n" in run_table(summary)
+    dense = {**summary, "source": {**summary["source"], "anchors": "dense"}}
+    assert "searched or seen again" in run_table(dense)
     for name in still.names:
         on, off = (read_frame(tmp_path / folder / "frames" / f"{name}.npz") for folder in ("on", "off"))
         np.testing.assert_array_equal(on["variance"], off["variance"])

@@ -26,7 +26,11 @@ _DEMO_COLUMNS = {
 # [nats] Above it, the mean NLL is decided by a few pixels with almost no variance.
 _NLL_DOMINATED = 100.0
 # What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
-_FOUND = {"tracked": ("triangulated", "tracked"), "landmarks": ("in view", "in the map")}
+_FOUND = {
+    "tracked": ("triangulated", "tracked"),
+    "landmarks": ("in view", "in the map"),
+    "dense": ("with a depth", "searched or seen again"),
+}
 _RUN_COLUMNS = {
     "delta1": "delta1",
     "abs_rel": "AbsRel",

@@ -116,9 +116,9 @@ def _on_gpu(name: str, device_type: str) -> bool:
 
 
 def select_posterior(name: str, device_type: str) -> PosteriorKernels:
-    """The posterior's kernels for a device; arguments and errors as :func:`select_kernels`. An accelerator takes the
+    """The posterior's kernels for a device; arguments and errors as :func:`select_step`. An accelerator takes the
     reference."""
-    if device_type != "cpu" or select_kernels(name, device_type) is REFERENCE:
+    if not _compiled(name, device_type):
         return POSTERIOR_REFERENCE
     from ufmstar_torch.kernels import posterior_cpu
 
