@@ -59,8 +59,12 @@ def links(logs):
 
 def features(logs, u, v):
     """logs less m_0; u and v from 0 to 1."""
-    hat = lambda x, i: max(1 - abs(x * (HATS - 1) - i), 0.0)  # noqa: E731
     return np.array([1, logs, 2 * u - 1, 2 * v - 1, *(hat(u, i) * hat(v, j) for j in range(HATS) for i in range(HATS))])
+
+
+def hat(x, i):
+    """The i-th coarse bilinear function at x in [0, 1]: 1 at its node, 0 from the next ones on."""
+    return max(1 - abs(x * (HATS - 1) - i), 0.0)
 
 
 def node_features(logs):

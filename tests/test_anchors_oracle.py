@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from oracle_anchors import AnchoredOracle
-from test_ufmstar import HEIGHT, SPGF, WIDTH, oracle_settings
+from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_ufmstar import SPGF, walks
+from walks import SPGF, walks
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.bench.benchmark import BenchSettings, run_benchmark

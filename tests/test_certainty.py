@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_ufmstar import SPGF, oracle_settings
+from walks import SPGF, oracle_settings
 
 import oracle
 import scenes

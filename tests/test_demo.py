@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from demo_networks import SIZE, SPEC, members, write_members
 from runs import read_summary
 
 from ufmstar_torch import UncertainDepth, cli
@@ -30,32 +31,18 @@ from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
-from ufmstar_torch.models import NetworkSpec, build_network, save_trained
+from ufmstar_torch.models import NetworkSpec, save_trained
 from ufmstar_torch.pipeline import NetworksInTurn
 
 METHODS = (NETWORK, UFM, UFM_STAR, ENSEMBLE)
 CPU = torch.device("cpu")
-SIZE, FRAMES, SEED = (64, 96), 7, 5
-SPEC = NetworkSpec(widths=0.1, positive="softplus", size=SIZE, preprocess="resize")
+FRAMES, SEED = 7, 5
 SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
-
-
-def members(count=3, spec=SPEC):
-    """Networks without training: their depths differ, which is all that the plumbing needs."""
-    torch.manual_seed(0)
-    networks = [build_network(spec).eval() for _ in range(count)]
-    with torch.no_grad():
-        for n, network in enumerate(networks):
-            network.backbone.head.norm.weight *= 30  # depth that follows the image
-            network.backbone.head.norm.bias += 0.1 * n
-    return networks
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    path = tmp_path_factory.mktemp("weights") / "three.safetensors"
-    save_trained(path, members(), SPEC, info={"note": "a test"})
-    return path
+    return write_members(tmp_path_factory.mktemp("weights") / "three.safetensors")
 
 
 @pytest.fixture(scope="module")

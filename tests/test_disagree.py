@@ -8,7 +8,7 @@ import random_gaussians
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from test_ufmstar import HEIGHT, SPGF, WIDTH, oracle_settings
+from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import oracle
 import scenes

@@ -7,9 +7,9 @@ import copy
 import pytest
 import torch
 from onnx_files import small_network
-from test_ufmstar import SPGF
 from tiny_networks import Linear, constant_head
 from torch import Tensor, nn
+from walks import SPGF
 
 import scenes
 from ufmstar_torch import UfMStarConfig, UncertainDepth

@@ -9,7 +9,7 @@ import copy
 
 import pytest
 import torch
-from test_ufmstar import SPGF, walks
+from walks import SPGF, walks
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from demo_networks import write_members
 from suite_runs import TRUTH, kept, write_rooms
-from test_demo import weights  # noqa: F401 (a fixture)
 from trainings import write_frames
 
 from ufmstar_torch.models.checkpoints import read_safetensors
@@ -165,7 +165,8 @@ def test_train(tmp_path, seed):
         assert [name for name in theirs if not torch.equal(mine[name], theirs[name])] == []
 
 
-def test_demo(weights, tmp_path):  # noqa: F811
+def test_demo(tmp_path):
+    weights = write_members(tmp_path / "three.safetensors")
     words = ["demo", "--weights", weights, "--frames", 5, "--seed", 5, "--threads", 1, "--out"]
     whole, out = tmp_path / "whole", tmp_path / "out"
     finish([*words, whole])

@@ -12,10 +12,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_ufmstar import SPGF, run
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
+from walks import SPGF, run
 
 import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig

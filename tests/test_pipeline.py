@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_ufmstar import SPGF
 from torch import nn
+from walks import SPGF
 
 import scenes
 from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
-from test_ufmstar import SPGF, oracle_settings
 from tiny_suite import CPU, base_network, row, write_network, write_networks
+from walks import SPGF, oracle_settings
 
 import oracle
 import scenes

@@ -18,7 +18,7 @@ import torch
 from random_gaussians import covariances, mixture
 from segment_scenes import REFERENCES, numba_spgf, reference
 from test_fuse import random_pairs
-from test_ufmstar import HEIGHT, SPGF, WIDTH, truth, walk, walks  # noqa: F401
+from walks import HEIGHT, SPGF, WIDTH, oracle_run, walks
 
 import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig, gaussian
@@ -307,7 +307,7 @@ def test_whole_step(streams, settings):
         close(getattr(ufm.mixture, name)[:, :n], value[:, :n], 1e-5, 1e-7)
 
 
-def test_thirty_frames_agree_with_the_oracle(truth, kernels):  # noqa: F811
+def test_thirty_frames_agree_with_the_oracle(kernels):
     """All kernels over the oracle's sequence; in the interpreter the CPU's segmentation, whose labels are the same."""
     from functools import partial
 
@@ -315,7 +315,7 @@ def test_thirty_frames_agree_with_the_oracle(truth, kernels):  # noqa: F811
     from ufmstar_torch.state import UfMStarState
     from ufmstar_torch.step import step
 
-    depths, poses, intrinsics, aleatoric, maps, _, expected, sizes = truth
+    depths, poses, intrinsics, aleatoric, maps, _, expected, sizes = oracle_run()
     config = UfMStarConfig(segment=SPGF, features=2, initial_capacity=8)
     if INTERPRETED:
         kernels = replace(kernels, spgf=select_kernels("numba", "cpu").spgf)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -237,13 +238,19 @@ def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
         lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
     except Timeout:
         return None
-    except (OSError, NotImplementedError) as error:  # the latter is filelock's word for ENOSYS
-        if isinstance(error, OSError) and error.errno not in _NO_LOCKS:
+    except NotImplementedError as error:  # filelock's form of ENOSYS
+        raise _no_locks(path, errno.ENOSYS) from error
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
             raise
-        reason = getattr(error, "strerror", None) or error
-        text = f"the file system does not support locks ({reason}), choose a folder on another one"
-        raise OSError(getattr(error, "errno", None) or 0, text, str(path)) from error
+        raise _no_locks(path, error.errno) from error
     return lock
+
+
+def _no_locks(path: Path, code: int) -> OSError:
+    """The error of a file system that does not support locks."""
+    text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
+    return OSError(code, text, str(path))
 
 
 def differences(then: Manifest, now: Manifest) -> str:

@@ -148,7 +148,8 @@ def read(
     for d, g, c, at, b, m, out, var in zip(*maps, mean.tolist(), y.numpy(), spread.numpy(), strict=True):
         _pixels(d, g, c, at, b, m, *size, ALIKE, LARGEST_LOG, out, var)
     corrected = depth * y.exp()
-    return tuple(torch.where(valid, x, torch.nan) for x in (corrected, corrected.square() * spread))  # type: ignore
+    corrected, variance = (torch.where(valid, x, torch.nan) for x in (corrected, corrected.square() * spread))
+    return corrected, variance
 
 
 @compiled

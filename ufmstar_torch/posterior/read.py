@@ -65,7 +65,8 @@ def read(
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
     corrected = d * y.clamp(-LARGEST_LOG, LARGEST_LOG).exp()
     spread = corrected.square() * (variance + unseen * claimed.double() / d.square())
-    return tuple(torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread))  # type: ignore
+    corrected, spread = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread))
+    return corrected, spread
 
 
 def _between(x: Tensor, count: int) -> tuple[Tensor, Tensor]:
