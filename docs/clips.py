@@ -96,9 +96,9 @@ def predict(name: str, source: str, members: list[DepthNetwork], *, aleatoric: b
         image, intrinsics = image_tensor(frame), torch.from_numpy(frame.intrinsics)
         with torch.no_grad():
             x, K = member.preprocess(image, intrinsics[None])
-            said = member(x)
-        depth, k = said.depth[0].float().numpy(), K[0].double().numpy()
-        own = said.aleatoric_variance[0].float().numpy() if aleatoric else depth
+            text = member(x)
+        depth, k = text.depth[0].float().numpy(), K[0].double().numpy()
+        own = text.aleatoric_variance[0].float().numpy() if aleatoric else depth
         truth = truth_at(frame, k, depth.shape)
         rows.append((depth, own, np.zeros_like(depth) if truth is None else truth, frame.T_world_cam, k))
     depths, owns, truths, poses, Ks = (np.stack(column) for column in zip(*rows, strict=True))

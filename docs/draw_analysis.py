@@ -88,11 +88,11 @@ def draw_factors(groups: dict[str, list[dict[str, dict[str, float]]]]) -> Figure
     names = list(next(iter(groups.values()))[0])[1:]
     figure, axes = plt.subplots(1, 2, figsize=(9, 0.26 * len(names) + 1), sharey=True, layout="constrained")
     for axis, (column, title) in zip(axes, columns.items(), strict=True):
-        for k, (group, found) in enumerate(groups.items()):
-            changes = [mean_and_ci(one[n][column] - one["default"][column] for one in found) for n in names]
+        for k, (group, result) in enumerate(groups.items()):
+            changes = [mean_and_ci(one[n][column] - one["default"][column] for one in result) for n in names]
             rows = np.arange(len(names)) + 0.25 * (k - (len(groups) - 1) / 2)
             means, halves = zip(*changes, strict=True)
-            axis.errorbar(means, rows, xerr=halves, fmt="o", markersize=4, label=f"{group}, {len(found)} clips")
+            axis.errorbar(means, rows, xerr=halves, fmt="o", markersize=4, label=f"{group}, {len(result)} clips")
         axis.axvline(0, color="k", linewidth=1)
         axis.set(xlabel=title, yticks=range(len(names)))
         axis.set_yticklabels(names, fontsize=8)

@@ -25,7 +25,7 @@ Point = tuple[str, float, dict[str, float]]  # base, over-confidence of the netw
 
 def points(folders: list[Path]) -> list[Point]:
     """One for each network and sequence that has both rows."""
-    found: list[Point] = []
+    result: list[Point] = []
     for folder in folders:
         records = {(r.dataset, r.sequence, r.method): r for r in load_results(folder, with_sums=False).records}
         for (dataset, sequence, name), alone in records.items():
@@ -33,8 +33,8 @@ def points(folders: list[Path]) -> list[Point]:
             star = records.get((dataset, sequence, Method(method.base, UFM_STAR).name))
             if method.fusion == ALONE and star is not None and method.uses_aleatoric:
                 change = {key: star.figures[key] - alone.figures[key] for key in FIGURES}
-                found.append((method.base, alone.figures["overconfidence"], change))
-    return found
+                result.append((method.base, alone.figures["overconfidence"], change))
+    return result
 
 
 def draw(foreign: list[Point], same: list[Point]) -> Figure:

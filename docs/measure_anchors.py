@@ -69,8 +69,8 @@ def figures(tour: Tour, landmarks: list[Landmarks], config: UfMStarConfig) -> li
     """ECE_delta, ECE_q, AUSE [m] and Spearman of UfM*."""
     clip, ufm, maps = tour.clip, UfMStar(config), []
     K = torch.from_numpy(clip.K)[None]
-    for depth, pose, frame, found in zip(clip.depth, clip.pose, tour.frames, landmarks, strict=True):
-        anchors = found.anchors(frame.intrinsics, K) if config.anchored else None
+    for depth, pose, frame, result in zip(clip.depth, clip.pose, tour.frames, landmarks, strict=True):
+        anchors = result.anchors(frame.intrinsics, K) if config.anchored else None
         maps.append(ufm(torch.from_numpy(depth)[None], torch.from_numpy(pose)[None], K, anchors=anchors).variance[0])
     judged = judge(clip, torch.stack(maps).numpy(), STRIDE)
     return [judged[name] for name in ("ece_delta", "ece_q", "ause_rmse", "spearman")]
@@ -86,8 +86,8 @@ def main() -> None:
     own = [tracked(tour, TrackerConfig()) for tour in every]
 
     def told(name: str, landmarks: list[list[Landmarks]], config: UfMStarConfig) -> None:
-        found = [figures(tour, marks, config) for tour, marks in zip(every, landmarks, strict=True)]
-        line(name, *map(shown, np.mean(found, axis=0)))
+        result = [figures(tour, marks, config) for tour, marks in zip(every, landmarks, strict=True)]
+        line(name, *map(shown, np.mean(result, axis=0)))
 
     for values in OF_UFM:
         told(", ".join(f"{k} {v}" for k, v in values.items()) or "UfM\\*", own, UfMStarConfig(**values))

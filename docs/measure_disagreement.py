@@ -73,8 +73,8 @@ def baselines(clip: Clip, stride: int) -> None:
     line("variance", *COLUMNS)
     line(*["---"] * (len(COLUMNS) + 1))
     for name, variance in variances(clip):
-        found = judge(clip, variance, stride)
-        line(name, *(shown(found[column]) for column in COLUMNS))
+        result = judge(clip, variance, stride)
+        line(name, *(shown(result[column]) for column in COLUMNS))
 
 
 def places(clip: Clip) -> dict[str, NDArray[np.bool_]]:

@@ -43,17 +43,17 @@ def row(sequence: FrameSequence, kind: str) -> str:
         if frame.image is None or frame.depth is None or not np.isfinite(frame.T_world_cam).all():
             continue
         started = process_time()
-        found = source.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        result = source.update(frame.image, frame.T_world_cam, frame.intrinsics)
         ms.append(1000 * (process_time() - started))
-        z = truth(frame, found.pixel)
+        z = truth(frame, result.pixel)
         known = z > 0
-        sigma, z = np.sqrt(found.variance[known]) / found.depth[known] ** 2, z[known]
-        normalised.append((1 / found.depth[known] - 1 / z) / sigma)
-        relative.append(np.abs(found.depth[known] / z - 1))
-        confirmed.append(np.zeros(len(z)) if found.confirmed is None else found.confirmed[known])
-        at = found.pixel / np.array(frame.image.shape[1::-1]) * GRID
+        sigma, z = np.sqrt(result.variance[known]) / result.depth[known] ** 2, z[known]
+        normalised.append((1 / result.depth[known] - 1 / z) / sigma)
+        relative.append(np.abs(result.depth[known] / z - 1))
+        confirmed.append(np.zeros(len(z)) if result.confirmed is None else result.confirmed[known])
+        at = result.pixel / np.array(frame.image.shape[1::-1]) * GRID
         covered.append(len(np.unique(at.astype(int).clip(0, GRID - 1) @ [1, GRID])) / GRID**2)
-        counts.append(len(found.depth))
+        counts.append(len(result.depth))
     size, error, times = np.abs(np.concatenate(normalised)), np.concatenate(relative), np.concatenate(confirmed)
     parts = [np.quantile(error[part], 0.9) if part.any() else np.nan for part in (times == 0, times >= 2)]
     figures = (np.median(size) / NORMAL, np.mean(size > 5), np.median(error), np.quantile(error, 0.9), *parts)

@@ -56,14 +56,14 @@ Figures = dict[str, dict[str, float]]
 def figures(clip: Clip, only: Sequence[str] | None = None) -> Figures:
     """The figures of a clip by factor, "default" first; ``only`` names the factors that are tried, None = all."""
     default = estimate(clip, UfMStar())
-    found = {"default": judge(clip, default, STRIDE)}
+    result = {"default": judge(clip, default, STRIDE)}
     own = np.zeros_like(default) if clip.aleatoric is None else clip.aleatoric
     for scale in SCALES:
         scaled = np.maximum(own + np.float32(scale) * (default - own), 0)
-        found[f"M times {scale:g}"] = judge(clip, scaled, STRIDE)
+        result[f"M times {scale:g}"] = judge(clip, scaled, STRIDE)
     for name, change in CHANGES.items() if only is None else ((name, CHANGES[name]) for name in only):
-        found[name] = judge(clip, estimate(clip, UfMStar(UfMStarConfig.from_dict(change))), STRIDE)
-    return found
+        result[name] = judge(clip, estimate(clip, UfMStar(UfMStarConfig.from_dict(change))), STRIDE)
+    return result
 
 
 def table(title: str, found: list[Figures]) -> None:
@@ -87,8 +87,8 @@ def main() -> None:
     for clip in clips(arguments):
         title = "Depth only" if clip.aleatoric is None else "Ensemble"
         groups.setdefault(title, []).append(figures(clip, arguments.only))
-    for title, found in groups.items():
-        table(title, found)
+    for title, result in groups.items():
+        table(title, result)
     if arguments.save is not None:
         arguments.save.write_text(json.dumps(groups))
 

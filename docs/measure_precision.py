@@ -31,11 +31,11 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     add_sources(parser)
-    found = list(clips(parser.parse_args()))
+    result = list(clips(parser.parse_args()))
     line("depth maps", "clip", "median", "99th percentile", "largest")
     line(*["---"] * 5)
     for name, dtype in DTYPES.items():
-        for clip in found:
+        for clip in result:
             change = changes(clip, dtype)
             line(name, clip.name, *(f"{100 * x:.1f} %" for x in (*np.percentile(change, [50, 99]), change.max())))
 

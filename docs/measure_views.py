@@ -122,8 +122,8 @@ def pairs(depth: Map, clip: Clip) -> Iterator[tuple[Array, Array]]:
 def parts(clip: Clip) -> None:
     """Mean W2^2 of the pairs, weighted with their pixels, of the predicted and of the true depth."""
     for what, depth in (("predicted", clip.depth), ("true", clip.truth)):
-        found = list(pairs(depth, clip))
-        terms, pixels = (np.concatenate(arrays, axis=-1) for arrays in zip(*found, strict=True))
+        result = list(pairs(depth, clip))
+        terms, pixels = (np.concatenate(arrays, axis=-1) for arrays in zip(*result, strict=True))
         line(clip.name, what, *(f"{value:.4f}" for value in (terms * pixels).sum(1) / pixels.sum()))
 
 

@@ -148,7 +148,7 @@ def _recording(
 
 
 def _views(part: str, frames: Iterable[Frame], rooms: list[str], preprocess: Preprocess) -> tuple[View, ...]:
-    found = []
+    result = []
     for frame, room in zip(frames, rooms, strict=True):
         if frame.image is None or frame.depth is None:
             raise ValueError(f"frame {frame.name} has no {'image' if frame.image is None else 'depth'}: it needs both")
@@ -157,5 +157,5 @@ def _views(part: str, frames: Iterable[Frame], rooms: list[str], preprocess: Pre
         truth = truth_at(frame, K[0].numpy(), (x.shape[-2], x.shape[-1]))
         assert truth is not None
         pose = torch.from_numpy(frame.T_world_cam)
-        found.append(View(f"{part}/{frame.name}", x[0], torch.from_numpy(truth), pose, K[0], room))
-    return tuple(found)
+        result.append(View(f"{part}/{frame.name}", x[0], torch.from_numpy(truth), pose, K[0], room))
+    return tuple(result)

@@ -35,14 +35,14 @@ def scores(model: UncertainDepth, path: str, pixels: int, seed: int) -> Iterator
             continue
         image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
         pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-        found = model.mean_uncertainty(image, pose, K, pixels=pixels, seed=seed + frame.index)
+        result = model.mean_uncertainty(image, pose, K, pixels=pixels, seed=seed + frame.index)
         yield {
             "sequence": sequence.name,
             "frame": frame.name,
-            "mean_variance_m2": float(found.mean),
-            "standard_error_m2": float(found.standard_error),
-            "measured": float(found.measured),
-            "pixels": int(found.pixels),
+            "mean_variance_m2": float(result.mean),
+            "standard_error_m2": float(result.standard_error),
+            "measured": float(result.measured),
+            "pixels": int(result.pixels),
         }
 
 

@@ -33,11 +33,11 @@ class Ensemble(DepthNetwork):
         super().__init__()
         if len(members) < 2:
             raise ValueError(f"members must be at least two networks, got {len(members)}")
-        wanted = [member.preprocess for member in members]
-        if any(other != wanted[0] for other in wanted):
-            raise ValueError(f"members must have the same preprocessing, got {wanted}")
+        expected = [member.preprocess for member in members]
+        if any(other != expected[0] for other in expected):
+            raise ValueError(f"members must have the same preprocessing, got {expected}")
         self.members = nn.ModuleList(members)
-        self.preprocess = wanted[0]
+        self.preprocess = expected[0]
 
     @property
     def takes_intrinsics(self) -> bool:

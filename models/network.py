@@ -82,8 +82,8 @@ def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[
         raise ValueError(f"image must be floating-point [B, 3, H, W] as the network's preprocess makes it, got {shape}")
     height, width = image.shape[-2:]
     if not fits(height, width, multiple, smallest):
-        wanted = f"multiples of {multiple} px" + (f", at least {smallest}" if smallest > multiple else "")
-        raise ValueError(f"image must have a height and width that are {wanted}, got {height} x {width}")
+        expected = f"multiples of {multiple} px" + (f", at least {smallest}" if smallest > multiple else "")
+        raise ValueError(f"image must have a height and width that are {expected}, got {height} x {width}")
     return height, width
 
 

@@ -69,12 +69,12 @@ class NetworkSpec(Checked):
         if self.method == "mc_dropout" and not self.dropout:
             raise ValueError("NetworkSpec.dropout must be positive for 'mc_dropout', which samples by it")
         if (self.members > 1) != (self.method == "batch_ensemble"):
-            wanted = "1" if self.members > 1 else "at least 2"
-            raise ValueError(f"NetworkSpec.members must be {wanted} for {self.method!r}, got {self.members}")
+            expected = "1" if self.members > 1 else "at least 2"
+            raise ValueError(f"NetworkSpec.members must be {expected} for {self.method!r}, got {self.members}")
         size, smallest = self.size, _SMALLEST[self.architecture]
         if type(size) is not tuple or len(size) != 2 or not all(_is_side(side, smallest) for side in size):
-            wanted = f"multiples of {_MULTIPLE} px from {smallest} px on"
-            raise ValueError(f"NetworkSpec.size must be (height, width) in {wanted}, got {size!r}")
+            expected = f"multiples of {_MULTIPLE} px from {smallest} px on"
+            raise ValueError(f"NetworkSpec.size must be (height, width) in {expected}, got {size!r}")
         for f in fields(self):
             if _ONLY.get(f.name, self.architecture) != self.architecture and getattr(self, f.name) != f.default:
                 raise ValueError(f"NetworkSpec.{f.name} is of {_ONLY[f.name]!r} only, not of {self.architecture!r}")

@@ -145,17 +145,17 @@ def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
     matches, overlaps = [], {}
     for c, component in enumerate(current_cam):
         own = candidate(component, K, size, near)
-        found = []
+        result = []
         for k, other in enumerate(projected):
             if own is None or other is None:
                 continue
             overlaps[c, k] = bhattacharyya(*other, *own)
             if overlaps[c, k] >= eta:
-                found.append(k)
+                result.append(k)
         kept = []
-        for k in found:
+        for k in result:
             hidden = False
-            for other in found:
+            for other in result:
                 nearer = previous_cam[other]["mean"][2] < previous_cam[k]["mean"][2]
                 if nearer and bhattacharyya(*projected[other], *projected[k]) > eta_occl:
                     hidden = True

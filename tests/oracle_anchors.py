@@ -15,18 +15,18 @@ def believed(anchors):
         return [True] * len(anchors)
     ratio = [np.log(g / d) for _, _, g, _, d in anchors]
     noise = [s2 / g**2 for _, _, g, s2, _ in anchors]
-    asked = []
+    requested = []
     for i, (u, v, *_) in enumerate(anchors):
         others = [j for j in range(len(anchors)) if j != i]
         others.sort(key=lambda j: ((anchors[j][0] - u) ** 2 + (anchors[j][1] - v) ** 2, j))
-        asked.append(others[:NEIGHBOURS])
-    sigma = np.quantile([abs(ratio[i] - ratio[j]) for i, near in enumerate(asked) for j in near], 0.25) / QUARTILE
-    found = []
-    for i, near in enumerate(asked):
+        requested.append(others[:NEIGHBOURS])
+    sigma = np.quantile([abs(ratio[i] - ratio[j]) for i, near in enumerate(requested) for j in near], 0.25) / QUARTILE
+    result = []
+    for i, near in enumerate(requested):
         limits = [SIGMAS * np.sqrt(sigma**2 + 2 * LEAST**2 + noise[i] + noise[j]) for j in near]
         agree = sum(abs(ratio[i] - ratio[j]) <= limit for j, limit in zip(near, limits, strict=True))
-        found.append(agree >= SUPPORT)
-    return found
+        result.append(agree >= SUPPORT)
+    return result
 
 
 def weight(claim, others):

@@ -29,11 +29,11 @@ def warp(pixel, rho, H, b, step=1e-4):
 
 def patch(image, pixel, rho, H, b):
     """[10, 10] the image around a pixel as the view sees it at rho."""
-    back, found = warp(np.asarray(pixel, float), rho, H, b), np.empty((SIDE + 2, SIDE + 2))
+    back, result = warp(np.asarray(pixel, float), rho, H, b), np.empty((SIDE + 2, SIDE + 2))
     for j in range(SIDE + 2):
         for i in range(SIDE + 2):
-            found[j, i] = bilinear(image, *(pixel + back @ [i + FIRST - 1, j + FIRST - 1]))
-    return found
+            result[j, i] = bilinear(image, *(pixel + back @ [i + FIRST - 1, j + FIRST - 1]))
+    return result
 
 
 def zncc(one, other):

@@ -62,19 +62,19 @@ def job_of(sequence, source, frames=slice(None), config=CONFIG, **options):
 
 def outputs(out):
     """Every output that must not depend on interruptions, by file: exact bytes, or values without times."""
-    found = {}
+    result = {}
     for file in sorted(out.rglob("*")):
         name = str(file.relative_to(out))
         if file.suffix == ".npz":
             with np.load(file) as stored:
-                found[name] = {key: stored[key].tobytes() for key in stored.files}
+                result[name] = {key: stored[key].tobytes() for key in stored.files}
         elif name == "frames.jsonl":
-            found[name] = [without_times(json.loads(line)) for line in file.read_text().splitlines()]
+            result[name] = [without_times(json.loads(line)) for line in file.read_text().splitlines()]
         elif name == "summary.json":
-            found[name] = without_times(json.loads(file.read_text()))
+            result[name] = without_times(json.loads(file.read_text()))
         elif file.is_file() and file.parent.name != "resume":
-            found[name] = file.read_bytes()
-    return found
+            result[name] = file.read_bytes()
+    return result
 
 
 def without_times(record):

@@ -88,14 +88,14 @@ def go(job, evaluate=None, *, resume=False, overwrite=False, **context):
 
 def kept(out):
     """What does not depend on who computed it, or when: figures, curves and sums by file."""
-    found = {}
+    result = {}
     for path in sorted((out / "records").rglob("*.json")):
         values = json.loads(path.read_text())
         if path.name != "failed.json":
             sums = torch.load(path.with_suffix(".pt"), weights_only=True)
             plain = {name: values[name] for name in ("frames", "figures", "curves", "state")}
-            found[str(path.relative_to(out))] = (plain, _bytes(sums))
-    return found
+            result[str(path.relative_to(out))] = (plain, _bytes(sums))
+    return result
 
 
 def _bytes(value):

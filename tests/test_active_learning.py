@@ -224,20 +224,20 @@ def test_no_held_back_view_is_trained_on_and_no_label_beyond_the_picks_used(plac
 def test_scores_decide_and_later_rounds_score_anew(place, monkeypatch):
     start, settings = networks(1), example.Settings(budget=2, rounds=2, spacing=2, steps=2, pixels=100)
     first = {"ufmstar": [float(i == 7) for i in range(12)]}
-    asked: list[Any] = []
+    requested: list[Any] = []
 
     def scored(members: Any, pool: Any, pixels: int) -> dict[str, list[float]]:
-        asked.append(members)
+        requested.append(members)
         return {"ufmstar": [float(i == 3) for i in range(12)]}
 
     monkeypatch.setattr(example, "score_pool", scored)
     picks, _ = example.run_strategy("ufmstar", start, place, first, settings, seed=0)
     assert picks == [7, 3]
-    assert len(asked) == 1
-    assert asked[0][0] is not start[0], "the second round is scored by what the first has learnt"
+    assert len(requested) == 1
+    assert requested[0][0] is not start[0], "the second round is scored by what the first has learnt"
     chance = [example.run_strategy("random", start, place, first, settings, seed=s)[0] for s in (0, 0, 1)]
     assert chance[0] == chance[1] != chance[2]
-    assert len(asked) == 1, "random picks look at no score"
+    assert len(requested) == 1, "random picks look at no score"
 
 
 def test_a_recordings_parts_do_not_touch(tmp_path):
@@ -325,7 +325,7 @@ def test_the_whole_loop(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert place["cost"]["sample_ms"] > 0
     assert place["cost"]["dense_ms"] > 0
     assert 0 <= place["cost"]["picks_agree"] <= 2
-    told = capsys.readouterr().out
-    assert "| ufmstar |" in told
-    assert "Mean of V over 200 pixels" in told
+    printed = capsys.readouterr().out
+    assert "| ufmstar |" in printed
+    assert "Mean of V over 200 pixels" in printed
     assert (out / "active_learning.png").stat().st_size < 150_000

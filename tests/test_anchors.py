@@ -107,9 +107,9 @@ def test_gross_outliers_do_not_poison():
 def test_the_anchors_own_noise_is_no_error_of_the_network():
     _, outputs, _ = walk(lambda z, i, rng: z, noise=0.5, count=300)
     _, fooled, _ = walk(lambda z, i, rng: z, noise=0.5, variance=0.0, count=300)
-    told, doubled = (float(np.mean([o.anchored[o.valid].mean() for o in run[8:]])) for run in (outputs, fooled))
+    message, doubled = (float(np.mean([o.anchored[o.valid].mean() for o in run[8:]])) for run in (outputs, fooled))
     assert doubled > 0.05, "without its variance the noise would be taken for the network's"
-    assert told < 0.25 * doubled
+    assert message < 0.25 * doubled
 
 
 def test_the_lesson_outlasts_the_anchors():
@@ -201,8 +201,8 @@ def test_without_new_anchors_nothing_fades_and_one_does_not_decide():
 
 def test_outliers_are_those_without_support():
     good = [(2.0, 2.0 * ratio, 0.0, 0.0) for ratio in (0.98, 0.99, 1.0, 1.01, 1.02, 1.03)]
-    found = inliers(rows([*good, (2.0, 5.0, 0.0, 0.0), (2.0, 5.0, 25.0, 0.0)]))
-    assert found.tolist() == [[True] * 6 + [False, True]], "an anchor as uncertain as that contradicts nothing"
+    result = inliers(rows([*good, (2.0, 5.0, 0.0, 0.0), (2.0, 5.0, 25.0, 0.0)]))
+    assert result.tolist() == [[True] * 6 + [False, True]], "an anchor as uncertain as that contradicts nothing"
     masked = inliers(rows(good, [True] * 4 + [False] * 2))
     assert masked.tolist() == [[True] * 4 + [False] * 2]
 

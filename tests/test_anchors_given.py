@@ -29,22 +29,22 @@ def at(u, v, z):
 
 
 def test_points_project_to_their_pixels():
-    wanted = [(3.25, 40.0, 2.0), (0.0, 0.0, 0.5), (63.0, 47.0, 8.0)]
-    points = torch.tensor([[at(*w) for w in wanted]])
-    found = Anchors.from_points(points, torch.full((1, 3), 0.01, dtype=torch.float64), K, (H, W))
+    expected = [(3.25, 40.0, 2.0), (0.0, 0.0, 0.5), (63.0, 47.0, 8.0)]
+    points = torch.tensor([[at(*w) for w in expected]])
+    actual = Anchors.from_points(points, torch.full((1, 3), 0.01, dtype=torch.float64), K, (H, W))
     # float32 points: a millionth of a pixel's ray
-    torch.testing.assert_close(found.pixel[0], torch.tensor([w[:2] for w in wanted]).double(), rtol=0, atol=1e-4)
-    torch.testing.assert_close(found.depth[0], torch.tensor([2.0, 0.5, 8.0]).double(), rtol=1e-6, atol=0)
-    assert found.variance.tolist() == [[0.01] * 3]
-    assert found.valid.all()
+    torch.testing.assert_close(actual.pixel[0], torch.tensor([w[:2] for w in expected]).double(), rtol=0, atol=1e-4)
+    torch.testing.assert_close(actual.depth[0], torch.tensor([2.0, 0.5, 8.0]).double(), rtol=1e-6, atol=0)
+    assert actual.variance.tolist() == [[0.01] * 3]
+    assert actual.valid.all()
 
 
 def test_each_stream_has_its_own_camera():
     other = resize_intrinsics(K, (H, W), (2 * H, 2 * W))
     points = torch.tensor([[at(10.0, 20.0, 3.0)]]).expand(2, 1, 3).float()
-    found = Anchors.from_points(points, torch.zeros(2, 1), torch.stack([K, other]), (2 * H, 2 * W))
+    actual = Anchors.from_points(points, torch.zeros(2, 1), torch.stack([K, other]), (2 * H, 2 * W))
     expected = torch.tensor([[[10.0, 20.0]], [[20.5, 40.5]]], dtype=torch.float64)
-    torch.testing.assert_close(found.pixel, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(actual.pixel, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -64,10 +64,10 @@ def test_each_stream_has_its_own_camera():
 )
 def test_what_cannot_be_seen_or_makes_no_sense_is_not_valid(point, variance):
     points, spread = torch.tensor([[at(63.4, -0.4, 2.0), point]]), torch.tensor([[0.01, variance]])
-    found = Anchors.from_points(points, spread, K, (H, W))
-    assert found.valid.tolist() == [[True, False]]
-    assert all(bool(part.isfinite().all()) for part in (found.pixel, found.depth, found.variance))
-    assert found.depth[0, 1] == found.variance[0, 1] == 0
+    result = Anchors.from_points(points, spread, K, (H, W))
+    assert result.valid.tolist() == [[True, False]]
+    assert all(bool(part.isfinite().all()) for part in (result.pixel, result.depth, result.variance))
+    assert result.depth[0, 1] == result.variance[0, 1] == 0
 
 
 def test_the_mask_and_padding_are_respected():
@@ -98,10 +98,10 @@ def test_wrong_kinds_and_shapes_are_named(change, error, told):
 def test_moved_to_a_resized_image():
     half = resize_intrinsics(K, (H, W), (H // 2, W // 2))
     given = Anchors(torch.tensor([[[10.5, 20.5]]]), torch.ones(1, 1), torch.zeros(1, 1))
-    found = given.moved(K, half)
-    torch.testing.assert_close(found.pixel, torch.tensor([[[5.0, 10.0]]], dtype=torch.float64))
-    assert found.depth is given.depth
-    torch.testing.assert_close(found.moved(half, K).pixel, given.pixel.double())
+    result = given.moved(K, half)
+    torch.testing.assert_close(result.pixel, torch.tensor([[[5.0, 10.0]]], dtype=torch.float64))
+    assert result.depth is given.depth
+    torch.testing.assert_close(result.moved(half, K).pixel, given.pixel.double())
     with pytest.raises(ValueError, match=r"anchors.pixel must be \[B, N, 2\]"):
         Anchors(torch.zeros(4, 2), torch.ones(4), torch.ones(4)).moved(K, half)
 
@@ -125,7 +125,7 @@ def half(image, intrinsics):
 def two_streams(frames=4):
     """Depths [2, H, W], poses [2, 4, 4], K [2, 3, 3] and anchors of ground truth, 40 and 25 of them, of two walks."""
     depths, poses, K_ = scenes.sequence(2 * frames, H, W, 0.0)
-    rng, found = np.random.default_rng(0), []
+    rng, result = np.random.default_rng(0), []
     for i in range(frames):
         truth = np.stack([depths[i], depths[-1 - i]])
         seen = [rng.permutation(np.argwhere(map_ > 0))[:40] for map_ in truth]
@@ -135,8 +135,8 @@ def two_streams(frames=4):
         valid = torch.arange(40) < torch.tensor([[40], [25]])
         anchors = Anchors(pixel, depth.where(valid, NAN), torch.full((2, 40), 1e-4), valid)
         pose = torch.tensor(np.stack([poses[i], poses[-1 - i]]))
-        found.append((torch.tensor(truth).float(), pose, torch.tensor(K_).expand(2, 3, 3), anchors))
-    return found
+        result.append((torch.tensor(truth).float(), pose, torch.tensor(K_).expand(2, 3, 3), anchors))
+    return result
 
 
 @pytest.mark.parametrize("preprocess", [None, half])

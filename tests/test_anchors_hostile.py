@@ -22,7 +22,7 @@ ON = UfMStarConfig(anchored=True)
 def taught(spoilt=None, at=5, frames=8):
     """B/d^2 on average after every frame of a network that is 20 % off; ``spoilt`` (depth, variance) joins frame 5."""
     depths, poses, K = scenes.sequence(frames, H, W, 0.0)
-    rng, ufm, found = np.random.default_rng(0), UfMStar(ON), []
+    rng, ufm, result = np.random.default_rng(0), UfMStar(ON), []
     for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
         v, u = rng.integers(0, H, 40), rng.integers(0, W, 40)
         pixel, depth = torch.tensor(np.stack([u, v], -1)[None].astype(float)), torch.tensor(truth[v, u])[None].clone()
@@ -31,8 +31,8 @@ def taught(spoilt=None, at=5, frames=8):
             pixel, depth, variance = pixel[:, :1], *(torch.tensor([[x]], dtype=torch.float64) for x in spoilt)
         anchors = Anchors(pixel, depth, variance)
         out = ufm(torch.tensor(1.2 * truth)[None], torch.tensor(T), torch.tensor(K), anchors=anchors)
-        found.append(float((out.anchored / out.depth.square())[out.valid].mean()))
-    return found, int(out.statistics.anchors_used[0])
+        result.append(float((out.anchored / out.depth.square())[out.valid].mean()))
+    return result, int(out.statistics.anchors_used[0])
 
 
 @pytest.fixture(scope="module")
@@ -45,17 +45,17 @@ def without():
     [(1e30, 1e-4), (1e200, 1e-4), (1e4, 1e-4), (1e-30, 0.0), (2.0, 1e300), (2.0, 1e4), (2.0, 4.0), (1e200, 1e300)],
 )
 def test_one_anchor_that_says_nothing_teaches_nothing(spoilt, without):
-    found, used = taught(spoilt)
-    assert np.isfinite(found).all()
+    result, used = taught(spoilt)
+    assert np.isfinite(result).all()
     assert used >= 30
     # The frame with the bad anchor alone teaches nothing, so the rest stays within what a frame's forty change.
-    np.testing.assert_allclose(found, without, rtol=0.25)
+    np.testing.assert_allclose(result, without, rtol=0.25)
 
 
 def anchored_std(claim, frames=6, every=False):
     """std [m] where a network is 1 m too far, of frames with 60 anchors; it claims ``claim`` [m^2] at one of them."""
     depths, poses, K = scenes.sequence(frames, H, W, 0.0)
-    rng, ufm, found = np.random.default_rng(1), UfMStar(ON), []
+    rng, ufm, result = np.random.default_rng(1), UfMStar(ON), []
     for i, (truth, T) in enumerate(zip(depths, poses, strict=True)):
         v, u = rng.integers(0, H, 60), rng.integers(0, W, 60)
         depth = torch.tensor(truth[v, u])[None]
@@ -64,16 +64,16 @@ def anchored_std(claim, frames=6, every=False):
         if claim is not None and (every or i == 0):
             aleatoric[0, v[7], u[7]] = claim
         out = ufm(torch.tensor(truth + 1.0)[None], torch.tensor(T), torch.tensor(K), aleatoric, anchors=anchors)
-        found.append(float(out.std[out.valid].median()))
-    return found, out.statistics
+        result.append(float(out.std[out.valid].median()))
+    return result, out.statistics
 
 
 @pytest.mark.parametrize("every", [False, True])
 @given(st.floats(-4, 12))
 @settings(max_examples=8, deadline=None)
 def test_one_large_claim_does_not_switch_anchors_off(every, exponent):
-    found, statistics = anchored_std(10.0**exponent, every=every)
-    np.testing.assert_allclose(found, anchored_std(None)[0], rtol=0.1)
+    result, statistics = anchored_std(10.0**exponent, every=every)
+    np.testing.assert_allclose(result, anchored_std(None)[0], rtol=0.1)
     assert 60 >= int(statistics.anchors[0]) >= int(statistics.anchors_used[0]) >= 50
     if every and exponent > 2:
         assert int(statistics.anchors_used[0]) < int(statistics.anchors[0]), "the statistics count it out"

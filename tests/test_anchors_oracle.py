@@ -21,13 +21,15 @@ ANCHORED = UfMStarConfig(segment=SPGF, regression="exact", anchored=True, anchor
 
 def taken(truth, rng, count):
     """(u, v, depth, variance): a third of them far off, positions between pixels, on pixels with a depth."""
-    found = []
-    while len(found) < count:
+    result = []
+    while len(result) < count:
         v, u = int(rng.integers(0, HEIGHT)), int(rng.integers(0, WIDTH))
         g = truth[v, u] * (rng.uniform(0.3, 3) if rng.random() < 0.3 else rng.normal(1, 0.02))
         if np.isfinite(g) and g > 0:
-            found.append((u + rng.uniform(-0.4, 0.4), v + rng.uniform(-0.4, 0.4), g, (rng.uniform(0.01, 0.3) * g) ** 2))
-    return found
+            result.append(
+                (u + rng.uniform(-0.4, 0.4), v + rng.uniform(-0.4, 0.4), g, (rng.uniform(0.01, 0.3) * g) ** 2)
+            )
+    return result
 
 
 def as_anchors(rows):

@@ -73,11 +73,11 @@ def test_a_point_is_seen_where_the_new_intrinsics_project_it(pixel, change, zoom
     point = torch.linalg.solve(K, torch.tensor([*pixel, 1.0], dtype=torch.float64)) * 2.5
     depth = torch.full(SIZE, 2.5, dtype=torch.float64)
     image, new_depth, new_K = apply_geometry(blob(torch.tensor(pixel)), depth, K, change, zoom)
-    there = seen_by_new_camera(point, change, zoom)
-    where = project(there, new_K)
+    present = seen_by_new_camera(point, change, zoom)
+    where = project(present, new_K)
     torch.testing.assert_close(centroid(image), where, rtol=0, atol=0.02)
     column, row = where.round().long().tolist()
-    assert new_depth[row, column].item() == pytest.approx(there[2].item(), abs=1e-12)
+    assert new_depth[row, column].item() == pytest.approx(present[2].item(), abs=1e-12)
 
 
 @pytest.mark.parametrize("zoom", ["depth", "focal"])

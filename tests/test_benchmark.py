@@ -40,8 +40,8 @@ SPREAD = {"median_ms", "iqr_ms", "q1_ms", "q3_ms", "min_ms", "count"}
 
 
 def test_spread_of_known_values():
-    told = spread([5.0, 1.0, 2.0, 4.0, 3.0])
-    assert told == {"median_ms": 3.0, "iqr_ms": 2.0, "q1_ms": 2.0, "q3_ms": 4.0, "min_ms": 1.0, "count": 5}
+    message = spread([5.0, 1.0, 2.0, 4.0, 3.0])
+    assert message == {"median_ms": 3.0, "iqr_ms": 2.0, "q1_ms": 2.0, "q3_ms": 4.0, "min_ms": 1.0, "count": 5}
     assert spread([1.0, 2.0, 3.0, 4.0])["q1_ms"] == 1.75  # linear between the sorted values
     assert spread([7.0])["iqr_ms"] == 0
 
@@ -52,10 +52,10 @@ def test_one_outlier_does_not_move_the_median():
 
 @given(st.lists(st.floats(0.01, 1e4), min_size=1, max_size=30), st.floats(0.1, 10))
 def test_spread_is_ordered_and_scales(times, factor):
-    told, scaled = spread(times), spread([factor * t for t in times])
-    assert told["min_ms"] <= told["q1_ms"] <= told["median_ms"] <= told["q3_ms"]
-    assert scaled["median_ms"] == pytest.approx(factor * told["median_ms"])
-    assert scaled["iqr_ms"] == pytest.approx(factor * told["iqr_ms"], abs=1e-9 * factor * max(times))
+    message, scaled = spread(times), spread([factor * t for t in times])
+    assert message["min_ms"] <= message["q1_ms"] <= message["median_ms"] <= message["q3_ms"]
+    assert scaled["median_ms"] == pytest.approx(factor * message["median_ms"])
+    assert scaled["iqr_ms"] == pytest.approx(factor * message["iqr_ms"], abs=1e-9 * factor * max(times))
 
 
 def test_paired_ratio_cancels_a_common_slowdown():
@@ -360,8 +360,8 @@ def small_report(step=2.0, cores=2):
 def test_against_an_earlier_report(tmp_path):
     file = tmp_path / "earlier.json"
     file.write_text(json.dumps(small_report(step=4.0)))
-    found = compare(small_report(), file)
-    assert found == {"file": "earlier.json", "date": "then", "ratios": {"224 numba": {"step": 0.5, "segment": 1.0}}}
+    result = compare(small_report(), file)
+    assert result == {"file": "earlier.json", "date": "then", "ratios": {"224 numba": {"step": 0.5, "segment": 1.0}}}
     with pytest.raises(ValueError, match="other hardware: cores 2, here 4"):
         compare(small_report(cores=4), file)
     file.write_text("{}")
@@ -424,11 +424,11 @@ def test_a_tiny_run_from_end_to_end(tmp_path, capsys):
     assert {row["met"] for row in report["targets"]} == {None}, "targets are for 224 x 224"
     assert report["peer"]["process"]["count"] == 3
     assert (report["peer"]["frame"]["median_ms"], report["peer"]["frame"]["count"]) == (64, 9), "3 runs of 3 frames"
-    told = capsys.readouterr()
-    assert "whole step" in told.out
-    assert "floor" in told.out
-    assert "peer" in told.out
-    assert "64 x 64, numba" in told.err
+    printed = capsys.readouterr()
+    assert "whole step" in printed.out
+    assert "floor" in printed.out
+    assert "peer" in printed.out
+    assert "64 x 64, numba" in printed.err
 
 
 def check_result(result):
@@ -509,8 +509,8 @@ def report_with(**changes):
 
 
 def test_targets_are_told_as_met_or_missed():
-    told = {row["name"]: (row["value"], row["met"]) for row in benchmark.targets(report_with())}
-    assert told == {
+    message = {row["name"]: (row["value"], row["met"]) for row in benchmark.targets(report_with())}
+    assert message == {
         "spgf_ms": (1.0, True),
         "step_ms": (12.0, False),
         "step/resnet50": (0.1, True),
@@ -519,9 +519,9 @@ def test_targets_are_told_as_met_or_missed():
         "tracker_cpu_ms": (None, None),
     }
     long_run = {"ratio": 1.5, "memory": {"in_use": 50_000}}
-    told = {row["name"]: row["met"] for row in benchmark.targets(report_with(long_run=long_run))}
-    assert told["long_run_ratio"] is False
-    assert told["components_bytes"] is False, "a room is what the long run has seen"
+    message = {row["name"]: row["met"] for row in benchmark.targets(report_with(long_run=long_run))}
+    assert message["long_run_ratio"] is False
+    assert message["components_bytes"] is False, "a room is what the long run has seen"
     assert benchmark.targets(report_with(result={"backend": "torch"}))[0]["met"] is None
 
 

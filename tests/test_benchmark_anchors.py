@@ -50,15 +50,15 @@ def report(one_core):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackedTour, "frames", lambda _, count: seen[:count])
         patch.setattr("ufmstar_torch.eval.bench.step.reference_networks", lambda size, fastdepth, runtime: ({}, {}))
-        found = benchmark.run_benchmark(options)
+        result = benchmark.run_benchmark(options)
     assert threads() == before
-    return found
+    return result
 
 
 def test_every_figure_is_there_and_possible(report):
-    found = json.loads(json.dumps(report["anchors"]))
-    tracker, step = found["tracker"], found["step"]
-    assert (found["points"], found["frames"], found["threads"]) == (60, 6, 1)
+    result = json.loads(json.dumps(report["anchors"]))
+    tracker, step = result["tracker"], result["step"]
+    assert (result["points"], result["frames"], result["threads"]) == (60, 6, 1)
     for times in (tracker["update"], step["plain"], step["anchored"]):
         assert set(times) == TIMES | {"count"}
         assert times["count"] == 6
@@ -100,11 +100,11 @@ def test_parts_are_parts_of_the_whole(monkeypatch):
     """With a clock that moves by one at every look, parts and the whole are numbers of looks."""
     ticks = iter(range(10**6))
     monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
-    found = measure_tracker(rendered()[:14], 60)
+    result = measure_tracker(rendered()[:14], 60)
     # Following, searching and triangulating take a tick each; the whole update, from its own first look at the clock to
     # its last, seven.
-    assert [found["parts"][name]["median_ms"] for name in PARTS] == [1e3, 1e3, 1e3, 4e3]
-    assert found["update"]["count"] == 2
+    assert [result["parts"][name]["median_ms"] for name in PARTS] == [1e3, 1e3, 1e3, 4e3]
+    assert result["update"]["count"] == 2
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -126,10 +126,10 @@ def test_opencv_gets_one_thread_and_its_own_back(fails):
 
 
 def test_the_report_in_words(report):
-    told = format_report(report)
-    assert "corners followed at 640 x 480" in told
-    assert "step of 224 x 224 with 60 anchors" in told
-    assert "triangulating" in told
+    message = format_report(report)
+    assert "corners followed at 640 x 480" in message
+    assert "step of 224 x 224 with 60 anchors" in message
+    assert "triangulating" in message
     assert {row["name"]: row["met"] for row in report["targets"]}["tracker_cpu_ms"] is None, "the target is for 300"
     as_if = {**report, "anchors": {**report["anchors"], "points": 300}}
     value = {row["name"]: row["value"] for row in benchmark.targets(as_if)}["tracker_cpu_ms"]

@@ -38,8 +38,8 @@ def ufmstar(capfd):
     def call(*words):
         capfd.readouterr()
         code = cli.main([str(word) for word in words])
-        told = capfd.readouterr()
-        return code, told.out, told.err
+        printed = capfd.readouterr()
+        return code, printed.out, printed.err
 
     return call
 
@@ -417,8 +417,8 @@ def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, 
     monkeypatch.setattr(sources, "load_network", load)
     assert ufmstar(*words, "--out", tmp_path / "out", "--resume")[0] == 0
     whole, resumed = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
-    for found in (whole, resumed):
-        del found["summary.json"]["settings"]["out"]
+    for result in (whole, resumed):
+        del result["summary.json"]["settings"]["out"]
     assert whole == resumed
 
 

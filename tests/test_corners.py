@@ -25,14 +25,14 @@ def test_new_corners_keep_away_from_each_other_and_from_the_followed(size):
     # Also in the corners of the image, where discs reach beyond it.
     edge = np.array([[0.0, 0.0], [size[1] - 1, size[0] - 1], [size[1] - 1, 0.0]])
     followed = np.concatenate([rng.uniform(0, np.array(size[::-1]) - 1, (20, 2)), edge])
-    found = find(image, 4000, 9.0, followed)
-    assert len(found) > 20
-    assert apart(found, followed).min() > 9 - 2.5, "a pixel of the searched image for rounding"
-    assert apart(found, found)[~np.eye(len(found), dtype=bool)].min() >= 9 - 1e-9
+    result = find(image, 4000, 9.0, followed)
+    assert len(result) > 20
+    assert apart(result, followed).min() > 9 - 2.5, "a pixel of the searched image for rounding"
+    assert apart(result, result)[~np.eye(len(result), dtype=bool)].min() >= 9 - 1e-9
     alone = find(image, 4000, 9.0, np.zeros((0, 2)))
-    assert len(alone) > len(found)
+    assert len(alone) > len(result)
     assert apart(alone, followed).min() < 5, "without them there would be some"
-    np.testing.assert_array_equal(find(image, 7, 9.0, followed), found[:7])
+    np.testing.assert_array_equal(find(image, 7, 9.0, followed), result[:7])
 
 
 def test_the_mask_is_what_opencv_draws(monkeypatch):
@@ -61,12 +61,12 @@ def test_a_strong_edge_is_no_row_of_corners():
         near = np.abs(0.94 * (points[:, 0] - 160) + 0.34 * (points[:, 1] - 120)) < 6
         return int((near & (np.abs(points[:, 1] - 120) < 105)).sum())
 
-    found = find(image, 300, 8.0, np.zeros((0, 2)))
+    result = find(image, 300, 8.0, np.zeros((0, 2)))
     corners = np.array([[20.0, 100], [59, 100], [20, 139], [59, 139]])
-    assert (apart(corners, found).min(1) < 3).all()
+    assert (apart(corners, result).min(1) < 3).all()
     by_eigenvalue = on_edge(cv2.goodFeaturesToTrack(image, 300, 0.01, 8.0)[:, 0])
     assert by_eigenvalue >= 10
-    assert on_edge(found) <= by_eigenvalue / 2
+    assert on_edge(result) <= by_eigenvalue / 2
 
 
 def test_a_blank_wall_has_no_corners():

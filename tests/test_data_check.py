@@ -96,17 +96,17 @@ def test_depth_ten_times_too_large(tour, capsys):
 def test_depth_in_smaller_units_than_metres_can_say(tour):
     """Depth a tenth as large would need 10 m per unit; positions are what can be changed."""
     spoil_depth(tour, lambda depth: depth / 10)
-    found = check_data(tour, pairs=2)
-    assert found.remedies[0].startswith("divide the positions of the poses by ")
-    assert float(found.remedies[0].split()[-1]) == pytest.approx(10, rel=0.1)
+    result = check_data(tour, pairs=2)
+    assert result.remedies[0].startswith("divide the positions of the poses by ")
+    assert float(result.remedies[0].split()[-1]) == pytest.approx(10, rel=0.1)
 
 
 def test_a_trajectory_without_scale(tour):
     spoil_poses(tour, lambda T: np.concatenate([T[..., :3], T[..., 3:] * [[0.2], [0.2], [0.2], [1]]], axis=-1))
-    found = check_data(tour, pairs=2, trajectory="poses.txt")
-    assert "depth looks too large" in found.problems[0]
-    assert found.remedies[0].startswith("a single camera's trajectory has no scale: divide the positions")
-    assert float(found.remedies[0].split()[-1]) == pytest.approx(0.2, rel=0.1)
+    result = check_data(tour, pairs=2, trajectory="poses.txt")
+    assert "depth looks too large" in result.problems[0]
+    assert result.remedies[0].startswith("a single camera's trajectory has no scale: divide the positions")
+    assert float(result.remedies[0].split()[-1]) == pytest.approx(0.2, rel=0.1)
 
 
 def test_unregistered_depth(tour):
@@ -117,9 +117,9 @@ def test_unregistered_depth(tour):
     T = np.eye(4)
     T[0, 3] = 0.08
     spoil_depth(tour, lambda depth: register_depth(depth, K, K_depth, T, SIZE))
-    found = check_data(tour, pairs=2)
-    assert any("not registered to the images" in problem for problem in found.problems)
-    assert any("--depth-intrinsics" in remedy for remedy in found.remedies)
+    result = check_data(tour, pairs=2)
+    assert any("not registered to the images" in problem for problem in result.problems)
+    assert any("--depth-intrinsics" in remedy for remedy in result.remedies)
 
 
 def test_broken_and_missing_frames_are_told(tour, capsys):
@@ -154,9 +154,9 @@ def test_a_sequence_that_cannot_be_opened(tour, capsys):
 def test_few_usable_frames(tour):
     T = [np.eye(4)[:3].ravel()] * 8
     np.savetxt(tour / "slam.txt", [[100 + i, *row] for i, row in enumerate(T)])
-    found = check_data(tour, trajectory="slam.txt", fps=1, time_offset=100, pairs=1)
-    assert found.problems[0] == "only 8 of 24 frames are usable"
-    assert found.skipped == {"no pose within 0.1 s around the image": 16}
+    result = check_data(tour, trajectory="slam.txt", fps=1, time_offset=100, pairs=1)
+    assert result.problems[0] == "only 8 of 24 frames are usable"
+    assert result.skipped == {"no pose within 0.1 s around the image": 16}
 
 
 def test_several_sequences_give_a_line_each(exported, tmp_path, capsys):
@@ -177,7 +177,7 @@ def test_several_sequences_give_a_line_each(exported, tmp_path, capsys):
 
 
 def test_wrong_usage(tmp_path, exported, capsys):
-    for words, told in (
+    for words, message in (
         ((tmp_path / "absent",), "no such file or folder"),
         ((tmp_path,), "has no known layout, and nothing below it has"),
         ((exported, "--depth-scale", 1000), "depth_scale is in metres per unit"),
@@ -188,7 +188,7 @@ def test_wrong_usage(tmp_path, exported, capsys):
     ):
         code, out = command(capsys, *words)
         assert code == 2
-        assert told in out
+        assert message in out
     for words in (["data"], ["data", "mend", "x"], ["data", "check", "x", "--unknown"]):
         assert main(words) == 2
         assert capsys.readouterr().err.count("\n") == 1
@@ -216,10 +216,10 @@ def test_no_depth_and_no_poses(tmp_path, capsys):
     ],
 )
 def test_the_shared_recordings_are_right(name, layout, frames, worst):
-    found = check_data(require_shared(f"data/{name}"), pairs=1)
-    assert (found.layout, found.frames, found.problems, found.undecided) == (layout, frames, (), ())
-    assert found.checked["error"] < worst
-    assert 0.1 < found.depth_range[0] < found.depth_range[1] < 100
+    result = check_data(require_shared(f"data/{name}"), pairs=1)
+    assert (result.layout, result.frames, result.problems, result.undecided) == (layout, frames, (), ())
+    assert result.checked["error"] < worst
+    assert 0.1 < result.depth_range[0] < result.depth_range[1] < 100
 
 
 def write_page_files(folder):
@@ -267,7 +267,7 @@ def test_the_page_names_every_layout():
 
 
 def test_tours_are_checked_without_files():
-    found = check_data("tour:7?frames=3&size=48x64", pairs=1)
-    assert (found.layout, found.frames) == ("tour", 3)
+    result = check_data("tour:7?frames=3&size=48x64", pairs=1)
+    assert (result.layout, result.frames) == ("tour", 3)
     with pytest.raises(ValueError, match="poses must be one of"):
         open_sequence("tour:7", poses="x")

@@ -57,11 +57,11 @@ def done(weights, tmp_path_factory):
     out = tmp_path_factory.mktemp("demo") / "out"
     words = ["--weights", weights, "--out", out, "--frames", FRAMES, "--seed", SEED]
     with pytest.MonkeyPatch.context() as patch:
-        told = {"out": [], "err": []}
-        patch.setattr("sys.stdout", Recorder(told["out"]))
-        patch.setattr("sys.stderr", Recorder(told["err"]))
+        message = {"out": [], "err": []}
+        patch.setattr("sys.stdout", Recorder(message["out"]))
+        patch.setattr("sys.stderr", Recorder(message["err"]))
         code = cli.main(["demo", *map(str, words)])
-    return out, code, "".join(told["out"]), "".join(told["err"])
+    return out, code, "".join(message["out"]), "".join(message["err"])
 
 
 class Recorder:
@@ -84,16 +84,16 @@ class Recorder:
 
 
 def test_the_command_prints_one_table_and_says_where_everything_is(done):
-    out, code, told, _ = done
+    out, code, message, _ = done
     assert code == 0
-    lines = told.splitlines()
+    lines = message.splitlines()
     for name in ("delta1", "NLL", "ECE_delta", "ECE_q", "AUSE [m]", "network ms", "+ ms", "state kB"):
         assert name in lines[0]
     assert [line[:26].strip() for line in lines[1:5]] == [
         "3 members in turn, alone", "with UfM", "with UfM*", "all 3 members per image",
     ]  # fmt: skip
     for name in ("contact_sheet.png", "calibration.png", "mixture.ply", "summary.json"):
-        assert f"{out}/{name}: " in told
+        assert f"{out}/{name}: " in message
     assert max(map(len, lines)) <= 130 + len(str(out))
 
 
@@ -140,10 +140,10 @@ def test_times_and_memory_of_every_row(done):
 
 
 def test_progress_goes_to_stderr(done):
-    _, _, told, progress = done
+    _, _, message, progress = done
     for stage in ("rooms", "kernels", "frames", "pictures"):
         assert f"{stage}: 100%" in progress
-        assert f"{stage}: 100%" not in told
+        assert f"{stage}: 100%" not in message
 
 
 # ---- the rows are what they say ----
@@ -241,14 +241,14 @@ def test_pixels_belong_to_the_room_they_show():
     both = 0
     for entry in frames.entries[::3]:
         view = render(tour, torch.from_numpy(entry.T_world_cam), torch.from_numpy(frames.intrinsics), *SIZE)
-        found = surface_kinds(
+        result = surface_kinds(
             tour, Frame(0, "", None, view.depth.float().numpy(), entry.T_world_cam, frames.intrinsics)
         )
         rooms = tour.surfaces.rooms[view.surface].numpy()
         only = rooms[..., 1] < 0  # not the frame of a door, which belongs to two rooms
         hall = np.array([style == "hall" for style in tour.room_styles])
-        assert (found[only] == hall[rooms[..., 0]][only]).mean() > 0.995
-        both += 0.05 < found.mean() < 0.95
+        assert (result[only] == hall[rooms[..., 0]][only]).mean() > 0.995
+        both += 0.05 < result.mean() < 0.95
     assert both >= 2, "some frames must show both kinds through a door"
 
 
@@ -320,8 +320,8 @@ def ufmstar(capfd):
     def call(*words):
         capfd.readouterr()
         code = cli.main([str(word) for word in words])
-        told = capfd.readouterr()
-        return code, told.out, told.err
+        printed = capfd.readouterr()
+        return code, printed.out, printed.err
 
     return call
 
@@ -394,12 +394,12 @@ def test_without_matplotlib_there_is_still_the_same_table(weights, tmp_path, mon
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     colour_table.cache_clear()
     out = tmp_path / "out"
-    code, told, _ = ufmstar("demo", "--out", out, "--weights", weights, "--frames", FRAMES, "--seed", SEED)
+    code, message, _ = ufmstar("demo", "--out", out, "--weights", weights, "--frames", FRAMES, "--seed", SEED)
     assert code == 0
     again, before = (read_summary(folder)["methods"] for folder in (out, done[0]))
     assert all(again[method]["figures"] == before[method]["figures"] for method in METHODS)
-    assert told.splitlines()[3].startswith("  with UfM*")
-    assert "no contact_sheet.png: pictures need matplotlib" in told
+    assert message.splitlines()[3].startswith("  with UfM*")
+    assert "no contact_sheet.png: pictures need matplotlib" in message
     assert (out / "mixture.npz").exists()
     assert not (out / "contact_sheet.png").exists()
     assert read_summary(out)["outputs"]["curves.json"] is None
@@ -438,7 +438,7 @@ def test_the_shipped_networks_are_small_and_several():
     kinds = ("familiar", "unfamiliar")
     regions = RegionMetrics(METHODS, kinds, lambda result, _: torch.from_numpy(surface_kinds(tour, result.frame)))
     walked(load_trained(SHIPPED), frames, range(0, 40, 2), [regions])
-    found = regions.by_region()
-    assert found["familiar"][UFM_STAR]["delta1"] > 0.6
-    assert found["unfamiliar"][UFM_STAR]["rms_sigma"] > found["familiar"][UFM_STAR]["rms_sigma"]
-    assert found["unfamiliar"][UFM_STAR]["nll"] < found["unfamiliar"][NETWORK]["nll"]
+    outcome = regions.by_region()
+    assert outcome["familiar"][UFM_STAR]["delta1"] > 0.6
+    assert outcome["unfamiliar"][UFM_STAR]["rms_sigma"] > outcome["familiar"][UFM_STAR]["rms_sigma"]
+    assert outcome["unfamiliar"][UFM_STAR]["nll"] < outcome["unfamiliar"][NETWORK]["nll"]

@@ -23,10 +23,10 @@ def true_depth(frame, pixel):
 def test_depths_of_a_rendered_room_are_right_and_as_uncertain_as_stated(tour):
     evidence, errors, surprises, counts = DenseEvidence(), [], [], []
     for frame in tour:
-        found = evidence.update(frame.image, frame.T_world_cam, frame.intrinsics)
-        z = true_depth(frame, found.pixel)
-        errors.extend(np.abs(found.depth - z) / z)
-        surprises.extend((1 / found.depth - 1 / z) * found.depth**2 / np.sqrt(found.variance))
+        result = evidence.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        z = true_depth(frame, result.pixel)
+        errors.extend(np.abs(result.depth - z) / z)
+        surprises.extend((1 / result.depth - 1 / z) * result.depth**2 / np.sqrt(result.variance))
         counts.append(len(z))
     assert counts[:2] == [0, 0], "two keyframes must agree"
     assert np.median(counts[6:]) >= 60
@@ -61,10 +61,10 @@ def run(evidence, frames, poses=None, images=None):
 
 def test_landmarks_are_confirmed_and_those_confirmed_err_less(tour):
     there_and_back = [*tour, *tour[::-1], *tour]
-    found = run(DenseEvidence(), there_and_back)
-    z = [true_depth(frame, f.pixel) for frame, f in zip(there_and_back, found, strict=True)]
-    error = np.concatenate([np.abs(f.depth / g - 1) for f, g in zip(found, z, strict=True)])
-    times = np.concatenate([f.confirmed for f in found])
+    result = run(DenseEvidence(), there_and_back)
+    z = [true_depth(frame, f.pixel) for frame, f in zip(there_and_back, result, strict=True)]
+    error = np.concatenate([np.abs(f.depth / g - 1) for f, g in zip(result, z, strict=True)])
+    times = np.concatenate([f.confirmed for f in result])
     assert (times >= 2).sum() > 200
     assert np.quantile(error[times >= 2], 0.9) < np.quantile(error[times == 0], 0.9)
 
@@ -103,9 +103,9 @@ def test_a_thing_that_moves_by_itself_gives_hardly_any_anchors(tour):
         images.append(image)
         where.append((u, v))
     on_it, beside = 0, 0
-    for (u, v), found in zip(where, run(DenseEvidence(), frames, images=images), strict=True):
+    for (u, v), result in zip(where, run(DenseEvidence(), frames, images=images), strict=True):
         # Windows reach 4 px: at its rim lie points of the background.
-        inside = ((found.pixel >= [u + 4, v + 4]) & (found.pixel < [u + 48, v + 36])).all(1)
+        inside = ((result.pixel >= [u + 4, v + 4]) & (result.pixel < [u + 48, v + 36])).all(1)
         on_it, beside = on_it + inside.sum(), beside + (~inside).sum()
     assert beside > 500
     assert on_it < 0.02 * beside, "it covers a tenth of the image and has more contrast than the rest"

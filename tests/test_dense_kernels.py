@@ -60,26 +60,26 @@ def test_one_view_agrees_with_the_loops(scene):
     for k in range(3):
         given = views(others[k : k + 1], MOVED[k : k + 1], np.eye(4))
         search = Search(0.5, 0.4, 0.6, 3.5, 0.85, 1.0, 1.0)
-        found = measure(image, pixel, given, search)
-        chosen = np.flatnonzero(found.agreed == 1)[:6]
+        result = measure(image, pixel, given, search)
+        chosen = np.flatnonzero(result.agreed == 1)[:6]
         assert len(chosen) == 6
         for n in chosen:
             rho, score = oracle_dense.along_line(image, others[k], pixel[n], given.H[0], given.b[0], 0.4, 0.6)
             assert score > 0.95
             ends = [oracle_dense.project(pixel[n], r, given.H[0], given.b[0]) for r in (0.4, 0.6)]
             speed = np.linalg.norm(ends[1] - ends[0]) / 0.2
-            assert abs(found.rho[n] - rho) * speed < 0.1, "a tenth of a pixel"
+            assert abs(result.rho[n] - rho) * speed < 0.1, "a tenth of a pixel"
 
 
 def test_a_plane_is_where_it_is_and_as_uncertain_as_stated(scene):
     image, pixel, others = scene
-    found = measure(image, pixel, views(others, MOVED, np.eye(4)), SEARCH)
-    fine = (found.agreed >= 2) & (found.contradicted == 0)
+    result = measure(image, pixel, views(others, MOVED, np.eye(4)), SEARCH)
+    fine = (result.agreed >= 2) & (result.contradicted == 0)
     assert fine.mean() > 0.5
-    error = found.rho[fine] - 0.5
+    error = result.rho[fine] - 0.5
     assert np.median(np.abs(error)) < 0.004
-    assert np.abs(error / np.sqrt(found.variance[fine])).max() < 8
-    assert np.nanmedian(np.abs(found.across[fine])) < 0.1, "the poses are exact"
+    assert np.abs(error / np.sqrt(result.variance[fine])).max() < 8
+    assert np.nanmedian(np.abs(result.across[fine])) < 0.1, "the poses are exact"
 
 
 def test_the_variance_is_the_smallest_of_the_views_and_follows_the_poses_noise(scene):
@@ -106,15 +106,15 @@ def test_poses_that_are_wrong_show_across_the_line(scene):
     wrong = [T.copy() for T in MOVED]
     for T in wrong:
         T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec([0.008, 0, 0]).as_matrix()  # .7 px, across
-    found = measure(image, pixel, views(others, wrong, np.eye(4)), SEARCH)
-    assert 0.4 < np.nanmedian(np.abs(found.across[found.agreed > 0])) < 1.0
+    result = measure(image, pixel, views(others, wrong, np.eye(4)), SEARCH)
+    assert 0.4 < np.nanmedian(np.abs(result.across[result.agreed > 0])) < 1.0
 
 
 def test_no_contrast_no_depth():
     flat = np.full((72, 96), 90, np.uint8)
     pixel = np.array([[40.0, 30.0]])
-    found = measure(flat, pixel, views([flat] * 3, MOVED, np.eye(4)), SEARCH)
-    assert found.agreed.tolist() == [0]
+    result = measure(flat, pixel, views([flat] * 3, MOVED, np.eye(4)), SEARCH)
+    assert result.agreed.tolist() == [0]
     strength = np.zeros((9, 12))
     best_pixels(flat, 8, np.zeros((9, 12, 2)), strength)
     assert (strength == 0).all()
@@ -142,9 +142,9 @@ def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene)
     point = np.concatenate([pixel, np.ones((2, 1))], 1) @ np.linalg.inv(K).T * 2.0
     kept = (point, np.tile(np.eye(4), (2, 1, 1)), np.full(2, 0.01), patches(image, pixel))
     for view, T in zip(others, MOVED, strict=True):
-        found, depth, spread, shown = sight(view, *kept, T, K)
+        result, depth, spread, shown = sight(view, *kept, T, K)
         cam = (point - T[:3, 3]) @ T[:3, :3]
-        np.testing.assert_allclose(found, cam[:, :2] / cam[:, 2:] * 90 + K[:2, 2], atol=1e-9)
+        np.testing.assert_allclose(result, cam[:, :2] / cam[:, 2:] * 90 + K[:2, 2], atol=1e-9)
         np.testing.assert_allclose(depth, cam[:, 2], atol=1e-12)
         np.testing.assert_allclose(spread, 0.01 * np.abs(point @ T[:3, 2]), atol=1e-12)
         assert shown.tolist() == [1, 1]

@@ -61,8 +61,8 @@ def two_cameras():
         "beams": beams,
         "ranges": ranges,
     }
-    wanted = [(u, v, depths[0][v, u]), (columns, np.full(20, row), depths[1][row, columns])]
-    return {name: torch.from_numpy(value) for name, value in given.items()}, wanted
+    expected = [(u, v, depths[0][v, u]), (columns, np.full(20, row), depths[1][row, columns])]
+    return {name: torch.from_numpy(value) for name, value in given.items()}, expected
 
 
 def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
@@ -73,16 +73,16 @@ def test_every_piece_of_code_runs(tmp_path, monkeypatch, capsys):
     assert scope["out"].statistics.anchors_used.item() > 0
     assert float(scope["out"].anchored.nan_to_num(0).max()) > 0
 
-    given, wanted = two_cameras()
+    given, expected = two_cameras()
     scope = dict(given)
     exec(compile(own, PAGE.name, "exec"), scope)
-    found = scope["anchors"]
-    assert found.valid.sum(1).tolist() == [30, 18]
-    for stream, (u, v, z) in enumerate(wanted):
-        use = found.valid[stream, : len(z)].numpy()
+    actual = scope["anchors"]
+    assert actual.valid.sum(1).tolist() == [30, 18]
+    for stream, (u, v, z) in enumerate(expected):
+        use = actual.valid[stream, : len(z)].numpy()
         pixel = np.stack([u, v], axis=-1)[use]
-        np.testing.assert_allclose(found.pixel[stream, : len(z)].numpy()[use], pixel, atol=1e-6)
-        np.testing.assert_allclose(found.depth[stream, : len(z)].numpy()[use], z[use], rtol=1e-9)
+        np.testing.assert_allclose(actual.pixel[stream, : len(z)].numpy()[use], pixel, atol=1e-6)
+        np.testing.assert_allclose(actual.depth[stream, : len(z)].numpy()[use], z[use], rtol=1e-9)
     out = scope["out"]
     assert "[30, 18]" in capsys.readouterr().out
     # Both streams learn of r = 1/1.25 - 1 = -.2, less what shrinkage leaves of few anchors.

@@ -97,8 +97,8 @@ def test_places_divide_the_pixels(script: Any) -> None:
 
 def test_the_scripts_run(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Every table of a tour of six frames, and the pictures, from its beginning to its end."""
-    found = script("clips").clips(argparse.Namespace(root=None, tours="200:201", frames=6, fov=None))
-    clip, ensemble = found
+    result = script("clips").clips(argparse.Namespace(root=None, tours="200:201", frames=6, fov=None))
+    clip, ensemble = result
     assert clip.aleatoric is None
     assert ensemble.aleatoric is not None
     tables = script("measure_disagreement").TABLES

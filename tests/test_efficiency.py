@@ -158,14 +158,14 @@ def test_energy_is_that_of_the_inferences(sequence):
     members = [network(offset=0.2 + 0.1 * n, backbone=Counted) for n in range(4)]
     networks = {"ensemble": TimedNetwork("ensemble", members, "Linear")}
     meter = counting_meter(3.0)
-    told = measure(rows_of("Ensemble", "UfM*-Ensemble"), networks, sequence, plan=QUICK, meter=meter)
-    assert told["power"]["idle_watts"] == {"cpu package 0": pytest.approx(3.0)}
-    energy = told["networks"]["ensemble"]["energy"]
+    message = measure(rows_of("Ensemble", "UfM*-Ensemble"), networks, sequence, plan=QUICK, meter=meter)
+    assert message["power"]["idle_watts"] == {"cpu package 0": pytest.approx(3.0)}
+    energy = message["networks"]["ensemble"]["energy"]
     assert energy[DEPTH]["net"]["millijoules"] == pytest.approx(2000)
     assert energy[ONCE]["net"]["millijoules"] == pytest.approx(2000)
     assert energy[EVERY]["net"]["millijoules"] == pytest.approx(8000)
     assert energy[DEPTH]["gross"]["millijoules"] > 2000
-    ensemble, star = told["rows"]
+    ensemble, star = message["rows"]
     assert ensemble["energy"]["network_uncertainty"]["net"]["millijoules"] == pytest.approx(6000)
     assert ensemble["energy_overhead_percent"]["net"] == pytest.approx(75.0)
     # A head and the multiview step consume nothing on this meter, but the machine idles meanwhile.
@@ -173,7 +173,7 @@ def test_energy_is_that_of_the_inferences(sequence):
     assert star["energy"]["multiview"]["gross"]["watts"] == pytest.approx(3.0)
     assert star["energy_overhead_percent"]["net"] == pytest.approx(0.0, abs=1e-4)
     assert star["energy_overhead_percent"]["gross"] > 0
-    assert NOT_MEASURABLE not in efficiency_table(told)[0]
+    assert NOT_MEASURABLE not in efficiency_table(message)[0]
 
 
 def numbers_of_energy(value, inside=False):
@@ -233,10 +233,10 @@ def test_a_row_tells_its_latency_and_memory(unpowered):
 def test_what_cannot_be_measured_is_left_out_and_named(sequence):
     one = {"ensemble": TimedNetwork("ensemble", [network()], "Linear")}
     rows = [*rows_of("Ensemble", "UfM*-Ensemble", "Evidential"), Row(Method.parse("UfM*-Ensemble"), Setting(skip=2))]
-    told = measure(rows, one, sequence, plan=QUICK, meter=NO_SENSOR)
-    assert [row["row"] for row in told["rows"]] == ["UfM*-Ensemble"]
-    assert set(told["left_out"]) == {"Ensemble", "Evidential", "UfM*-Ensemble (skip 2)"}
-    assert "Evidential is left out: no network for evidential" in efficiency_table(told)[0]
+    message = measure(rows, one, sequence, plan=QUICK, meter=NO_SENSOR)
+    assert [row["row"] for row in message["rows"]] == ["UfM*-Ensemble"]
+    assert set(message["left_out"]) == {"Ensemble", "Evidential", "UfM*-Ensemble (skip 2)"}
+    assert "Evidential is left out: no network for evidential" in efficiency_table(message)[0]
     with pytest.raises(ValueError, match="can be measured"):
         measure(rows_of("Evidential"), one, sequence, plan=QUICK, meter=NO_SENSOR)
     with pytest.raises(ValueError, match="8 readable frames, the plan needs 45"):
@@ -250,12 +250,12 @@ def test_a_network_that_predicts_all_in_one_is_not_separable(sequence):
     whole = wrap_network(both, "depth", aleatoric="variance", preprocess=Preprocess(size=SIZE))
     networks = {base: TimedNetwork(base, [whole], "Mine") for base in ("aleatoric", "depth_only")}
     names = ("UfM*-Aleatoric", "DepthOnly", "UfM*-DepthOnly")
-    told = measure(rows_of(*names), networks, sequence, plan=QUICK, meter=NO_SENSOR)
-    aleatoric, alone, depth_only = told["rows"]
+    message = measure(rows_of(*names), networks, sequence, plan=QUICK, meter=NO_SENSOR)
+    aleatoric, alone, depth_only = message["rows"]
     assert "WrappedNetwork" in aleatoric["latency"]["network_uncertainty"]["not_separable"]
     assert alone["latency"]["network_uncertainty"] == {"none": "the method asks nothing of the network but depth"}
     assert depth_only["latency"]["multiview"]["median_ms"] > 0
-    lines = {line.label: [cell.value for cell in line.cells] for line in efficiency_tables(told)[0].lines}
+    lines = {line.label: [cell.value for cell in line.cells] for line in efficiency_tables(message)[0].lines}
     assert lines["UfM*-Aleatoric"][3:6] == ["not separable"] * 3
     assert lines["DepthOnly"][3:6] == ["", "", ""]
     # Its weights are no tensors of torch's.

@@ -71,8 +71,8 @@ def test_a_window_is_the_difference_of_two_readings():
 def test_a_counter_that_wraps_once_loses_nothing(wraps_at, start, share, watts):
     used = share * wraps_at * watts / 1000  # what fits into the longest window that is allowed
     before = start * wraps_at
-    found = consumed(Rail("cpu", CPU, wraps_at), before, (before + used) % wraps_at, used / watts)
-    assert found == pytest.approx(used, rel=1e-6, abs=1e-9 * wraps_at)
+    result = consumed(Rail("cpu", CPU, wraps_at), before, (before + used) % wraps_at, used / watts)
+    assert result == pytest.approx(used, rel=1e-6, abs=1e-9 * wraps_at)
 
 
 def test_the_meter_counts_across_a_wrap():
@@ -170,10 +170,10 @@ def test_gross_and_net_energy_per_frame():
     added = once.minus(depth)
     assert added.joules == pytest.approx((0.25,) * 3)
     assert added.net == pytest.approx((0.2,) * 3)
-    told = added.to_dict()
-    assert told["gross"]["millijoules"] == pytest.approx(250.0)
-    assert told["gross"]["watts"] == pytest.approx(25.0)
-    assert told["net"]["watts"] == pytest.approx(20.0)
+    message = added.to_dict()
+    assert message["gross"]["millijoules"] == pytest.approx(250.0)
+    assert message["gross"]["watts"] == pytest.approx(25.0)
+    assert message["net"]["watts"] == pytest.approx(20.0)
     # Windows take turns, in alternating order.
     assert log == ["depth", "once", "once", "depth", "depth", "once"]
 
@@ -208,9 +208,9 @@ def test_one_unusable_window_makes_the_part_not_measurable(cause):
     machine = Machine(watts=0.0 if cause == "counter" else 5.0)
     idle = {"cpu package 0": 1.0} if cause == "counter" else {}
     work = {("x", "once"): (CPU, frames_of(machine, 3, 0.1, 0.0))}
-    told = run_windows(machine.meter(), work, idle, seconds=0.1, windows=2)["x", "once"].to_dict()
-    assert list(told) == ["not_measurable"]
-    assert ("did not move" if cause == "counter" else "idle power") in told["not_measurable"]
+    message = run_windows(machine.meter(), work, idle, seconds=0.1, windows=2)["x", "once"].to_dict()
+    assert list(message) == ["not_measurable"]
+    assert ("did not move" if cause == "counter" else "idle power") in message["not_measurable"]
 
 
 def test_a_difference_of_less_time_than_nothing_has_no_power():

@@ -16,11 +16,11 @@ def part(ms, millijoules=None, low=None):
     spread = {"median_ms": ms, "q1_ms": ms if low is None else low, "q3_ms": ms}
     if millijoules is None:
         return spread, {"not_measurable": "no counter"}
-    told = [
+    message = [
         {**dict.fromkeys(("q1", "millijoules", "q3"), mJ), "seconds": 1e-3 * ms}
         for mJ in (millijoules, millijoules / 2)
     ]
-    return spread, {"gross": told[0], "net": told[1]}
+    return spread, {"gross": message[0], "net": message[1]}
 
 
 def line(depth=(27.0, 206.3), dnn=(252.0, 1857.0), mvd=None, memory=None, overhead=90.0):
@@ -33,7 +33,7 @@ def line(depth=(27.0, 206.3), dnn=(252.0, 1857.0), mvd=None, memory=None, overhe
     walls = {
         key: {name.removesuffix("_ms"): ms / 27 for name, ms in times.items()} for key, (times, _) in parts.items()
     }
-    doubled = {key: {name: 2 * value for name, value in told.items()} for key, told in walls.items()}
+    doubled = {key: {name: 2 * value for name, value in message.items()} for key, message in walls.items()}
     ratios = {key: {"wall": walls[key], "processor": doubled[key]} for key in parts}
     row = {
         "row": name, "base": "ensemble", "network": "ResNet50-Monodepth2",

@@ -24,9 +24,9 @@ FIXED = {"on_bad_frame": "skip", "initial_capacity": 256, "max_components": 256}
 
 def frames(streams: int, count: int):
     """Depth, pose and intrinsics on the device, the first ones of a walk and back again."""
-    there = [tuple(v.cuda() for v in frame[:3]) for frame in walks(streams, 8)]
-    there += there[::-1]
-    return [there[i % len(there)] for i in range(count)]
+    present = [tuple(v.cuda() for v in frame[:3]) for frame in walks(streams, 8)]
+    present += present[::-1]
+    return [present[i % len(present)] for i in range(count)]
 
 
 @pytest.mark.parametrize("growing", [False, True])

@@ -253,10 +253,10 @@ def test_coarse_heads_learn_and_do_not_predict(method: str) -> None:
     x = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     network.train()
     network.backbone.eval()
-    told = network.distribution(x)
-    assert told.depth.shape == (8, 64, 64)
-    assert torch.equal(told.depth[:2], told.depth[6:])
-    told.prediction().variance.sum().backward()
+    message = network.distribution(x)
+    assert message.depth.shape == (8, 64, 64)
+    assert torch.equal(message.depth[:2], message.depth[6:])
+    message.prediction().variance.sum().backward()
     heads = {name: p for name, p in network.named_parameters() if not name.startswith("backbone")}
     assert len(heads) == 8
     assert all(p.grad is not None and p.grad.any() for p in heads.values())

@@ -49,8 +49,8 @@ def start(words):
 def finish(words):
     """An undisturbed process."""
     process = start(words)
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 0, said.decode()
+    _, text = process.communicate(timeout=300)
+    assert process.returncode == 0, text.decode()
 
 
 def kill_at(words, out, files, delay):

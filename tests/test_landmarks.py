@@ -90,8 +90,13 @@ def test_other_files_are_refused(tmp_path):
     np.savez(tmp_path / "pickled.npz", points=np.array([[{}, 1, 2]], dtype=object), sigma=np.ones(1))
     np.savez(tmp_path / "flat.npz", points=np.zeros(3), sigma=np.ones(3))
     (tmp_path / "bytes.npz").write_bytes(b"no archive")
-    for name, told in (("a", "'points'"), ("pickled", "allow_pickle"), ("flat", r"\[P, 3\]"), ("bytes", "landmarks")):
-        with pytest.raises(ValueError, match=told):
+    for name, message in (
+        ("a", "'points'"),
+        ("pickled", "allow_pickle"),
+        ("flat", r"\[P, 3\]"),
+        ("bytes", "landmarks"),
+    ):
+        with pytest.raises(ValueError, match=message):
             LandmarkMap.read(tmp_path / f"{name}.npz")
     with pytest.raises(FileNotFoundError):
         LandmarkMap.read(tmp_path / "none.csv")
@@ -131,10 +136,10 @@ def test_landmarks_are_where_a_loop_puts_them(tour):
             u, v = (frame.intrinsics @ [x / z, y / z, 1])[:2]
             if 0 <= round(u) < frame.image.shape[1] and 0 <= round(v) < frame.image.shape[0]:
                 expected.append((u, v, z, s * s))
-        found = landmarks.update(frame.image, frame.T_world_cam, frame.intrinsics)
-        values = np.c_[found.pixel, found.depth, found.variance]
+        actual = landmarks.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        values = np.c_[actual.pixel, actual.depth, actual.variance]
         np.testing.assert_allclose(values, np.reshape(expected, (-1, 4)), rtol=1e-9, atol=1e-9)
-        assert found.tracked == 300
+        assert actual.tracked == 300
         wide = landmarks.update(None, frame.T_world_cam, frame.intrinsics)
         seen = {tuple(row) for row in np.round(np.c_[wide.pixel, wide.depth], 6)}
         assert {tuple(row) for row in np.round(values[:, :3], 6)} <= seen
@@ -145,9 +150,9 @@ def test_a_large_map_is_thinned_evenly(tour):
     frame = tour[0]
     z = np.linspace(1, 2, 5000)
     in_view = (frame.T_world_cam @ np.stack([0 * z, 0 * z, z, z**0])).T[:, :3]
-    found = LandmarkMap(in_view, np.full(5000, 0.1)).update(frame.image, frame.T_world_cam, frame.intrinsics)
-    assert len(found.depth) == 500
-    np.testing.assert_allclose(found.depth, z[::10], rtol=1e-9)
+    result = LandmarkMap(in_view, np.full(5000, 0.1)).update(frame.image, frame.T_world_cam, frame.intrinsics)
+    assert len(result.depth) == 500
+    np.testing.assert_allclose(result.depth, z[::10], rtol=1e-9)
     nothing = LandmarkMap(-in_view - 100, np.ones(5000)).update(frame.image, frame.T_world_cam, frame.intrinsics)
     assert len(nothing.depth) == 0
     assert nothing.none == "no landmark of the map is in view"
@@ -183,8 +188,8 @@ def test_a_run_with_a_file_equals_a_loop_by_hand_and_resumes(tour, file, tmp_pat
     assert summary["anchors"]["mean_bias"] == pytest.approx(1 / 1.3 - 1, abs=0.02)
     assert summary["source"]["anchors"] == "landmarks"
     assert f"in view and {len(landmarks.sigma):.1f} in the map" in run_table(summary)
-    asked = iter([False] * 3 + [True])
-    assert run(job(), tmp_path / "again", stop=lambda: next(asked))["state"] == "interrupted"
+    requested = iter([False] * 3 + [True])
+    assert run(job(), tmp_path / "again", stop=lambda: next(requested))["state"] == "interrupted"
     run(job(), tmp_path / "again", resume=True)
     assert outputs(tmp_path / "again") == outputs(tmp_path / "out")
 
@@ -230,8 +235,8 @@ def test_a_model_with_a_source_equals_one_that_is_given_its_anchors(tour, file):
     tracker, mapped = LandmarkTracker(), LandmarkMap.read(file)
     by_hand, corners, both = wrapped(None), wrapped("corners"), wrapped(["corners", mapped])
     for i, (image, T, K) in enumerate(pictures(tour)):
-        found = tracker.update(image.permute(1, 2, 0).numpy(), T.numpy(), K.numpy()).anchors(K.numpy(), K)
-        expected = by_hand(image[None], T, K, anchors=found)
+        actual = tracker.update(image.permute(1, 2, 0).numpy(), T.numpy(), K.numpy()).anchors(K.numpy(), K)
+        expected = by_hand(image[None], T, K, anchors=actual)
         assert torch.equal(corners(image[None], T, K).variance, expected.variance)
         stacked = image[None].expand(2, -1, -1, -1) if i % 2 else image[None].expand(2, -1, -1, -1).float() / 255
         out = both(stacked, T.expand(2, 4, 4), K.expand(2, 3, 3))

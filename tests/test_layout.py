@@ -31,14 +31,14 @@ def sources() -> list[Path]:
 
 def imported(path: Path) -> list[tuple[str, list[str]]]:
     """(module, names) of every import statement, at any depth."""
-    found: list[tuple[str, list[str]]] = []
+    result: list[tuple[str, list[str]]] = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            found += [(alias.name, []) for alias in node.names]
+            result += [(alias.name, []) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative imports hide which layer is meant"
-            found.append((node.module or "", [alias.name for alias in node.names]))
-    return found
+            result.append((node.module or "", [alias.name for alias in node.names]))
+    return result
 
 
 def target_layer(module: str, names: list[str]) -> str | None:
@@ -74,7 +74,7 @@ EVAL_ORDER = (
 
 def test_imports_inside_eval_go_one_way():
     rank = {name: number for number, names in enumerate(EVAL_ORDER) for name in names}
-    found = set()
+    result = set()
     for path in sorted((ROOT / "eval").rglob("*.py")):
         own = path.relative_to(ROOT / "eval").with_suffix("").parts
         if own == ("__init__",):
@@ -85,8 +85,8 @@ def test_imports_inside_eval_go_one_way():
                 continue
             for target in [parts[2]] if len(parts) > 2 else names:
                 if rank[target] > rank[own[0]] or (rank[target] == rank[own[0]] and target != own[0]):
-                    found.add(f"{'.'.join(own)} -> {'.'.join(parts[2:]) or target}")
-    assert not found, found
+                    result.add(f"{'.'.join(own)} -> {'.'.join(parts[2:]) or target}")
+    assert not result, result
 
 
 def test_no_slow_tier_imports_a_fast_one():

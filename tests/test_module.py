@@ -78,8 +78,8 @@ def test_state_survives_safetensors(tmp_path):
 
 def test_loading_into_another_config_warns():
     ufm = UfMStar(CONFIG)
-    told = rf"another config: eta was {CONFIG.eta}, is 0.4, segment.min_pixels was {CONFIG.segment.min_pixels}, is 7"
-    with pytest.warns(UserWarning, match=told):
+    message = rf"another config: eta was {CONFIG.eta}, is 0.4, segment.min_pixels was {CONFIG.segment.min_pixels}, is 7"
+    with pytest.warns(UserWarning, match=message):
         UfMStar(CONFIG.replace(eta=0.4, segment=replace(CONFIG.segment, min_pixels=7))).load_state_dict(
             ufm.state_dict()
         )

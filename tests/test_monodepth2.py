@@ -235,11 +235,11 @@ def test_imagenet_from_torchvision(monkeypatch: pytest.MonkeyPatch) -> None:
     """None and an enum go through torchvision's own download, replaced here."""
     import torchvision.models
 
-    weights, asked = classifier_weights(), []
+    weights, requested = classifier_weights(), []
 
     class Downloaded:
         def get_state_dict(self, **options: Any) -> dict[str, Tensor]:
-            asked.append(options)
+            requested.append(options)
             return weights
 
     class Enum:
@@ -249,7 +249,7 @@ def test_imagenet_from_torchvision(monkeypatch: pytest.MonkeyPatch) -> None:
     for given in (None, Downloaded()):
         network = MonodepthResNet.imagenet(given, 18, decoder=SMALL)
         assert torch.equal(network.encoder.layer4[1].conv2.weight, weights["layer4.1.conv2.weight"])
-    assert asked == [{"progress": False, "check_hash": True}] * 2
+    assert requested == [{"progress": False, "check_hash": True}] * 2
     with pytest.raises(ValueError, match="torchvision's weights have strides"):
         MonodepthResNet.imagenet(None, 18, strides="v1", decoder=SMALL)
 

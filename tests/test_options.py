@@ -166,7 +166,7 @@ def test_the_help_of_a_flag_names_no_default(capsys):
     """--no-register would have "(default: True)", that of the field that it switches off."""
     with pytest.raises(SystemExit):
         cli.main(["run", "--help"])
-    told = " ".join(capsys.readouterr().out.split())
-    assert "--no-register leave 7-Scenes' depth in its own camera --T-color-depth" in told
-    assert "(default: True)" not in told
-    assert "leave preview.mp4 out --no-sheet" in told
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "--no-register leave 7-Scenes' depth in its own camera --T-color-depth" in printed
+    assert "(default: True)" not in printed
+    assert "leave preview.mp4 out --no-sheet" in printed

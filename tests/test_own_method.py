@@ -19,8 +19,8 @@ def test_both_rows_are_judged(tmp_path, capsys):
     network = build_network(SPEC).eval()
     save_trained(tmp_path / "net.safetensors", network, SPEC)
     tour = "tour:5?frames=3&size=64x96"
-    found = example.main([tour, "--model", "trained", "--weights", str(tmp_path / "net.safetensors")])
-    assert list(found) == ["UfM*", "a tenth"]
+    result = example.main([tour, "--model", "trained", "--weights", str(tmp_path / "net.safetensors")])
+    assert list(result) == ["UfM*", "a tenth"]
     assert capsys.readouterr().out.startswith("UfM* ")
     inside = pixels = 0
     errors = []
@@ -33,5 +33,5 @@ def test_both_rows_are_judged(tmp_path, capsys):
         errors.append(np.square(depth - frame.depth)[use])
         inside += int((np.abs(depth - frame.depth)[use] <= 0.2 * depth[use]).sum())
         pixels += int(use.sum())
-    assert found["a tenth"]["within 2 sigma"] == pytest.approx(inside / pixels, abs=1e-3)
-    assert found["a tenth"]["rmse"] == pytest.approx(float(np.sqrt(np.concatenate(errors).mean())), rel=0.05)
+    assert result["a tenth"]["within 2 sigma"] == pytest.approx(inside / pixels, abs=1e-3)
+    assert result["a tenth"]["rmse"] == pytest.approx(float(np.sqrt(np.concatenate(errors).mean())), rel=0.05)

@@ -255,18 +255,18 @@ def test_stream_and_a_device_for_the_multiview_part_change_no_bit():
     plain = UncertainDepth(members, CONFIG)
     ahead = UncertainDepth(members, CONFIG, multiview_device="cpu").to(torch.device("cpu"))
     frames = [(image(i), POSES[i], K) for i in range(5)]
-    asked = []
+    requested = []
 
     def video():
         for i, frame in enumerate(frames):
-            asked.append(i)
+            requested.append(i)
             yield frame
 
     for i, out in enumerate(ahead.stream(video())):
         expected = plain(*frames[i])
         assert out.member == expected.member == i % 3
         assert torch.equal(out.variance.nan_to_num(-1), expected.variance.nan_to_num(-1))
-        assert asked[-1] == min(i + 1, 4), "one image ahead"
+        assert requested[-1] == min(i + 1, 4), "one image ahead"
     assert int(ahead.image_index) == 5
     assert list(ahead.stream([])) == []
     assert ahead.ufm.mean.device.type == "cpu"

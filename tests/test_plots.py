@@ -96,8 +96,8 @@ class TestContactSheet:
         # Every colour of both depth maps is in the picture, so both rows were drawn on the one scale.
         shown = {tuple(c) for c in picture.reshape(-1, 3).tolist()}
         for one in panels:
-            wanted = {tuple(c) for c in scales.depth.rgb(one.depth, one.valid).reshape(-1, 3).tolist()}
-            assert len(wanted & shown) > 0.95 * len(wanted)
+            expected = {tuple(c) for c in scales.depth.rgb(one.depth, one.valid).reshape(-1, 3).tolist()}
+            assert len(expected & shown) > 0.95 * len(expected)
 
     def test_without_ground_truth_there_is_no_error_column(self, tmp_path: Path) -> None:
         contact_sheet([panel(error=False)], tmp_path / "without.png")

@@ -76,12 +76,12 @@ def test_a_pool_of_two_sequences(tmp_path, capsys):
     for frame in open_sequence(tours[1]):
         image = torch.from_numpy(frame.image).permute(2, 0, 1)[None]
         pose, camera = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-        found = model.mean_uncertainty(image, pose, camera, pixels=500, seed=frame.index)
+        actual = model.mean_uncertainty(image, pose, camera, pixels=500, seed=frame.index)
         [row] = [row for row in rows if (row["frame"], row["sequence"]) == (frame.name, rows_name(rows, tours[1]))]
-        expected = float(found.mean)
+        expected = float(actual.mean)
         assert (row["mean_variance_m2"] == "") == math.isnan(expected)
         assert math.isnan(expected) or float(row["mean_variance_m2"]) == pytest.approx(expected)
-        assert int(row["pixels"]) == int(found.pixels)
+        assert int(row["pixels"]) == int(actual.pixels)
 
 
 def rows_name(rows, tour):

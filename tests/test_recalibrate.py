@@ -198,8 +198,8 @@ def test_from_an_evaluation_to_other_sequences(evaluated, tmp_path, capsys):
     assert cli.main(again) == 1  # one of the sequences was fitted to
     assert "were fitted to this sequence" in capsys.readouterr().err
     records = sorted(path.relative_to(tmp_path / "out" / "records") for path in (tmp_path / "out").rglob("*@*.json"))
-    found = [json.loads((tmp_path / "out" / "records" / path).read_text()) for path in records]
-    [record] = [record for record in found if "recalibration" in record["setting"]]
+    result = [json.loads((tmp_path / "out" / "records" / path).read_text()) for path in records]
+    [record] = [record for record in result if "recalibration" in record["setting"]]
     assert record["sequence"] == "cedar"
     plain = json.loads((tmp_path / "out" / "records" / "rooms" / "cedar" / "UfMstar-DepthOnly.json").read_text())
     assert record["figures"]["nll_left_out_share"] == 0

@@ -153,8 +153,8 @@ class TestEntropy:
         merged = Merged({"entropy": 0.5}, curves)
         heights, _ = density(merged)
         assert heights.tolist() == [0.0, 0.75]  # the share of all pixels, those without a variance among them
-        found = replace(in_memory({(UFM_STAR, ("d", "s")): {}}), merged={("d", UFM_STAR): merged})
-        assert words(draw_entropy(found, "ensemble").axes[0]) == ["UfM*: mean 0.50\n(25 % with hardly any V)"]
+        result = replace(in_memory({(UFM_STAR, ("d", "s")): {}}), merged={("d", UFM_STAR): merged})
+        assert words(draw_entropy(result, "ensemble").axes[0]) == ["UfM*: mean 0.50\n(25 % with hardly any V)"]
 
     def test_range_holds_the_pixels(self):
         edges = np.linspace(-8, 8, 65)
@@ -183,18 +183,18 @@ def swept() -> Results:
 class TestSweeps:
     def test_points_rise_and_seeds_are_averaged_first(self, swept):
         assert sweeps(swept) == [("ensemble", "rotation_noise")]
-        found = points(swept, UFM_STAR.method, "rotation_noise")
-        assert [point.value for point in found] == [0.0, 2.0, 5.0]
-        assert [len(point.rows) for point in found] == [1, 2, 1]
-        mean = level(swept, found[1], NLL)
+        result = points(swept, UFM_STAR.method, "rotation_noise")
+        assert [point.value for point in result] == [0.0, 2.0, 5.0]
+        assert [len(point.rows) for point in result] == [1, 2, 1]
+        mean = level(swept, result[1], NLL)
         assert (mean.value, mean.sequences) == (pytest.approx(5.2), 5)
         deviation = math.sqrt((4.0**2 + 1.0**2 + 5.0**2 + 1.0**2 + 1.0**2) / 4)
         assert mean.half == pytest.approx(2.7764451051977934 * deviation / math.sqrt(5))
 
     def test_the_change_is_in_pairs(self, swept):
         still = Point(0.0, (noisy(0.0),))
-        found = change(swept, points(swept, UFM_STAR.method, "rotation_noise")[2], still, NLL)
-        assert (found.value, found.half) == (pytest.approx(0.5), pytest.approx(0.0, abs=1e-9))
+        result = change(swept, points(swept, UFM_STAR.method, "rotation_noise")[2], still, NLL)
+        assert (result.value, result.half) == (pytest.approx(0.5), pytest.approx(0.0, abs=1e-9))
 
     def test_lines_bands_and_the_base_alone(self, swept):
         figure = draw_sweep(swept, "ensemble", "rotation_noise")
@@ -271,12 +271,12 @@ class TestCost:
 class TestStyle:
     @given(st.lists(st.floats(0, 1), max_size=9), st.floats(0.01, 0.3))
     def test_names_keep_apart_and_in_order(self, wanted, gap):
-        found = spread_apart(wanted, gap, 0, 1)
-        assert len(found) == len(wanted)
+        actual = spread_apart(wanted, gap, 0, 1)
+        assert len(actual) == len(wanted)
         order = sorted(range(len(wanted)), key=lambda i: wanted[i])
         kept = min(gap, 1 / max(len(wanted) - 1, 1))
-        assert all(found[j] - found[i] >= kept - 1e-9 for i, j in pairwise(order))
-        assert all(-1e-9 <= place <= 1 + 1e-9 for place in found)
+        assert all(actual[j] - actual[i] >= kept - 1e-9 for i, j in pairwise(order))
+        assert all(-1e-9 <= place <= 1 + 1e-9 for place in actual)
 
     def test_places_far_enough_apart_stay(self):
         assert spread_apart([0.8, 0.1, 0.5], 0.2, 0, 1) == pytest.approx([0.8, 0.1, 0.5])

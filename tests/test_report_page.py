@@ -62,7 +62,7 @@ class Page(HTMLParser):
             self.tables[-1][-1][-1] += data
 
     def all(self, name: str) -> list[dict[str, str | None]]:
-        return [attributes for found, attributes in self.elements if found == name]
+        return [attributes for result, attributes in self.elements if result == name]
 
     @property
     def text(self) -> str:
@@ -79,8 +79,8 @@ def results_of(
     records = tuple(
         Record("own", datasets[n] if datasets else "d", f"s{n}", "FastDepth", method, figures=dict(figures))
         for n in range(max(map(len, values.values())))
-        for method, found in values.items()
-        for figures in found[n : n + 1]
+        for method, result in values.items()
+        for figures in result[n : n + 1]
     )
     rows = [{"method": method, "setting": {}} for method in values]
     return Results(Path("nowhere"), {"suite": "own", "title": "T", "rows": rows}, records, **changes)
@@ -190,10 +190,10 @@ class TestFindings:
         poor = {"Ensemble": [figures(2.0, delta1=0.2) | {"nll_left_out_share": 0.25}] * 2}
         failed = (Failed("d", "x", "broken"),)
         results = results_of(poor, failed=failed, missing=(("d", "y", rows_of("Ensemble")[0]),))
-        told = " ".join(caveats(results))
+        message = " ".join(caveats(results))
         for words in ("Left out, because of errors: 1 sequence;", "rows of 1 sequence are still", "On d only 20 %"):
-            assert words in told
-        assert "Ensemble 25 %" in told
+            assert words in message
+        assert "Ensemble 25 %" in message
         assert caveats(results_of({"Ensemble": [figures(2.0)] * 5})) == [
             "n = 5: the figures are means over 5 sequences, each counting the same."
         ]
@@ -310,8 +310,8 @@ class TestPage:
     def test_the_command_names_networks(self) -> None:
         network = {"model": "trained", "files": [{"name": "m0.safetensors"}, {"name": "m1.safetensors"}]}
         about = {"suite": "depth-only", "datasets": ["tum"], "networks": {"ensemble": network}}
-        wanted = "--network ensemble=trained:DIR/m0.safetensors,DIR/m1.safetensors --out OUT"
-        assert command(about) == f"ufmstar eval --suite depth-only --root tum=DIR {wanted}"
+        expected = "--network ensemble=trained:DIR/m0.safetensors,DIR/m1.safetensors --out OUT"
+        assert command(about) == f"ufmstar eval --suite depth-only --root tum=DIR {expected}"
 
     def test_the_command_has_what_was_chosen(self) -> None:
         network = {"model": "trained", "files": [{"name": "m.safetensors", "member": 0}]}

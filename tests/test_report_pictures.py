@@ -131,12 +131,12 @@ class TestFindExamples:
         big = np.full((24, 32), 2.0, np.float32)
         scene = {"image": np.ones((24, 32, 3), np.uint8), "truth": big, "K": 2 * K}
         self.write(folder, "f@1@UfMstar-DepthOnly", depth=big, variance=big, **scene)
-        found = find_examples(folder, {"Ensemble": "for people"})
-        assert [(e.dataset, e.sequence, e.frame) for e in found] == [("tum", "desk", "f@1")] * 2
-        assert set(found[0].rows) == {"Ensemble", "UfMstar-Ensemble@0a1b"}
-        assert set(found[1].rows) == {"UfMstar-DepthOnly"}
-        assert found[1].truth.shape == (24, 32)
-        assert (found[0].label("Ensemble"), found[0].label("other")) == ("for people", "other")
+        result = find_examples(folder, {"Ensemble": "for people"})
+        assert [(e.dataset, e.sequence, e.frame) for e in result] == [("tum", "desk", "f@1")] * 2
+        assert set(result[0].rows) == {"Ensemble", "UfMstar-Ensemble@0a1b"}
+        assert set(result[1].rows) == {"UfMstar-DepthOnly"}
+        assert result[1].truth.shape == (24, 32)
+        assert (result[0].label("Ensemble"), result[0].label("other")) == ("for people", "other")
 
     def test_bad_files_are_named(self, tmp_path: Path) -> None:
         folder = tmp_path / "tum" / "desk"
@@ -159,8 +159,8 @@ class TestStrips:
         scales = draw_strip(tmp_path / "s.png", one, list(rows))
         # Errors 1 and .5 where there is truth; sigmas .2 | .8 and .5: the two .5 share a colour, as they share a scale.
         for value, area in ((0.2, 0.5), (0.8, 0.5), (1.0, 0.5), (0.5, 1.5)):
-            found = pixels(tmp_path / "s.png", scales.length.rgb(np.array(value)))
-            assert found == pytest.approx(area * CELL, rel=0.12), value
+            result = pixels(tmp_path / "s.png", scales.length.rgb(np.array(value)))
+            assert result == pytest.approx(area * CELL, rel=0.12), value
         nll = one.nll("star")[0, 0]
         assert pixels(tmp_path / "s.png", NLL_SCALE.rgb(np.array(nll))) == pytest.approx(0.5 * CELL, rel=0.12)
         # No truth on the right half: of the truth itself, two errors and two NLLs.
@@ -227,17 +227,17 @@ class TestCompare:
 class TestProjection:
     def test_axis_aligned(self) -> None:
         view = Projection(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "from above")
-        found = project(view, np.array([[1.0, 2.0, 3.0]]), np.diag([0.04, 9.0, 0.25])[None])
-        np.testing.assert_allclose(found.centre, [[1.0, 3.0]])
-        np.testing.assert_allclose(found.axes, [[0.5 * SIGMAS, 0.2 * SIGMAS]])
-        assert abs(found.angle[0]) == pytest.approx(90)
+        result = project(view, np.array([[1.0, 2.0, 3.0]]), np.diag([0.04, 9.0, 0.25])[None])
+        np.testing.assert_allclose(result.centre, [[1.0, 3.0]])
+        np.testing.assert_allclose(result.axes, [[0.5 * SIGMAS, 0.2 * SIGMAS]])
+        assert abs(result.angle[0]) == pytest.approx(90)
 
     def test_a_line_at_thirty_degrees(self) -> None:
         along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
         view = Projection(np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), "")
-        found = project(view, np.zeros((1, 3)), np.outer(along, along)[None])
-        assert found.angle[0] == pytest.approx(30)
-        np.testing.assert_allclose(found.axes, [[SIGMAS, 0.0]], atol=1e-7)
+        result = project(view, np.zeros((1, 3)), np.outer(along, along)[None])
+        assert result.angle[0] == pytest.approx(30)
+        np.testing.assert_allclose(result.axes, [[SIGMAS, 0.0]], atol=1e-7)
 
     @settings(max_examples=25)
     @given(st.integers(0, 2**32 - 1))
@@ -248,13 +248,13 @@ class TestProjection:
         view = Projection(R[0], R[1], "")
         A = rng.normal(size=(4, 3, 3))
         covariance = A @ A.transpose(0, 2, 1)
-        found = project(view, rng.normal(size=(4, 3)), covariance)
+        actual = project(view, rng.normal(size=(4, 3)), covariance)
         for direction in np.linspace(0, np.pi, 7):
             n = np.cos(direction) * view.right + np.sin(direction) * view.up
-            wanted = SIGMAS * np.sqrt(np.einsum("i,kij,j->k", n, covariance, n))
-            off = direction - np.radians(found.angle)
-            a, b = found.axes.T
-            np.testing.assert_allclose(np.hypot(a * np.cos(off), b * np.sin(off)), wanted, rtol=1e-9)
+            expected = SIGMAS * np.sqrt(np.einsum("i,kij,j->k", n, covariance, n))
+            off = direction - np.radians(actual.angle)
+            a, b = actual.axes.T
+            np.testing.assert_allclose(np.hypot(a * np.cos(off), b * np.sin(off)), expected, rtol=1e-9)
 
     @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
     def test_views_find_up(self, up: tuple[float, float, float]) -> None:
@@ -303,10 +303,10 @@ class TestRooms:
         assert scale.high == pytest.approx(np.percentile([0.5, 0.5, 2.0], 99))
         with Image.open(tmp_path / "r.png") as picture:
             drawn = np.asarray(picture.convert("RGB")).astype(int)
-        wanted = 0.85 * scale.rgb(np.array(0.5)).astype(float) + 0.15 * 255  # on white
+        expected = 0.85 * scale.rgb(np.array(0.5)).astype(float) + 0.15 * 255  # on white
         halves_ = np.array_split(drawn, 2, axis=1)
         for half in halves_:
-            assert (np.abs(half - wanted).max(-1) <= 2).sum() > 300
+            assert (np.abs(half - expected).max(-1) <= 2).sum() > 300
 
     def test_snapshots_are_found_in_order(self, tmp_path: Path) -> None:
         (tmp_path / "room").mkdir()
@@ -314,7 +314,7 @@ class TestRooms:
         for name in ("UfMstar-Ensemble_frame_10", "UfMstar-Ensemble_frame_9", "UfMstar-MCD@ab_frame_1"):
             np.savez(tmp_path / "room" / f"{name}.npz", **maps, T_world_cam=np.eye(4))
         rooms = find_rooms(tmp_path)
-        assert {row: [s.frame for s in found] for row, found in rooms.items()} == {
+        assert {row: [s.frame for s in result] for row, result in rooms.items()} == {
             "UfMstar-Ensemble": ["frame_9", "frame_10"],
             "UfMstar-MCD@ab": ["frame_1"],
         }
@@ -333,8 +333,8 @@ class TestRooms:
 class TestChoice:
     def test_frames_of_many_sequences_first(self) -> None:
         names = [("a", "1"), ("a", "2"), ("a", "3"), ("b", "1"), ("c", "1"), ("c", "2")]
-        found = choose([example({}, sequence=s, frame=f) for s, f in names], 4)
-        assert [(e.sequence, e.frame) for e in found] == [("a", "3"), ("a", "2"), ("b", "1"), ("c", "2")]
+        result = choose([example({}, sequence=s, frame=f) for s, f in names], 4)
+        assert [(e.sequence, e.frame) for e in result] == [("a", "3"), ("a", "2"), ("b", "1"), ("c", "2")]
 
     def test_rows_of_a_strip(self) -> None:
         rows = rows_of("UfM-MCD", "Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "UfM*-FullEnsemble")

@@ -132,7 +132,7 @@ def test_pose_noise_has_lines_of_both_and_their_difference_at_the_same_value(res
 
 def test_the_band_of_a_line_with_anchors_is_its_interval(results):
     axes = draw_sweep(results, "depth_only", "rotation_drift").axes[1]
-    line = next(found for found in sweep_lines(results, "depth_only", "rotation_drift") if found.rest)
+    line = next(result for result in sweep_lines(results, "depth_only", "rotation_drift") if result.rest)
     mean = level(results, line.points[0], ECE_DELTA)
     values = np.array(list(SEQUENCES.values())) / 2
     assert (mean.value, mean.sequences) == (pytest.approx(values.mean()), 5)
@@ -160,20 +160,20 @@ def test_what_only_anchors_have_stands_beside_plain_ufm_star(results, name):
 def test_settings_beside_the_anchors_are_lines_of_their_own():
     drifts = (0.0, 0.1, 0.2)
     mores = ({}, {"disagreement": "overlap"}, {"anchors": "tracked"}, {"anchors": "tracked", "corrected": True})
-    found = results_of([row(**more, **({"rotation_drift": v} if v else {})) for more in mores for v in drifts])
-    words = [line.words for line in sweep_lines(found, "depth_only", "rotation_drift")]
+    result = results_of([row(**more, **({"rotation_drift": v} if v else {})) for more in mores for v in drifts])
+    words = [line.words for line in sweep_lines(result, "depth_only", "rotation_drift")]
     assert words == ["", "disagreement overlap", "anchored", "anchored, depth corrected on"]
-    axes = draw_sweep(found, "depth_only", "rotation_drift").axes[0]
+    axes = draw_sweep(result, "depth_only", "rotation_drift").axes[0]
     assert len({line.get_color() for line in drawn(axes).values()}) == 4
 
 
 def test_seeds_of_a_noise_are_one_point():
     seeds = [Row(STAR, Setting(rotation_drift=0.1, anchors="tracked", seed=seed)) for seed in (0, 1, 2)]
-    found = results_of([row(anchors="tracked"), row(anchors="tracked", rotation_drift=0.5), *seeds])
-    (line,) = sweep_lines(found, "depth_only", "rotation_drift")
+    result = results_of([row(anchors="tracked"), row(anchors="tracked", rotation_drift=0.5), *seeds])
+    (line,) = sweep_lines(result, "depth_only", "rotation_drift")
     assert [(point.value, len(point.rows)) for point in line.points] == [(0.0, 1), (0.1, 3), (0.5, 1)]
     # Without plain UfM*, the difference is to the line's own default.
-    below = draw_sweep(found, "depth_only", "rotation_drift").axes[4]
+    below = draw_sweep(result, "depth_only", "rotation_drift").axes[4]
     assert below.get_title(loc="left") == "difference to the default in NLL, in pairs"
     assert drawn(below)["UfM*-DepthOnly anchored"].get_ydata()[0] == 0
 

@@ -137,13 +137,13 @@ class TestMainTable:
 
     def test_a_network_of_depth_alone_has_dashes(self, tmp_path):
         rows = rows_of("DepthOnly", "UfM*-DepthOnly")
-        found = load_results(write_evaluation(tmp_path / "o", rows, SCENES[:1], suite="depth-only"))
-        cells = parsed(markdown(main_table(found)))
+        result = load_results(write_evaluation(tmp_path / "o", rows, SCENES[:1], suite="depth-only"))
+        cells = parsed(markdown(main_table(result)))
         assert cells["DepthOnly"]["NLL ↓"] == cells["DepthOnly"]["ECE_q ↓"] == "–"
         assert cells["DepthOnly"]["δ₁ ↑"] == cells["UfM*-DepthOnly"]["δ₁ ↑"] != "–"
-        assert not has_variance(found, rows[0])
-        assert list(references(found, rows[1])) == []
-        assert difference_table(found).is_empty
+        assert not has_variance(result, rows[0])
+        assert list(references(result, rows[1])) == []
+        assert difference_table(result).is_empty
 
     def test_further_figures_and_single_sequences(self, results):
         record = results.of(UFM_STAR, "7-scenes")[0]
@@ -243,14 +243,14 @@ class TestDifferences:
         gains = {"a": -0.4, "b": -0.45, "c": -0.5, "d": -0.55, "e": -0.6}
         figures = {(ALONE, ("d", s)): {"nll": v, "ece_delta": 0.2} for s, v in levels.items()}
         figures |= {(UFM_STAR, ("d", s)): {"nll": v + gains[s]} for s, v in levels.items()}
-        found = in_memory(figures)
-        mean = difference(found, UFM_STAR, ALONE, NLL)
+        result = in_memory(figures)
+        mean = difference(result, UFM_STAR, ALONE, NLL)
         assert (mean.value, mean.sequences) == (pytest.approx(-0.5), 5)
         assert mean.half == pytest.approx(T_4 * 0.05 * math.sqrt(2.5) / math.sqrt(5))
-        assert mean_of(found.of(ALONE), NLL).half == pytest.approx(T_4 * 2 * math.sqrt(2.5) / math.sqrt(5))
+        assert mean_of(result.of(ALONE), NLL).half == pytest.approx(T_4 * 2 * math.sqrt(2.5) / math.sqrt(5))
         assert better(mean, NLL) is True
         assert better(mean, SPEARMAN) is False  # there, more is better
-        assert better(difference(found, ALONE, UFM_STAR, NLL), NLL) is False
+        assert better(difference(result, ALONE, UFM_STAR, NLL), NLL) is False
 
     def test_on_common_sequences_only(self):
         figures = {(ALONE, ("d", s)): {"nll": 1.0} for s in "ab"} | {(UFM, ("d", s)): {"nll": 3.0} for s in "bc"}
@@ -284,14 +284,14 @@ class TestDifferences:
         full, fixed = rows_of("UfM*-FullEnsemble", "UfM*-Ensemble-fixed-param")
         method = UFM_STAR.method
         rows = [*ENSEMBLE, full, fixed, Row(ALONE.method, skipped), Row(method, skipped), Row(method, noisy)]
-        found = in_memory({(row, ("d", "s")): {"ece_delta": 0.1} for row in [*rows, *rows_of("Aleatoric")]})
-        told = {row: list(references(found, row)) for row in rows}
-        assert told[ALONE] == []
-        assert told[UFM] == told[UFM_100K] == [ALONE]
-        assert told[UFM_STAR] == [ALONE, UFM_100K]
-        assert told[full] == told[fixed] == [ALONE, UFM_100K, UFM_STAR]
-        assert told[Row(method, skipped)] == [Row(ALONE.method, skipped), UFM_STAR]  # alone on the same images
-        assert told[Row(method, noisy)] == [ALONE, UFM_STAR]
+        result = in_memory({(row, ("d", "s")): {"ece_delta": 0.1} for row in [*rows, *rows_of("Aleatoric")]})
+        message = {row: list(references(result, row)) for row in rows}
+        assert message[ALONE] == []
+        assert message[UFM] == message[UFM_100K] == [ALONE]
+        assert message[UFM_STAR] == [ALONE, UFM_100K]
+        assert message[full] == message[fixed] == [ALONE, UFM_100K, UFM_STAR]
+        assert message[Row(method, skipped)] == [Row(ALONE.method, skipped), UFM_STAR]  # alone on the same images
+        assert message[Row(method, noisy)] == [ALONE, UFM_STAR]
 
 
 class TestSums:
@@ -331,10 +331,10 @@ class TestTidy:
         assert len(lines) == len(stored["lines"])
         for record in results.records:
             mine = [line for line in lines if (line["method"], line["sequence"]) == (record.method, record.sequence)]
-            found = {line["figure"]: float(line["value"]) for line in mine}
-            assert {name: found[name] for name in record.figures} == record.figures  # to the last bit
-            assert found["frames.skipped"] == 2
-            assert found["ms.network"] == record.ms["network"]
+            result = {line["figure"]: float(line["value"]) for line in mine}
+            assert {name: result[name] for name in record.figures} == record.figures  # to the last bit
+            assert result["frames.skipped"] == 2
+            assert result["ms.network"] == record.ms["network"]
             assert {line["network"] for line in mine} == {NETWORK}
         assert stored["failed"] == [
             {"dataset": "tum", "sequence": "fr1_xyz", "reason": HOSTILE, "rows": [r.slug for r in ENSEMBLE]}
@@ -356,9 +356,9 @@ class TestTidy:
 class TestLoading:
     def test_unfinished_and_failed(self, results):
         assert {(dataset, sequence) for dataset, sequence, _ in results.missing} == {("scannet", "scene0009_00")}
-        told = summary(results)
-        assert f"tum, fr1_xyz: {HOSTILE}" in told
-        assert "scannet, scene0009_00: 4 row(s)" in told
+        message = summary(results)
+        assert f"tum, fr1_xyz: {HOSTILE}" in message
+        assert "scannet, scene0009_00: 4 row(s)" in message
         assert results.datasets == ("7-scenes", "scannet")
         assert results.rows == tuple(ENSEMBLE)
 
@@ -417,10 +417,10 @@ class TestLoading:
         sums = tmp_path / "records" / "scannet" / SCENES[1][1] / "Ensemble.pt"
         kept = sums.read_bytes()
         sums.unlink()
-        found = load_results(tmp_path)
-        assert set(found.merged) == {("scannet", UFM)}
-        assert len(found.notes) == 1
-        assert "Ensemble.pt is not there" in found.notes[0]
+        result = load_results(tmp_path)
+        assert set(result.merged) == {("scannet", UFM)}
+        assert len(result.notes) == 1
+        assert "Ensemble.pt is not there" in result.notes[0]
         sums.write_bytes(kept[:100])
         with pytest.raises(ResultsError, match=r"Ensemble\.pt does not hold the sums"):
             load_results(tmp_path)
@@ -433,11 +433,11 @@ class TestLoading:
 class TestCommand:
     def test_prints_the_main_table_and_what_it_wrote(self, out, capsys):
         assert cli.main(["report", str(out), "--no-figures"]) == 0
-        told = capsys.readouterr().out
-        assert parsed(told)["UfM*-Ensemble"]["paper: NLL"] == "0.96 ± 0.19"
-        assert f"tum, fr1_xyz: {HOSTILE}" in told
+        printed = capsys.readouterr().out
+        assert parsed(printed)["UfM*-Ensemble"]["paper: NLL"] == "0.96 ± 0.19"
+        assert f"tum, fr1_xyz: {HOSTILE}" in printed
         files = len(list((out / "tables").iterdir()))
-        assert told.endswith(f"{out}: results.json, results.csv, table.csv, tables/ ({files} files)\n")
+        assert printed.endswith(f"{out}: results.json, results.csv, table.csv, tables/ ({files} files)\n")
         assert (out / "tables" / "main-scannet.tex").is_file()
 
     def test_wrong_usage(self, tmp_path, capsys):
@@ -494,8 +494,8 @@ class TestThePapersNumbers:
 
     def test_the_networks_of_table_2(self):
         source = require_shared("paper/ufmstar.tex").read_text()
-        told = re.findall(r"Lat\.: (\S+) ms.*?Mem\.: (\S+) MB", source, re.DOTALL)
-        assert told == [(t.alone["latency_ms"], t.alone["memory_mb"]) for t in PAPER_2]
+        message = re.findall(r"Lat\.: (\S+) ms.*?Mem\.: (\S+) MB", source, re.DOTALL)
+        assert message == [(t.alone["latency_ms"], t.alone["memory_mb"]) for t in PAPER_2]
 
     def test_table_2_in_print(self):
         ours = paper_efficiency_tables(["FastDepth (8 bit)"])
@@ -511,21 +511,21 @@ class TestThePapersNumbers:
         """Energy of the sequences that were measured, memory of the network and of every record."""
         runs = {("d", f"s{n}"): measured_line(mvd=(24.0, 50.0 + 10 * n), memory={"mvd": 1}) for n in range(5)}
         figures = {(UFM_STAR, where): {"nll": 1.0} for where in runs}
-        found = in_memory({**figures, (UFM_STAR, ("d", "later")): {"nll": 1.0}}, efficiency=over_sequences(runs))
-        table = main_table(found)
+        result = in_memory({**figures, (UFM_STAR, ("d", "later")): {"nll": 1.0}}, efficiency=over_sequences(runs))
+        table = main_table(result)
         cells = parsed(markdown(table))["UfM\\*-Ensemble".replace("\\", "")]
         half = 2.776 * 250**0.5 / 5**0.5  # Student's t of four degrees of freedom, variance of 0, 10, ..., 40
         assert cells["energy [mJ] ↓"] == f"1927 ± {half:.0f}"  # 1857 of the network, 50 to 90 of the step
         assert cells["memory [MB] ↓"] == "1245"
         assert "memory on all sequences, energy on 5 of them" in table.notes[-1]
-        assert found.efficiency["rows"][0]["latency"]["multiview"]["median_ms"] == 24.0
-        assert found.efficiency["sequence"]["name"] == "5 sequences"
+        assert result.efficiency["rows"][0]["latency"]["multiview"]["median_ms"] == 24.0
+        assert result.efficiency["sequence"]["name"] == "5 sequences"
         without = over_sequences({("d", "s"): measured_line(mvd=(24.0, None), dnn=(252.0, None))})
         assert without["sequences"][0]["energy_mj"] == {"UfM*-Ensemble": None}
 
     def test_table_2_stands_below_what_was_measured(self, tmp_path):
-        found = in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}, efficiency=measured_line())
-        written = write_tables(replace(found, out=tmp_path))
+        result = in_memory({(ALONE, ("d", "s")): {"nll": 1.0}}, efficiency=measured_line())
+        written = write_tables(replace(result, out=tmp_path))
         assert {tmp_path / "tables" / f"efficiency.{kind}" for kind in ("md", "tex", "csv")} <= set(written)
         text = (tmp_path / "tables" / "efficiency.md").read_text()
         ours, theirs = text.split("### ")[1:]

@@ -73,17 +73,17 @@ def test_resampling_by_rays_equals_the_preprocessing_of_depth(size, preprocess):
     K = torch.tensor([[500.3, 0, 310.7], [0, 497.9, 244.1], [0, 0, 1]], dtype=torch.float64)
     K_net = preprocess.apply_intrinsics(K, *size).numpy()
     expected = preprocess.apply_depth(labels).numpy()
-    found = resample_nearest(labels.numpy(), K.numpy(), K_net, expected.shape)
-    np.testing.assert_array_equal(found, expected)
+    actual = resample_nearest(labels.numpy(), K.numpy(), K_net, expected.shape)
+    np.testing.assert_array_equal(actual, expected)
 
 
 def test_outside_of_the_other_camera_there_is_nothing():
     K = np.diag([10.0, 10.0, 1.0])
     shifted = K + np.array([[0, 0, 2.0], [0, 0, 1.0], [0, 0, 0]])
-    found = resample_nearest(np.ones((2, 3)), K, shifted, (4, 6))
+    actual = resample_nearest(np.ones((2, 3)), K, shifted, (4, 6))
     expected = np.zeros((4, 6))
     expected[1:3, 2:5] = 1
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(actual, expected)
 
 
 def test_scannet_depth_is_brought_to_the_colour_camera(tmp_path):
@@ -95,12 +95,12 @@ def test_scannet_depth_is_brought_to_the_colour_camera(tmp_path):
         (40, 54),
         Preprocess(size=(40, 54)).apply_intrinsics(torch.from_numpy(frame.intrinsics), *frame.image.shape[:2]),
     )
-    found = truth_at(frame, K.numpy(), size)
+    actual = truth_at(frame, K.numpy(), size)
     expected = render(of_color.T_world_cam[1], K.numpy(), *size)
-    both = found > 0
+    both = actual > 0
     assert both.mean() > 0.85  # the depth camera sees a little less than the colour camera
     # Nearest pixels: exact but for the slant of the surfaces within a pixel, and a few pixels at edges.
-    off = np.abs(found - expected)[both] / expected[both]
+    off = np.abs(actual - expected)[both] / expected[both]
     assert np.quantile(off, 0.9) < 0.02
     assert np.median(off) < 0.006
 
@@ -162,18 +162,18 @@ def test_a_run_equals_a_loop_by_hand(scene, tmp_path):
 
 
 def test_the_summary_says_what_it_came_from(path, tmp_path):
-    said = run(network_job(path, frames=slice(0, 4, 2)), tmp_path / "out")
-    assert said == read_summary(tmp_path / "out")
-    assert (said["state"], said["reason"]) == ("finished", "2 of 2 frames")
-    assert said["sequence"]["name"] == "walk"
-    assert said["sequence"]["layout"] == "generic"
-    assert said["settings"] == {"note": "a test"}
-    assert {"ufmstar-torch", "torch", "numpy", "numba", "python", "platform"} <= said["versions"].keys()
-    assert said["network_alone"] is None
-    assert "without a variance" in said["network_alone_reason"]
-    assert all(said["time"]["median_ms"][stage] > 0 for stage in ("read", "network", "ufm", "metrics", "write"))
-    assert said["time"]["frames_per_second"] > 0
-    assert said["mixture"]["bytes_allocated"] >= said["mixture"]["bytes_in_use"] > 0
+    text = run(network_job(path, frames=slice(0, 4, 2)), tmp_path / "out")
+    assert text == read_summary(tmp_path / "out")
+    assert (text["state"], text["reason"]) == ("finished", "2 of 2 frames")
+    assert text["sequence"]["name"] == "walk"
+    assert text["sequence"]["layout"] == "generic"
+    assert text["settings"] == {"note": "a test"}
+    assert {"ufmstar-torch", "torch", "numpy", "numba", "python", "platform"} <= text["versions"].keys()
+    assert text["network_alone"] is None
+    assert "without a variance" in text["network_alone_reason"]
+    assert all(text["time"]["median_ms"][stage] > 0 for stage in ("read", "network", "ufm", "metrics", "write"))
+    assert text["time"]["frames_per_second"] > 0
+    assert text["mixture"]["bytes_allocated"] >= text["mixture"]["bytes_in_use"] > 0
     lines = [json.loads(line) for line in (tmp_path / "out" / "frames.jsonl").read_text().splitlines()]
     assert [line["name"] for line in lines] == ["7", "9"]
     # The intrinsics of the written maps: those of 24x32 images, from 48x64 ones.

@@ -84,9 +84,9 @@ def test_a_run_with_maps_equals_a_loop_by_hand(tour, finished):
     out, summary = finished
     ufm, tracker, expected = UfMStar(ON), LandmarkTracker(), []
     for frame, record in zip(tour, records(out), strict=True):
-        found = too_far(frame)
+        actual = too_far(frame)
         landmarks = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
-        K, depth, a = (torch.from_numpy(x)[None] for x in (found.intrinsics, found.depth, found.variance))
+        K, depth, a = (torch.from_numpy(x)[None] for x in (actual.intrinsics, actual.depth, actual.variance))
         anchors = landmarks.anchors(frame.intrinsics, K)
         result = ufm(depth, torch.from_numpy(frame.T_world_cam)[None], K, a, anchors=anchors)
         stored = read_frame(out / "frames" / f"{frame.name}.npz")
@@ -102,12 +102,14 @@ def test_a_run_with_maps_equals_a_loop_by_hand(tour, finished):
         assert record["mean_anchored"] == pytest.approx(float(result.anchored[result.valid].double().mean()), rel=1e-4)
         assert record["mean_bias"] == pytest.approx(float(result.bias[result.valid].double().mean()), rel=1e-4)
         expected.append([*counts, record["mean_anchored"], record["mean_bias"]])
-    told = summary["anchors"]
-    means = [told[f"{key}_per_frame"] for key in ("tracked", "found", "usable", "used")]
-    np.testing.assert_allclose([*means, told["mean_anchored"], told["mean_bias"]], np.mean(expected, axis=0), rtol=1e-6)
+    message = summary["anchors"]
+    means = [message[f"{key}_per_frame"] for key in ("tracked", "found", "usable", "used")]
+    np.testing.assert_allclose(
+        [*means, message["mean_anchored"], message["mean_bias"]], np.mean(expected, axis=0), rtol=1e-6
+    )
     used = [record["anchors"]["used"] for record in records(out)]
-    assert sum(told["frames_without"].values()) == used.count(0)
-    assert used[told["frames_before_the_first"]] > 0 == sum(used[: told["frames_before_the_first"]])
+    assert sum(message["frames_without"].values()) == used.count(0)
+    assert used[message["frames_before_the_first"]] > 0 == sum(used[: message["frames_before_the_first"]])
     # The last frame knows of the 30 %, if roughly, in images as small as these: 1/1.3 - 1 = -.23.
     assert -0.35 < records(out)[-1]["mean_bias"] < -0.12
     assert summary["time"]["median_ms"]["anchors"] > 0
@@ -146,10 +148,12 @@ def test_a_standing_camera_is_plain_ufm_star_and_the_summary_says_so(tour, tmp_p
     still = with_entries(tour, lambda i, e: dataclasses.replace(tour.entries[0], name=e.name) if i < 4 else None)
     summary = run(map_job(still), tmp_path / "on")
     run(map_job(still, OFF), tmp_path / "off")
-    told = summary["anchors"]
-    assert told["used_per_frame"] == told["found_per_frame"] == told["mean_anchored"] == told["mean_bias"] == 0
-    assert told["tracked_per_frame"] > 20
-    assert told["frames_without"] == {
+    message = summary["anchors"]
+    assert (
+        message["used_per_frame"] == message["found_per_frame"] == message["mean_anchored"] == message["mean_bias"] == 0
+    )
+    assert message["tracked_per_frame"] > 20
+    assert message["frames_without"] == {
         "no corner followed from the frame before": 1,
         "no parallax, or no track that fits the poses": 3,
     }
@@ -174,8 +178,8 @@ def test_what_was_learnt_stays_where_anchors_end(tour, finished, tmp_path):
     assert before < 6
     assert "3 x no corner followed" in run_table(summary)
     later = sum(summary["anchors"]["frames_without"].values()) - before
-    told = f"; {before} before the first anchors: plain UfM*; {later} later: with what was learnt before"
-    assert told in run_table(summary)
+    message = f"; {before} before the first anchors: plain UfM*; {later} later: with what was learnt before"
+    assert message in run_table(summary)
 
 
 @pytest.mark.parametrize(
@@ -233,14 +237,14 @@ def test_only_a_run_with_anchors_goes_on_with_anchors(tour, finished, tmp_path, 
 def test_the_flag(tmp_path, capfd):
     words = ["run", TOUR, "--depth", "self", "--anchors", "--ufm.disagreement", "overlap", "--no-video", "--no-sheet"]
     assert cli.main([*words, "--frames", ":5", "--out", str(tmp_path / "a")]) == 0
-    told = capfd.readouterr().out
+    printed = capfd.readouterr().out
     summary = read_summary(tmp_path / "a")
     assert summary["settings"]["anchors"] is True
     assert summary["settings"]["ufm"]["anchored"] is True
     assert summary["settings"]["ufm"]["disagreement"] == "overlap"
-    assert "UfM*, anchored  " in told
-    used, found = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
-    assert f"anchors: {used:.1f} used a frame, of {found:.1f} triangulated" in told
+    assert "UfM*, anchored  " in printed
+    used, result = (summary["anchors"][key] for key in ("used_per_frame", "found_per_frame"))
+    assert f"anchors: {used:.1f} used a frame, of {result:.1f} triangulated" in printed
     # Perfect depth has no bias to find; tracks in images as small as these err by some per cent.
     assert abs(summary["anchors"]["mean_bias"]) < 0.1
     assert summary["anchors"]["mean_anchored"] < 0.1

@@ -170,8 +170,8 @@ def test_pruning_at_the_boundary(tier):
         return int(mixture.components[0])
 
     for prune, expected in (("either", [1, 0, 0, 0]), ("both", [1, 1, 1, 0]), ("none", [1, 1, 1, 1])):
-        found = [kept(*limits, prune) for limits in ((240, 8), (241, 8), (240, 9), (241, 9))]
-        assert found == expected, prune
+        actual = [kept(*limits, prune) for limits in ((240, 8), (241, 8), (240, 9), (241, 9))]
+        assert actual == expected, prune
 
 
 @pytest.mark.parametrize("tier", TIERS)
@@ -253,9 +253,9 @@ def test_float32_with_centred_moments():
     assert float((labels == single).double().mean()) > 0.9999
     large = exact.weight[0] >= 200
     torch.testing.assert_close(mixture.mean[0][large], exact.mean[0][large], rtol=0, atol=1e-5)
-    expected, found = (torch.linalg.eigvalsh(m.covariance[0][large]) for m in (exact, mixture))
-    assert float(((found - expected).abs() / expected)[:, 0].max()) < 5e-4
-    torch.testing.assert_close(found, expected, rtol=5e-4, atol=0)
+    expected, actual = (torch.linalg.eigvalsh(m.covariance[0][large]) for m in (exact, mixture))
+    assert float(((actual - expected).abs() / expected)[:, 0].max()) < 5e-4
+    torch.testing.assert_close(actual, expected, rtol=5e-4, atol=0)
 
 
 def test_static_bounds_change_nothing(monkeypatch):
@@ -302,9 +302,9 @@ def test_cuda_agrees_and_never_waits():
     features = depth.nan_to_num()[:, None]
     torch.cuda.set_sync_debug_mode("error")
     try:
-        mixture, found = segment.spgf(depth, K, config, features=features)
+        mixture, actual = segment.spgf(depth, K, config, features=features)
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert torch.equal(found.cpu(), labels)
+    assert torch.equal(actual.cpu(), labels)
     for name, value in expected.padded(mixture.capacity).tensors().items():
         torch.testing.assert_close(mixture.tensors()[name].cpu(), value, rtol=1e-10, atol=1e-12)

@@ -38,11 +38,11 @@ def walk(tmp_path_factory):
 
 
 def test_a_good_sequence_has_no_problem(walk):
-    found = check_sequence(open_sequence(walk))
-    assert found.ok
-    assert found.problems == ()
-    assert found.error < 0.01
-    assert (found.pairs, found.gap, found.scale) == (8, 5, 1.0)
+    result = check_sequence(open_sequence(walk))
+    assert result.ok
+    assert result.problems == ()
+    assert result.error < 0.01
+    assert (result.pairs, result.gap, result.scale) == (8, 5, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -54,26 +54,26 @@ def test_a_good_sequence_has_no_problem(walk):
     ],
 )
 def test_pose_conventions_are_recognised(walk, spoil, wording):
-    found = check_sequence(with_poses(open_sequence(walk), spoil))
-    assert len(found.problems) == 1
-    assert wording in found.reading
-    assert f"the poses look {found.reading}" in found.problems[0]
-    assert found.best_error < 0.01 < found.error
+    result = check_sequence(with_poses(open_sequence(walk), spoil))
+    assert len(result.problems) == 1
+    assert wording in result.reading
+    assert f"the poses look {result.reading}" in result.problems[0]
+    assert result.best_error < 0.01 < result.error
 
 
 @pytest.mark.parametrize("factor", [0.2, 0.5, 5.0, 1000.0])
 def test_a_wrong_depth_scale_is_recognised(walk, factor):
-    found = check_sequence(open_sequence(walk, depth_scale=min(1.0, 1e-3 * factor)))
-    assert len(found.problems) == 1
-    assert ("too large" if factor > 1 else "too small") in found.problems[0]
-    assert found.scale == pytest.approx(1 / factor, rel=0.05)
+    result = check_sequence(open_sequence(walk, depth_scale=min(1.0, 1e-3 * factor)))
+    assert len(result.problems) == 1
+    assert ("too large" if factor > 1 else "too small") in result.problems[0]
+    assert result.scale == pytest.approx(1 / factor, rel=0.05)
 
 
 def test_both_at_once(walk):
-    found = check_sequence(with_poses(open_sequence(walk, depth_scale=2e-3), np.linalg.inv))
-    assert len(found.problems) == 2
-    assert "inverted" in found.reading
-    assert found.scale == pytest.approx(0.5, rel=0.05)
+    result = check_sequence(with_poses(open_sequence(walk, depth_scale=2e-3), np.linalg.inv))
+    assert len(result.problems) == 2
+    assert "inverted" in result.reading
+    assert result.scale == pytest.approx(0.5, rel=0.05)
 
 
 def test_nonsense_poses_fit_no_reading(walk):
@@ -82,27 +82,27 @@ def test_nonsense_poses_fit_no_reading(walk):
     def turned(T):
         return T @ look(rng.normal(0, 1, 3), *rng.normal(0, 0.4, 2))
 
-    found = check_sequence(with_poses(open_sequence(walk), turned))
-    assert not found.ok
-    assert any("disagree" in problem or "no two frames overlap" in problem for problem in found.problems)
+    result = check_sequence(with_poses(open_sequence(walk), turned))
+    assert not result.ok
+    assert any("disagree" in problem or "no two frames overlap" in problem for problem in result.problems)
 
 
 def test_a_camera_that_stands_still_leaves_it_undecided(walk):
     sequence = open_sequence(walk)
     still = dataclasses.replace(sequence, entries=(sequence.entries[3],) * 10)
-    found = check_sequence(still)
-    assert found.ok
-    assert any("tell the depth's scale" in text for text in found.undecided)
-    assert any("does not tell the poses from world-to-camera" in text for text in found.undecided)
+    result = check_sequence(still)
+    assert result.ok
+    assert any("tell the depth's scale" in text for text in result.undecided)
+    assert any("does not tell the poses from world-to-camera" in text for text in result.undecided)
 
 
 def test_unreadable_frames_are_told_and_left_out(tmp_path):
     path, _ = layouts.write_generic(tmp_path, frames=12)
     truncate(path / "images" / "7.png")
-    found = check_sequence(open_sequence(path))
-    assert found.ok
-    assert len(found.unreadable) == 1
-    assert "7.png" in found.unreadable[0]
+    result = check_sequence(open_sequence(path))
+    assert result.ok
+    assert len(result.unreadable) == 1
+    assert "7.png" in result.unreadable[0]
 
 
 def test_what_cannot_be_checked_is_refused(tmp_path):
@@ -118,17 +118,17 @@ def test_what_cannot_be_checked_is_refused(tmp_path):
 @pytest.mark.parametrize("writer", ["write_tum", "write_seven_scenes", "write_scannet", "write_tartanair"])
 def test_every_generated_layout_is_consistent(tmp_path, writer):
     path = getattr(layouts, writer)(tmp_path, frames=8)[0]
-    found = check_sequence(open_sequence(path))
-    assert found.ok
-    assert found.error < 0.02
-    assert "camera-to-world, x right" in found.reading
+    result = check_sequence(open_sequence(path))
+    assert result.ok
+    assert result.error < 0.02
+    assert "camera-to-world, x right" in result.reading
 
 
 def test_seven_scenes_unregistered_depth_is_consistent_with_its_own_camera(tmp_path):
     path = layouts.write_seven_scenes(tmp_path, frames=8)[0]
-    found = check_sequence(open_sequence(path, register=False))
-    assert found.ok
-    assert found.registration is None  # the sequence does not claim that depth lies on the images
+    result = check_sequence(open_sequence(path, register=False))
+    assert result.ok
+    assert result.registration is None  # the sequence does not claim that depth lies on the images
 
 
 def test_depth_edges_lie_on_the_near_side_and_planes_have_none():
@@ -161,8 +161,8 @@ def test_unregistered_depth_is_flagged():
     assert bad.zoom == pytest.approx(525 / 585, abs=0.03)
     assert bad.shift_x < 0
     moved = [np.roll(depth, (6, -8), axis=(0, 1)) for depth in truth.depths]  # what undoes it is found
-    found = depth_image_fit(zip(truth.images, moved, strict=True))
-    assert found.quality < 0.25
-    assert found.zoom == pytest.approx(1, abs=0.03)
-    assert found.shift_x - good.shift_x == pytest.approx(8, abs=2)  # steps of 2 px
-    assert found.shift_y - good.shift_y == pytest.approx(-6, abs=2)
+    result = depth_image_fit(zip(truth.images, moved, strict=True))
+    assert result.quality < 0.25
+    assert result.zoom == pytest.approx(1, abs=0.03)
+    assert result.shift_x - good.shift_x == pytest.approx(8, abs=2)  # steps of 2 px
+    assert result.shift_y - good.shift_y == pytest.approx(-6, abs=2)

@@ -160,10 +160,10 @@ def write_exr(path, channels, compression="ZIP", **header):
 
 @pytest.mark.parametrize("names", [("B", "G", "R", "Z"), ("A", "View.Depth.Z"), ("A", "B", "R"), ("whatever",)])
 def test_the_depth_channel_is_found(tmp_path, names):
-    wanted = next((n for n in names if n.endswith("Z")), "R" if "R" in names else names[0])
+    expected = next((n for n in names if n.endswith("Z")), "R" if "R" in names else names[0])
     channels = {name: RNG.uniform(1, 2, (4, 6)).astype(np.float32) for name in names}
     write_exr(tmp_path / "d.exr", channels)
-    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), channels[wanted])
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.exr"), channels[expected])
 
 
 @pytest.mark.parametrize("compression", ["NO", "PIZ", "ZIPS"])

@@ -64,9 +64,9 @@ def test_the_laser_gives_the_cameras_depth(written):
         expected[::2, ::3] = truth.depths[i][::2, ::3]
         np.testing.assert_array_equal(frame.depth > 0, expected > 0)
         np.testing.assert_allclose(frame.depth, expected, rtol=1e-5)
-    found = check_sequence(sequence)  # a sixth of the pixels is enough to compare
-    assert found.ok
-    assert found.error < 0.02
+    actual = check_sequence(sequence)  # a sixth of the pixels is enough to compare
+    assert actual.ok
+    assert actual.error < 0.02
 
 
 def test_neighbouring_scans_can_be_added(written):
@@ -104,9 +104,9 @@ def test_a_root_with_several_drives(root):
         open_sequence(root, drive=1)
     with pytest.raises(ValueError, match="drive goes with the dataset's root"):
         open_sequence(root / "data_2d_raw" / DRIVE, drive=7)
-    found = find_sequences(root.parent)
-    assert [one.name for one in found] == [f"KITTI-360__data_2d_raw__{name}" for name in (DRIVE, other)]
-    assert {one.layout for one in found} == {"kitti360"}
+    result = find_sequences(root.parent)
+    assert [one.name for one in result] == [f"KITTI-360__data_2d_raw__{name}" for name in (DRIVE, other)]
+    assert {one.layout for one in result} == {"kitti360"}
 
 
 def test_the_right_camera(tmp_path):

@@ -59,8 +59,8 @@ def test_parts_and_scenes(written):
     assert open_sequence(root / "val" / "office_2").names == NAMES[2:]
     assert open_sequence(root / "val" / "office_2").name == "nyu_val_office_2"
     assert open_sequence(root / "train").names == ("den__1",)
-    found = find_sequences(root.parent)  # one set, not one per scene, and not the training part
-    assert [(one.name, one.layout, one.path) for one in found] == [("nyudepthv2__val", "nyu", root / "val")]
+    result = find_sequences(root.parent)  # one set, not one per scene, and not the training part
+    assert [(one.name, one.layout, one.path) for one in result] == [("nyudepthv2__val", "nyu", root / "val")]
 
 
 def test_the_validation_crop_is_the_fields(written):
@@ -136,7 +136,7 @@ def test_an_evaluation_refuses_rows_that_compare_views(written):
 
 
 def test_the_check_says_so(written):
-    found = check_sequence(open_sequence(written[0]))
-    assert found.ok
-    assert found.pairs == 0
-    assert found.undecided[0] == "there are no poses: methods that compare views cannot be run"
+    result = check_sequence(open_sequence(written[0]))
+    assert result.ok
+    assert result.pairs == 0
+    assert result.undecided[0] == "there are no poses: methods that compare views cannot be run"

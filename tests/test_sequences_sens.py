@@ -33,13 +33,13 @@ def file(written, tmp_path):
 
 def frame_offsets(path):
     """Where each frame begins, by the sizes in the file alone."""
-    data, here, found = path.read_bytes(), HEADER, []
+    data, here, result = path.read_bytes(), HEADER, []
     for _ in range(struct.unpack_from("<Q", data, HEADER - 8)[0]):
-        found.append(here)
+        result.append(here)
         color, depth = struct.unpack_from("<2Q", data, here + 64 + 16)
         here += FRAME + color + depth
     assert here == len(data) - 8  # the number of IMU frames
-    return found
+    return result
 
 
 def test_what_is_read_is_what_was_written(written):
@@ -150,10 +150,10 @@ def test_broken_frames_are_found_when_decoding(file):
     file.write_bytes(data)
     errors = []
     assert list(open_sequence(file).readable(errors.append)) == []
-    told = [str(error) for error in errors]
-    assert "cannot be decoded" in told[0]
-    assert "depth map at byte" in told[1]
-    assert "has 6144 bytes, expected 64x47 of 2" in told[2]
+    message = [str(error) for error in errors]
+    assert "cannot be decoded" in message[0]
+    assert "depth map at byte" in message[1]
+    assert "has 6144 bytes, expected 64x47 of 2" in message[2]
     struct.pack_into("<2I", data, HEADER - 8 - 4 - 16, 161, 121)
     file.write_bytes(data)
     with pytest.raises(FrameError, match="the image is 162x121, the sequence's are 161x121"):

@@ -36,10 +36,10 @@ def warped_error(a, b):
     column, row = np.rint(fx * x[front] / z[front] + cx), np.rint(fy * y[front] / z[front] + cy)
     z = z[front]
     inside = (column >= 0) & (column < b.depth.shape[1]) & (row >= 0) & (row < b.depth.shape[0])
-    there = b.depth[row[inside].astype(int), column[inside].astype(int)]
-    valid = there > 0
+    present = b.depth[row[inside].astype(int), column[inside].astype(int)]
+    valid = present > 0
     assert valid.sum() > 0.1 * len(v)
-    return np.median(np.abs(z[inside][valid] - there[valid]) / there[valid])
+    return np.median(np.abs(z[inside][valid] - present[valid]) / present[valid])
 
 
 def test_depth_agrees_five_frames_on(recording):
@@ -58,21 +58,21 @@ def test_depth_agrees_five_frames_on(recording):
 
 
 def test_the_check_finds_nothing_wrong(recording):
-    found = check_sequence(open_sequence(recording[0]))
-    assert found.ok
-    assert found.undecided == ()
-    assert found.error < 0.02
+    result = check_sequence(open_sequence(recording[0]))
+    assert result.ok
+    assert result.undecided == ()
+    assert result.error < 0.02
 
 
 def test_the_check_recognises_inverted_poses_and_wrong_scale(recording):
     path, _, _, _, wrong_scale, factor = recording
     sequence = open_sequence(path)
     entries = tuple(dataclasses.replace(e, T_world_cam=np.linalg.inv(e.T_world_cam)) for e in sequence.entries)
-    found = check_sequence(dataclasses.replace(sequence, entries=entries))
-    assert [problem.startswith("the poses look world-to-camera") for problem in found.problems] == [True]
-    found = check_sequence(open_sequence(path, depth_scale=wrong_scale))
-    assert [problem.startswith("depth looks too") for problem in found.problems] == [True]
-    assert found.scale == pytest.approx(1 / factor, rel=0.1)
+    result = check_sequence(dataclasses.replace(sequence, entries=entries))
+    assert [problem.startswith("the poses look world-to-camera") for problem in result.problems] == [True]
+    result = check_sequence(open_sequence(path, depth_scale=wrong_scale))
+    assert [problem.startswith("depth looks too") for problem in result.problems] == [True]
+    assert result.scale == pytest.approx(1 / factor, rel=0.1)
 
 
 def test_mocap_that_starts_late(tmp_path):

@@ -124,10 +124,10 @@ def test_the_method_decides_the_head(name):
     spec = replace(SMALL, method=name, dropout=0.2, members=3 if several else 1)
     network = build_network(spec).eval()
     image = torch.rand(2, 3, 32, 64)
-    told = network.distribution(image)
+    message = network.distribution(image)
     expected = {"depth": PointDepth, "evidential": EvidentialDepth}.get(name, GaussianDepth)
-    assert type(told) is expected
-    assert told.depth.shape == (6 if several else 2, 32, 64)
+    assert type(message) is expected
+    assert message.depth.shape == (6 if several else 2, 32, 64)
     assert isinstance(network, BatchEnsemble) == several
     if name == "mc_dropout":
         assert (network(image).depth == network(image).depth).all()  # samples only within its wrapper

@@ -49,26 +49,26 @@ def frames(count: int, config: UfMStarConfig, dtype: torch.dtype, streams: int =
             more["valid"] = torch.rand(depth.shape, generator=generator) > 0.1
         if config.anchored:
             at = torch.randint(0, 48, (streams, 20, 2), generator=generator)
-            there = torch.stack([depth[s, at[s, :, 1], at[s, :, 0]] for s in range(streams)]).double()
-            more["anchors"] = Anchors(at.double(), 1.1 * there, 1e-4 * there.square())
+            present = torch.stack([depth[s, at[s, :, 1], at[s, :, 0]] for s in range(streams)]).double()
+            more["anchors"] = Anchors(at.double(), 1.1 * present, 1e-4 * present.square())
         yield (depth, pose, K), more
 
 
 def tensors(out) -> dict[str, torch.Tensor]:
     """What a frame returned, by name."""
-    found = {f"statistics.{name}": value for name, value in vars(out.statistics).items()}
-    found |= {f"current_cam.{name}": value for name, value in out.current_cam.tensors().items()}
-    return {name: value for name, value in (found | vars(out)).items() if isinstance(value, torch.Tensor)}
+    result = {f"statistics.{name}": value for name, value in vars(out.statistics).items()}
+    result |= {f"current_cam.{name}": value for name, value in out.current_cam.tensors().items()}
+    return {name: value for name, value in (result | vars(out)).items() if isinstance(value, torch.Tensor)}
 
 
 def assert_same(one, other, rows=slice(None)) -> None:
     """Equal to the last bit, C_i up to its padding."""
     a, b = tensors(one), tensors(other)
     for name, value in a.items():
-        there = b[name][rows]
+        present = b[name][rows]
         if name.startswith("current_cam"):
-            there = there[:, : value.shape[1]]
-        assert torch.equal(value.double().nan_to_num(-1), there.double().nan_to_num(-1)), name
+            present = present[:, : value.shape[1]]
+        assert torch.equal(value.double().nan_to_num(-1), present.double().nan_to_num(-1)), name
 
 
 @pytest.mark.parametrize("name", CONFIGS)

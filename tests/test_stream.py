@@ -164,16 +164,16 @@ def test_it_stops_between_frames_and_goes_on(sequence):
 
 def rows_with_memory():
     """UfM* with anchors that are tracked at drifting poses, UfM, and a row that leaves images out."""
-    wanted = [
+    expected = [
         row("UfM*-DepthOnly", anchors="tracked", rotation_drift=0.3, translation_drift=0.01, seed=2),
         row("UfM*-DepthOnly", anchors="tracked", rotation_drift=0.3, translation_drift=0.01, seed=2, corrected=True),
         row("UfM-DepthOnly"),
         row("UfM*-DepthOnly", skip=1),
     ]
-    anchors, source = anchor_sources(wanted), networks(Brightness(1.0), Brightness(1.1))
+    anchors, source = anchor_sources(expected), networks(Brightness(1.0), Brightness(1.1))
     return [
         RowRunner(one.slug, source, make_estimator(one, CPU), setting=one.setting, anchors=anchors.get(one))
-        for one in wanted
+        for one in expected
     ]
 
 
@@ -192,10 +192,10 @@ def test_a_state_taken_at_any_frame_gives_the_same_bits(tour):
         again = Recorded("again", [])
         stream.drive([again])
         assert len(again.results) == FRAMES - start
-        for expected, found in zip(sink.results[start:], again.results, strict=True):
-            assert found.rows.keys() == expected.rows.keys()
+        for expected, actual in zip(sink.results[start:], again.results, strict=True):
+            assert actual.rows.keys() == expected.rows.keys()
             for key, one in expected.rows.items():
-                other = found.rows[key]
+                other = actual.rows[key]
                 assert other.member == one.member
                 np.testing.assert_array_equal(other.T_world_cam, one.T_world_cam)
                 np.testing.assert_array_equal(other.estimate.variance.numpy(), one.estimate.variance.numpy())

@@ -187,23 +187,23 @@ def test_suites_and_words(tmp_path):
 
 @pytest.mark.parametrize("corrected", [False, True])
 def test_tracked_rows_equal_the_tracker_and_ufm_star_by_hand(tour, networks, corrected):
-    wanted = row(NAME, anchors="tracked", corrected=corrected)
-    found = evaluate(tour, [row(NAME), wanted], networks)[wanted.slug]
+    target = row(NAME, anchors="tracked", corrected=corrected)
+    actual = evaluate(tour, [row(NAME), target], networks)[target.slug]
     expected, used = by_hand(tour, networks["depth_only"], tracked_by(LandmarkTracker()), corrected=corrected)
     assert used > 3
-    assert_agrees(found, expected, used)
-    assert found.ms["anchors"] > 0
+    assert_agrees(actual, expected, used)
+    assert actual.ms["anchors"] > 0
     plain = UfMStar(UfMStarConfig(on_bad_frame="skip"))
-    assert found.state["bytes_end"] > found.state["count_end"] * plain.mixture.bytes_per_component()
+    assert actual.state["bytes_end"] > actual.state["count_end"] * plain.mixture.bytes_per_component()
 
 
 def test_the_tracker_sees_the_noisy_poses_and_the_chosen_images(tour, networks):
     noise = {"rotation_noise": 0.3, "translation_noise": 0.01, "seed": 5}
     noisy, sparse = row(NAME, anchors="tracked", **noise), row(NAME, anchors="tracked", skip=1)
-    found = evaluate(tour, [row(NAME, anchors="tracked"), noisy, sparse], networks)
+    result = evaluate(tour, [row(NAME, anchors="tracked"), noisy, sparse], networks)
     for one in (noisy, sparse):
         by = tracked_by(LandmarkTracker())
-        assert_agrees(found[one.slug], *by_hand(tour, networks["depth_only"], by, setting=one.setting))
+        assert_agrees(result[one.slug], *by_hand(tour, networks["depth_only"], by, setting=one.setting))
     # And not the exact ones.
     tracker = LandmarkTracker()
     exact = by_hand(
@@ -212,7 +212,7 @@ def test_the_tracker_sees_the_noisy_poses_and_the_chosen_images(tour, networks):
         lambda frame, T, p, truth: tracked_by(tracker)(frame, frame.T_world_cam, p, truth),
         setting=noisy.setting,
     )
-    assert exact[0]["ece_delta"] != pytest.approx(found[noisy.slug].figures["ece_delta"], rel=1e-6)
+    assert exact[0]["ece_delta"] != pytest.approx(result[noisy.slug].figures["ece_delta"], rel=1e-6)
 
 
 def test_no_anchors_at_most_is_plain_ufm_star(tour, networks):
@@ -243,9 +243,9 @@ def test_truth_is_exact_at_random_pixels_and_more_hold_the_fewer(tour):
 
     def drawn(count, seed=0):
         source = AnchorSource(Setting(anchors="truth", anchor_count=count, seed=seed), None)
-        found = source.of(frame, frame.T_world_cam, p, truth)
-        assert found.ms is None
-        return found.anchors
+        result = source.of(frame, frame.T_world_cam, p, truth)
+        assert result.ms is None
+        return result.anchors
 
     few, many, default = drawn(20), drawn(300), drawn(None)
     assert [a.depth.shape[1] for a in (few, many, default)] == [20, 300, 100]
@@ -266,10 +266,10 @@ def test_track_noise_has_the_size_that_the_tracker_states_for_it(tour):
         pair = []
         for size, own in zip((0.0, 0.5), tracks, strict=True):
             source = AnchorSource(Setting(anchors="tracked", track_noise=size), own)
-            found = source.of(frame, frame.T_world_cam, p, None)
-            assert isinstance(found.anchors, Anchors)
-            assert found.ms > 0
-            pair.append(found.anchors)
+            result = source.of(frame, frame.T_world_cam, p, None)
+            assert isinstance(result.anchors, Anchors)
+            assert result.ms > 0
+            pair.append(result.anchors)
         assert torch.equal(pair[0].variance, pair[1].variance), "the tracker does not know of the noise"
         clean.append(torch.cat([pair[0].pixel, pair[0].depth[..., None]], -1)[0])
         noisy.append(torch.cat([pair[1].pixel, pair[1].depth[..., None]], -1)[0])
@@ -292,7 +292,7 @@ def test_rows_of_the_same_poses_share_a_tracker():
 def test_tracking_needs_images(tour):
     blind = replace(tour, entries=tuple(replace(entry, load_image=None) for entry in tour.entries))
     networks = {"depth_only": Biased()}
-    found = evaluate(blind, [row(NAME), row(NAME, anchors="truth")], networks)
-    assert all(result.frames["judged"] == 10 for result in found.values())
+    outcome = evaluate(blind, [row(NAME), row(NAME, anchors="truth")], networks)
+    assert all(result.frames["judged"] == 10 for result in outcome.values())
     with pytest.raises(Exception, match="no image"):
         evaluate(blind, [row(NAME, anchors="tracked")], networks)

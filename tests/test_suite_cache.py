@@ -27,8 +27,8 @@ def path(tmp_path_factory):
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory):
     written = write_networks(tmp_path_factory.mktemp("networks"))
-    wanted = {one.method.base for one in ROWS}
-    return {base: base_network(text, samples=3) for base, text in written.items() if base in wanted}
+    expected = {one.method.base for one in ROWS}
+    return {base: base_network(text, samples=3) for base, text in written.items() if base in expected}
 
 
 def maps(seed=0):
@@ -111,11 +111,11 @@ def test_from_the_cache_everything_is_as_from_the_networks(path, networks, tmp_p
     sequence, cache = open_sequence(path), PredictionCache(tmp_path)
     without = evaluate(sequence, ROWS, networks)
     first = evaluate(sequence, ROWS, networks, cache)
-    asked = 4 * 6  # frames, and predictions of each: ensemble all and one, MC-Dropout both, two networks
-    assert (cache.hits, cache.misses) == (0, asked)
+    requested = 4 * 6  # frames, and predictions of each: ensemble all and one, MC-Dropout both, two networks
+    assert (cache.hits, cache.misses) == (0, requested)
     again = PredictionCache(tmp_path)
     second = evaluate(sequence, ROWS, networks, again)
-    assert (again.hits, again.misses, again.damaged) == (asked, 0, 0)
+    assert (again.hits, again.misses, again.damaged) == (requested, 0, 0)
     for slug, result in without.items():
         assert same(result, first[slug])
         assert same(result, second[slug])

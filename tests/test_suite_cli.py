@@ -32,8 +32,8 @@ def ufmstar(capfd, monkeypatch):
     def call(*words):
         capfd.readouterr()
         code = cli.main([str(word) for word in words])
-        told = capfd.readouterr()
-        return code, told.out, told.err
+        printed = capfd.readouterr()
+        return code, printed.out, printed.err
 
     return call
 

@@ -83,8 +83,8 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     )
     given = {"network": network, "suite": str(tmp_path / "some.toml")}
     before = torch.get_num_threads()
-    ended, told = quiet(options_for(rooms, tmp_path / "two", "--processes", "2", "--threads", "1", **given))
-    assert (ended.finished, ended.stopped, dict(ended.failed), ended.left) == (True, False, {}, 0), told
+    ended, message = quiet(options_for(rooms, tmp_path / "two", "--processes", "2", "--threads", "1", **given))
+    assert (ended.finished, ended.stopped, dict(ended.failed), ended.left) == (True, False, {}, 0), message
     try:
         torch.set_num_threads(1)
         quiet(options_for(rooms, tmp_path / "one", **given))
@@ -119,9 +119,9 @@ def scripted(tmp_path, text, stop, count=3):
 
 @pytest.mark.slow
 def test_a_pool_that_is_stopped_tells_all_its_processes(tmp_path):
-    ended, told = scripted(tmp_path, SCRIPT, lambda: len(list(tmp_path.glob("pid*"))) == 3)
+    ended, message = scripted(tmp_path, SCRIPT, lambda: len(list(tmp_path.glob("pid*"))) == 3)
     assert not ended
-    assert told == []
+    assert message == []
     assert {path.name for path in tmp_path.glob("ended*")} == {"ended1", "ended2", "ended3"}
 
 
@@ -191,13 +191,13 @@ def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(roo
     children = [fork.Process(target=as_rank, args=(rank, 2, options, results)) for rank in range(2)]
     for child in children:
         child.start()
-    found = sorted(results.get(timeout=60) for _ in children)
+    result = sorted(results.get(timeout=60) for _ in children)
     for child in children:
         child.join(60)
-    assert [rank[:2] for rank in found] == [(0, True), (1, True)]
-    assert found[0][2:4] == (0, True)
-    assert not found[1][3]
-    assert sorted(found[0][4] + found[1][4]) == list(NAMES)
+    assert [rank[:2] for rank in result] == [(0, True), (1, True)]
+    assert result[0][2:4] == (0, True)
+    assert not result[1][3]
+    assert sorted(result[0][4] + result[1][4]) == list(NAMES)
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")))
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
@@ -264,9 +264,9 @@ def test_jobs_through_submitit(rooms, tmp_path):
     options = options_for(
         rooms, tmp_path / "out", "--slurm", "cluster=debug", "jobs=2", "partition=gpu", "timeout_min=5"
     )
-    ended, told = quiet(options)
+    ended, message = quiet(options)
     assert (ended.finished, ended.left) == (True, 0)
-    assert told[0].startswith("jobs ")
+    assert message[0].startswith("jobs ")
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")), evaluate_sequence)
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
@@ -277,7 +277,7 @@ def test_what_slurm_is_told():
     assert dict(slurm_.parameters) == {
         "slurm_partition": "gpu", "mem_gb": 16, "slurm_qos": "high", "slurm_gres": "gpu:1"
     }  # fmt: skip
-    for words, told in (
+    for words, message in (
         (["gpu"], "KEY=VALUE"),
         (["a=1", "a=2"], "each key once"),
         (["jobs=0"], "at least 1"),
@@ -285,7 +285,7 @@ def test_what_slurm_is_told():
         (["cluster=moon"], "slurm, local or debug"),
         (["nodes=2"], "jobs=N sets their number"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             Slurm.parse(words)
 
 

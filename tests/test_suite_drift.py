@@ -71,18 +71,18 @@ def test_without_drift_poses_stay_themselves():
 
 @pytest.mark.parametrize("first", [0, 9])
 def test_the_first_pose_is_exact_and_all_are_poses(first):
-    found = drifted(BOTH, range(first, len(WALK)))
-    np.testing.assert_array_equal(found[0], WALK[first])
-    R = found[:, :3, :3]
+    result = drifted(BOTH, range(first, len(WALK)))
+    np.testing.assert_array_equal(result[0], WALK[first])
+    R = result[:, :3, :3]
     np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-12)
     assert (np.linalg.det(R) > 0).all()
-    np.testing.assert_allclose(found[:, 3], np.tile([0, 0, 0, 1.0], (len(R), 1)), atol=1e-14)
+    np.testing.assert_allclose(result[:, 3], np.tile([0, 0, 0, 1.0], (len(R), 1)), atol=1e-14)
 
 
 def test_a_step_has_the_noise_that_was_asked_for():
     """Of the pose relative to the frame before, whatever path and orientation the walk has come to."""
-    found = [noise(Setting(rotation_drift=2.0, translation_drift=0.05, seed=seed)) for seed in range(12)]
-    turned, moved = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    result = [noise(Setting(rotation_drift=2.0, translation_drift=0.05, seed=seed)) for seed in range(12)]
+    turned, moved = (np.concatenate(parts) for parts in zip(*result, strict=True))
     for values, deviation in ((turned, math.radians(2)), (moved, 0.05)):
         assert kstest(values.ravel() / deviation, "norm").pvalue > 0.01
     together = np.corrcoef(np.hstack([turned, moved]).T) - np.eye(6)

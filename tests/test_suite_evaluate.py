@@ -101,22 +101,22 @@ def test_a_row_equals_a_loop_by_hand(base, texts, networks, sequence):
     behind = {"ensemble": "Ensemble", "batch_ensemble": "BatchEnsemble", "depth_only": "DepthOnly"}
     name = behind.get(base, base.capitalize())
     rows = [row(f"UfM*-{name}"), row(f"UfM-{name}"), row(f"UfM-{name}-1K")]
-    found = evaluate(sequence, rows, networks)
+    result = evaluate(sequence, rows, networks)
     hands = [UfMStar(SKIP), UfM(UfMConfig(max_points=None)), UfM(UfMConfig(max_points=1000))]
     for one, estimator in zip(rows, hands, strict=True):
         by_hand = judged(sequence, through(estimator, members, sequence))
-        assert agrees(found[one.slug].figures, by_hand)
+        assert agrees(result[one.slug].figures, by_hand)
     ufm, components = hands[2], int(hands[0].mixture.components)
-    assert found[rows[2].slug].state["bytes_end"] == 40 * int(ufm.points) == 40_000
-    assert found[rows[0].slug].state["count_end"] == components
-    assert found[rows[0].slug].state["bytes_end"] == 64 * components
-    assert found[rows[0].slug].state["smoothing_bytes"] == 4 * 32 * 64
+    assert result[rows[2].slug].state["bytes_end"] == 40 * int(ufm.points) == 40_000
+    assert result[rows[0].slug].state["count_end"] == components
+    assert result[rows[0].slug].state["bytes_end"] == 64 * components
+    assert result[rows[0].slug].state["smoothing_bytes"] == 4 * 32 * 64
 
 
 def test_full_and_alone_put_the_members_together(texts, networks, sequence):
     members = members_of(texts["ensemble"])
     rows = [row("Ensemble"), row("UfM*-FullEnsemble"), row("UfM*-Ensemble")]
-    found = evaluate(sequence, rows, networks)
+    result = evaluate(sequence, rows, networks)
     full = UncertainDepth(members, SKIP, mode="full", preprocess=members[0].preprocess)
     alternating = UncertainDepth(members, SKIP, preprocess=members[0].preprocess)
 
@@ -134,36 +134,36 @@ def test_full_and_alone_put_the_members_together(texts, networks, sequence):
             variance = variance + (depths.square().mean(0) - depths.mean(0).square())
             yield depths.mean(0), variance, torch.ones_like(variance, dtype=torch.bool), K
 
-    assert agrees(found["UfMstar-FullEnsemble"].figures, judged(sequence, piped(full)))
-    assert agrees(found["UfMstar-Ensemble"].figures, judged(sequence, piped(alternating)))
+    assert agrees(result["UfMstar-FullEnsemble"].figures, judged(sequence, piped(full)))
+    assert agrees(result["UfMstar-Ensemble"].figures, judged(sequence, piped(alternating)))
     by_hand = judged(sequence, alone())
     for name in ("delta1", "rmse", "nll", "ece_delta", "ece_q"):
-        assert found["Ensemble"].figures[name] == pytest.approx(by_hand[name], abs=2e-3)
-    assert found["Ensemble"].state == {}
-    assert found["Ensemble"].figures["delta1"] == found["UfMstar-FullEnsemble"].figures["delta1"]
+        assert result["Ensemble"].figures[name] == pytest.approx(by_hand[name], abs=2e-3)
+    assert result["Ensemble"].state == {}
+    assert result["Ensemble"].figures["delta1"] == result["UfMstar-FullEnsemble"].figures["delta1"]
 
 
 def test_depth_only_ignores_variances(texts, sequence):
     with_head = base_network(texts["aleatoric"].replace("aleatoric", "depth_only", 1))
     rows = [row("DepthOnly"), row("UfM*-DepthOnly")]
-    found = evaluate(sequence, rows, {"depth_only": with_head})
-    assert {"delta1", "rmse", "abs_rel"} < found["DepthOnly"].figures.keys()
-    assert not {"nll", "ece_delta", "spearman"} & found["DepthOnly"].figures.keys(), "it has no variance"
-    assert list(found["DepthOnly"].sums) == ["metrics"]
+    result = evaluate(sequence, rows, {"depth_only": with_head})
+    assert {"delta1", "rmse", "abs_rel"} < result["DepthOnly"].figures.keys()
+    assert not {"nll", "ece_delta", "spearman"} & result["DepthOnly"].figures.keys(), "it has no variance"
+    assert list(result["DepthOnly"].sums) == ["metrics"]
     members = members_of(texts["aleatoric"])
     by_hand = judged(sequence, through(UfMStar(SKIP), members, sequence, aleatoric=False))
-    assert agrees(found["UfMstar-DepthOnly"].figures, by_hand)
+    assert agrees(result["UfMstar-DepthOnly"].figures, by_hand)
 
 
 def test_ground_truth_as_prediction_shows_the_floor(sequence):
     floor = {"depth_only": base_network("depth_only=ground-truth:24x32")}
-    found = evaluate(sequence, [row("UfM*-DepthOnly"), row("DepthOnly")], floor)
-    assert found["DepthOnly"].figures["rmse"] == 0
-    assert found["DepthOnly"].figures["delta1"] == 1
-    assert found["UfMstar-DepthOnly"].figures["rmse"] == 0
-    assert np.isfinite(found["UfMstar-DepthOnly"].figures["nll"])
-    assert found["UfMstar-DepthOnly"].state["smoothing_bytes"] == 4 * 24 * 32
-    assert "network" not in found["UfMstar-DepthOnly"].ms, "no network ran"
+    result = evaluate(sequence, [row("UfM*-DepthOnly"), row("DepthOnly")], floor)
+    assert result["DepthOnly"].figures["rmse"] == 0
+    assert result["DepthOnly"].figures["delta1"] == 1
+    assert result["UfMstar-DepthOnly"].figures["rmse"] == 0
+    assert np.isfinite(result["UfMstar-DepthOnly"].figures["nll"])
+    assert result["UfMstar-DepthOnly"].state["smoothing_bytes"] == 4 * 24 * 32
+    assert "network" not in result["UfMstar-DepthOnly"].ms, "no network ran"
 
 
 # ---- MC-Dropout ----
@@ -172,10 +172,10 @@ def test_ground_truth_as_prediction_shows_the_floor(sequence):
 def test_samples_depend_on_the_frame_and_their_number_alone(texts, networks, sequence):
     network = networks["mc_dropout"]
     frames = [sequence[i] for i in range(3)]
-    asked = [(2, 1), (0, 0), (1, 2), (0, 1), (2, 0), (2, 1), (0, 0)]
-    first = {key: network.one(frames[key[0]], key[1]).depth for key in asked}
+    requested = [(2, 1), (0, 0), (1, 2), (0, 1), (2, 0), (2, 1), (0, 0)]
+    first = {key: network.one(frames[key[0]], key[1]).depth for key in requested}
     other = base_network(texts["mc_dropout"], samples=3)
-    for key in reversed(asked):
+    for key in reversed(requested):
         assert torch.equal(other.one(frames[key[0]], key[1]).depth, first[key])
     assert not torch.equal(first[0, 0], first[0, 1])
     same_image = replace(frames[0], index=1)
@@ -183,7 +183,7 @@ def test_samples_depend_on_the_frame_and_their_number_alone(texts, networks, seq
 
 
 def test_mc_dropout_equals_seeded_passes_by_hand(texts, networks, sequence):
-    found = evaluate(sequence, [row("UfM*-MCD"), row("MC-Dropout"), row("UfM*-FullMCD")], networks)
+    result = evaluate(sequence, [row("UfM*-MCD"), row("MC-Dropout"), row("UfM*-FullMCD")], networks)
     [member] = members_of(texts["mc_dropout"])
     generator = torch.Generator()
     set_sampling(member, True, generator)
@@ -204,9 +204,9 @@ def test_mc_dropout_equals_seeded_passes_by_hand(texts, networks, sequence):
                 out = ufm(p.depth, pose, K, p.aleatoric_variance, p.epistemic_variance)
                 yield p.depth, out.variance, out.valid, K
 
-    assert agrees(found["UfMstar-MCD"].figures, judged(sequence, by_hand(1, UfMStar(SKIP))))
-    assert agrees(found["MC-Dropout"].figures, judged(sequence, by_hand(3, None)))
-    assert agrees(found["UfMstar-FullMCD"].figures, judged(sequence, by_hand(3, UfMStar(SKIP))))
+    assert agrees(result["UfMstar-MCD"].figures, judged(sequence, by_hand(1, UfMStar(SKIP))))
+    assert agrees(result["MC-Dropout"].figures, judged(sequence, by_hand(3, None)))
+    assert agrees(result["UfMstar-FullMCD"].figures, judged(sequence, by_hand(3, UfMStar(SKIP))))
 
 
 def test_a_network_that_samples_stops_doing_so_for_other_bases(texts, sequence):
@@ -260,33 +260,33 @@ def test_every_inference_is_made_once(networks, sequence, monkeypatch):
 def test_skip_and_limit_choose_frames_and_turns(texts, networks, sequence):
     members = members_of(texts["ensemble"])
     one, two = row("UfM*-Ensemble", skip=1), row("UfM*-Ensemble")
-    found = evaluate(sequence, [one, two], networks, limit=slice(1, None))
-    assert (found[one.slug].frames["done"], found[two.slug].frames["done"]) == (2, 4)
+    result = evaluate(sequence, [one, two], networks, limit=slice(1, None))
+    assert (result[one.slug].frames["done"], result[two.slug].frames["done"]) == (2, 4)
     skipping = judged(sequence, through(UfMStar(SKIP), members, sequence, indices=[1, 3]), [1, 3])
-    assert agrees(found[one.slug].figures, skipping)
+    assert agrees(result[one.slug].figures, skipping)
     every = judged(sequence, through(UfMStar(SKIP), members, sequence, indices=[1, 2, 3, 4]), [1, 2, 3, 4])
-    assert agrees(found[two.slug].figures, every)
+    assert agrees(result[two.slug].figures, every)
 
 
 def test_noise_reaches_the_estimator_and_nothing_else(texts, networks, sequence):
     noisy = row("UfM*-Aleatoric", rotation_noise=3.0, translation_noise=0.1, seed=2)
-    found = evaluate(sequence, [noisy, row("UfM*-Aleatoric"), row("Aleatoric")], networks)
+    result = evaluate(sequence, [noisy, row("UfM*-Aleatoric"), row("Aleatoric")], networks)
     members = members_of(texts["aleatoric"])
 
     def poses(frame):
         return perturbed(frame.T_world_cam, noisy.setting, frame.index)
 
     by_hand = judged(sequence, through(UfMStar(SKIP), members, sequence, poses=poses))
-    assert agrees(found[noisy.slug].figures, by_hand)
-    assert found[noisy.slug].figures["rmse"] == found["UfMstar-Aleatoric"].figures["rmse"]
-    assert found[noisy.slug].figures["nll"] != found["UfMstar-Aleatoric"].figures["nll"]
+    assert agrees(result[noisy.slug].figures, by_hand)
+    assert result[noisy.slug].figures["rmse"] == result["UfMstar-Aleatoric"].figures["rmse"]
+    assert result[noisy.slug].figures["nll"] != result["UfMstar-Aleatoric"].figures["nll"]
 
 
 def test_a_tour(networks):
     tour = open_tour("tour:3?frames=3&size=32x48")
-    found = evaluate(tour, [row("UfM*-DepthOnly"), row("UfM-DepthOnly-100K")], networks)
-    assert all(result.frames["judged"] == 3 for result in found.values())
-    assert all(np.isfinite(result.figures["ece_delta"]) for result in found.values())
+    outcome = evaluate(tour, [row("UfM*-DepthOnly"), row("UfM-DepthOnly-100K")], networks)
+    assert all(result.frames["judged"] == 3 for result in outcome.values())
+    assert all(np.isfinite(result.figures["ece_delta"]) for result in outcome.values())
 
 
 # ---- confident pixels ----
@@ -294,10 +294,10 @@ def test_a_tour(networks):
 
 def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(networks, sequence):
     rows = [row("UfM*-Aleatoric"), row("UfM-Aleatoric"), row("UfM-Aleatoric-1K"), row("Aleatoric"), row("Evidential")]
-    found = evaluate(sequence, rows, networks, confident=0.3)
+    actual = evaluate(sequence, rows, networks, confident=0.3)
     expected, groups = NLLByError(), {name: [] for name in ("Aleatoric", "UfM-Aleatoric-1K")}
-    assert set(found["UfMstar-Aleatoric"].sums) == {"metrics", *(f"nll_by_error:{n}" for n in groups)}
-    assert set(found["Evidential"].sums) == {"metrics", "nll_by_error:Evidential"}
+    assert set(actual["UfMstar-Aleatoric"].sums) == {"metrics", *(f"nll_by_error:{n}" for n in groups)}
+    assert set(actual["Evidential"].sums) == {"metrics", "nll_by_error:Evidential"}
     network = networks["aleatoric"]
     for frame, *_ in frames_of(sequence):
         p = network.one(frame, 0)
@@ -307,21 +307,21 @@ def test_the_nll_by_error_is_over_the_pixels_where_the_reference_is_confident(ne
         mask = judged_here & (p.aleatoric <= order[int(np.ceil(0.3 * len(order))) - 1])
         assert 0.3 <= mask.sum() / judged_here.sum() < 0.31
         expected.update(p.depth, p.aleatoric, truth, mask)
-    curves = found["Aleatoric"].curves
+    curves = actual["Aleatoric"].curves
     for name, curve in expected.compute().items():
         assert curves[f"{name}:Aleatoric"] == pytest.approx(curve.tolist(), rel=1e-12, nan_ok=True)
     # The same pixels for all: with the same depth their errors are the same.
     key = "error_by_error:Aleatoric"
-    assert found["UfMstar-Aleatoric"].curves[key] == pytest.approx(curves[key], rel=1e-12)
-    assert found["UfM-Aleatoric"].curves[key] == pytest.approx(curves[key], rel=1e-12)
-    assert found["UfMstar-Aleatoric"].curves["nll_by_error:Aleatoric"] != curves["nll_by_error:Aleatoric"]
+    assert actual["UfMstar-Aleatoric"].curves[key] == pytest.approx(curves[key], rel=1e-12)
+    assert actual["UfM-Aleatoric"].curves[key] == pytest.approx(curves[key], rel=1e-12)
+    assert actual["UfMstar-Aleatoric"].curves["nll_by_error:Aleatoric"] != curves["nll_by_error:Aleatoric"]
 
 
 def test_a_row_is_compared_with_references_on_its_own_frames(networks, sequence):
     rows = [row("Ensemble"), row("UfM*-Ensemble", skip=1), row("UfM-Ensemble-100K", skip=1), row("UfM*-FullEnsemble")]
-    found = evaluate(sequence, rows, networks)
-    assert set(found[rows[1].slug].sums) == {"metrics", "nll_by_error:UfM-Ensemble-100K"}
-    assert set(found[rows[3].slug].sums) == {"metrics", "nll_by_error:Ensemble"}
+    result = evaluate(sequence, rows, networks)
+    assert set(result[rows[1].slug].sums) == {"metrics", "nll_by_error:UfM-Ensemble-100K"}
+    assert set(result[rows[3].slug].sums) == {"metrics", "nll_by_error:Ensemble"}
 
 
 # ---- what is left out ----
@@ -333,8 +333,8 @@ def test_broken_frames_are_left_out_by_all_rows_alike(networks, tmp_path):
     (path / "depth" / f"{10 + 4 / 30 + 0.005:.6f}.png").write_bytes(b"")
     sequence = open_sequence(path)
     names = ["Ensemble", "UfM*-Ensemble", "DepthOnly", "UfM-DepthOnly"]
-    found = evaluate(sequence, [row(name) for name in names], networks)
-    frames = [result.frames for result in found.values()]
+    outcome = evaluate(sequence, [row(name) for name in names], networks)
+    frames = [result.frames for result in outcome.values()]
     assert all(counts == frames[0] for counts in frames)
     assert (frames[0]["selected"], frames[0]["done"], frames[0]["judged"], frames[0]["skipped"]) == (7, 5, 5, 2)
     assert sum(frames[0]["reasons"].values()) == 2
@@ -342,7 +342,7 @@ def test_broken_frames_are_left_out_by_all_rows_alike(networks, tmp_path):
     good = replace(sequence, entries=tuple(sequence.entries[i] for i in kept))
     clean = evaluate(good, [row(name) for name in names], networks)
     for slug, result in clean.items():
-        assert repr(result.figures) == repr(found[slug].figures), "as if they had never been there, turns included"
+        assert repr(result.figures) == repr(outcome[slug].figures), "as if they had never been there, turns included"
 
 
 def test_poses_that_are_none_are_left_out(networks, sequence):
@@ -350,16 +350,16 @@ def test_poses_that_are_none_are_left_out(networks, sequence):
     stretched[:3, :3] *= 1.5
     broken = replace(sequence.entries[2], T_world_cam=stretched)
     bad = replace(sequence, entries=(*sequence.entries[:2], broken, *sequence.entries[3:]))
-    found = evaluate(bad, [row("Aleatoric"), row("UfM*-Aleatoric"), row("UfM-Aleatoric")], networks)
-    for result in found.values():
+    outcome = evaluate(bad, [row("Aleatoric"), row("UfM*-Aleatoric"), row("UfM-Aleatoric")], networks)
+    for result in outcome.values():
         assert (result.frames["done"], result.frames["skipped"]) == (FRAMES - 1, 1)
         assert "not orthonormal" in next(iter(result.frames["reasons"]))
 
 
 def test_frames_without_ground_truth_are_used_but_not_judged(networks, sequence):
     entries = tuple(replace(e, load_depth=None) if i in (1, 2) else e for i, e in enumerate(sequence.entries))
-    found = evaluate(replace(sequence, entries=entries), [row("UfM*-Aleatoric"), row("Aleatoric")], networks)
-    counts = found["Aleatoric"].frames
+    outcome = evaluate(replace(sequence, entries=entries), [row("UfM*-Aleatoric"), row("Aleatoric")], networks)
+    counts = outcome["Aleatoric"].frames
     assert (counts["done"], counts["judged"], counts["skipped"]) == (FRAMES, FRAMES - 2, 0)
     both = {"aleatoric": networks["aleatoric"], "depth_only": base_network("depth_only=ground-truth:32x64")}
     rows = [row("Aleatoric"), row("UfM*-DepthOnly")]
@@ -378,11 +378,11 @@ def test_pixels_that_a_row_leaves_out_are_counted(sequence):
         return replace(p, depth=depth)
 
     holes.one = with_holes
-    found = evaluate(sequence, [row("DepthOnly"), row("UfM*-DepthOnly")], {"depth_only": holes})
-    for result in found.values():
+    outcome = evaluate(sequence, [row("DepthOnly"), row("UfM*-DepthOnly")], {"depth_only": holes})
+    for result in outcome.values():
         assert result.figures["left_out_share"] == 0.5
         assert result.figures["pixels"] == FRAMES * 24 * 64
-    assert found["UfMstar-DepthOnly"].figures["nll_left_out_share"] >= 0.5
+    assert outcome["UfMstar-DepthOnly"].figures["nll_left_out_share"] >= 0.5
 
 
 @pytest.mark.parametrize("trouble", ["nothing readable", "no truth", "no frames"])
@@ -397,8 +397,12 @@ def test_a_sequence_that_cannot_be_used(networks, sequence, trouble):
         entries = tuple(replace(entry, load_depth=None) for entry in entries)
     else:
         limit = slice(40, None)
-    told = {"nothing readable": "5 x truncated", "no truth": "no frame has ground truth", "no frames": "selected of 5"}
-    with pytest.raises(SequenceError, match=told[trouble]) as raised:
+    message = {
+        "nothing readable": "5 x truncated",
+        "no truth": "no frame has ground truth",
+        "no frames": "selected of 5",
+    }
+    with pytest.raises(SequenceError, match=message[trouble]) as raised:
         evaluate(replace(sequence, entries=entries), [row("Aleatoric")], networks, limit=limit)
     assert raised.value.reason == str(raised.value)
 
@@ -432,11 +436,11 @@ def test_what_cannot_be_judged_is_refused(networks, sequence, rows, options, tol
 
 
 def test_sums_hold_all_that_the_figures_are_made_of(networks, sequence):
-    found = evaluate(sequence, [row("UfM*-Aleatoric"), row("Aleatoric")], networks)["UfMstar-Aleatoric"]
+    result = evaluate(sequence, [row("UfM*-Aleatoric"), row("Aleatoric")], networks)["UfMstar-Aleatoric"]
     again = SequenceMetrics()
-    again.load_state_dict(found.sums["metrics"])
-    assert repr(again.compute()) == repr(found.figures)
+    again.load_state_dict(result.sums["metrics"])
+    assert repr(again.compute()) == repr(result.figures)
     binned = NLLByError()
-    binned.load_state_dict(found.sums["nll_by_error:Aleatoric"])
-    assert repr(binned.compute()["nll_by_error"].tolist()) == repr(found.curves["nll_by_error:Aleatoric"])
-    assert all(value.device == CPU for sums in found.sums.values() for value in sums.values())
+    binned.load_state_dict(result.sums["nll_by_error:Aleatoric"])
+    assert repr(binned.compute()["nll_by_error"].tolist()) == repr(result.curves["nll_by_error:Aleatoric"])
+    assert all(value.device == CPU for sums in result.sums.values() for value in sums.values())

@@ -53,11 +53,11 @@ def test_the_default_row_has_the_default_settings():
 
 
 def test_overrides_by_dotted_name():
-    wanted = {"segment.min_pixels": 2000, "segment.min_rows": 32, "ema_alpha": 1.0, "regression": "neighbourhood"}
-    config = ufm_star_config(row("UfM*-MCD", overrides=wanted))
+    expected = {"segment.min_pixels": 2000, "segment.min_rows": 32, "ema_alpha": 1.0, "regression": "neighbourhood"}
+    config = ufm_star_config(row("UfM*-MCD", overrides=expected))
     assert (config.segment.min_pixels, config.segment.min_rows) == (2000, 32)
     assert (config.ema_alpha, config.regression) == (1.0, "neighbourhood")
-    others = {name: value for name, value in config.to_dict().items() if name not in (*wanted, "segment")}
+    others = {name: value for name, value in config.to_dict().items() if name not in (*expected, "segment")}
     assert others.items() <= UfMStarConfig(on_bad_frame="skip").to_dict().items()
 
 
@@ -291,10 +291,10 @@ def test_labels(files, loaded):
 
 
 def test_what_was_run_is_told_in_plain_values(loaded):
-    told = loaded["mc_dropout"].identity
-    assert json.loads(json.dumps(told)) == told
-    assert (told["model"], told["members"], told["samples"]) == ("trained", 1, 4)
-    assert len(told["files"][0]["sha256"]) == 64
+    message = loaded["mc_dropout"].identity
+    assert json.loads(json.dumps(message)) == message
+    assert (message["model"], message["members"], message["samples"]) == ("trained", 1, 4)
+    assert len(message["files"][0]["sha256"]) == 64
 
 
 def test_files_that_are_not_there(tmp_path):

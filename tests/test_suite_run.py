@@ -39,9 +39,9 @@ def folder_of(job):
 
 def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
-    ended, told = go(job)
+    ended, message = go(job)
     assert ended
-    assert [line.split(":")[0] for line in told] == [f"rooms/{name}" for name in NAMES]
+    assert [line.split(":")[0] for line in message] == [f"rooms/{name}" for name in NAMES]
     record = Record.load(job.out / "records" / "rooms" / "birch" / "UfMstar-DepthOnly.json")
     assert (record.suite, record.dataset, record.sequence) == ("depth-only", "rooms", "birch")
     assert (record.network, record.method, record.setting) == ("ground truth", "UfM*-DepthOnly", {})
@@ -101,9 +101,9 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
     root = write_rooms(tmp_path / "own")
     (root / "birch" / "poses.txt").write_text("not a pose\n")
     job = job_on(root, tmp_path / "out")
-    ended, told = go(job)
+    ended, message = go(job)
     assert ended
-    assert "rooms/birch: failed: " in told[1]
+    assert "rooms/birch: failed: " in message[1]
     assert sorted(path.split("/")[2] for path in kept(job.out)) == ["ash"] * 4 + ["cedar"] * 4
     failed = json.loads((job.out / "records" / "rooms" / "birch" / "failed.json").read_text())
     assert (failed["sequence"], failed["dataset"], len(failed["rows"])) == ("birch", "rooms", 4)
@@ -153,7 +153,7 @@ def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
 def test_images_without_poses_are_for_networks_alone(tmp_path):
     root, _ = write_nyu(tmp_path / "nyu")
     job = job_on(root, tmp_path / "out")
-    ended, told = go(job, evaluate_sequence)
+    ended, message = go(job, evaluate_sequence)
     assert ended
     folder, (item,) = folder_of(job), job.items
     done = sorted(path.stem for path in folder.place(item).glob("*.json") if path.stem != "failed")
@@ -161,10 +161,10 @@ def test_images_without_poses_are_for_networks_alone(tmp_path):
     failure = folder.failure(item)
     assert "no poses" in failure["reason"]
     assert failure["rows"] == ["UfM-DepthOnly", "UfM-DepthOnly-100K", "UfMstar-DepthOnly"]
-    assert sum("failed" in line for line in told) == 1
-    again, told = go(job, evaluate_sequence, resume=True)
+    assert sum("failed" in line for line in message) == 1
+    again, message = go(job, evaluate_sequence, resume=True)
     assert again
-    assert sum("failed" in line for line in told) == 1, "it is told each time"
+    assert sum("failed" in line for line in message) == 1, "it is told each time"
 
 
 def test_poses_of_another_program(tmp_path):
@@ -183,8 +183,8 @@ def test_poses_of_another_program(tmp_path):
     assert json.loads((job.out / "eval.json").read_text())["settings"]["trajectory"] == "slam.txt"
     with pytest.raises(FolderError, match="settings"):
         go(job_from(read(words)), resume=True)
-    for wrong, told in (("--poses sideways", "--poses"), ("--fps 0", "fps must be positive")):
-        with pytest.raises(ValueError, match=told):
+    for wrong, message in (("--poses sideways", "--poses"), ("--fps 0", "fps must be positive")):
+        with pytest.raises(ValueError, match=message):
             job_from(read([*words, *wrong.split()]))
 
 
@@ -199,13 +199,13 @@ def test_another_sequence_of_the_name_is_refused(tmp_path):
 
 
 def test_stopping_loses_the_sequence_in_hand_alone(rooms, tmp_path):
-    asked = []
+    requested = []
 
     def stop():
-        return bool(asked) and asked[-1] == ("birch", 2)
+        return bool(requested) and requested[-1] == ("birch", 2)
 
     job = job_on(rooms, tmp_path / "out")
-    assert not go(job, Stub(lambda *where: asked.append(where)), stop=stop)[0]
+    assert not go(job, Stub(lambda *where: requested.append(where)), stop=stop)[0]
     assert {path.split("/")[2] for path in kept(job.out)} == {"ash"}
     stub = Stub()
     assert go(job, stub, resume=True)[0]
@@ -303,7 +303,7 @@ def test_a_sequence_that_another_process_is_at_is_left_to_it(rooms, tmp_path):
     folder = EvalFolder.open(job.out, job.about(networks), resume=False, overwrite=False)
     stub = Stub()
     with folder.claim(job.items[0], "other"):
-        ended, told = go(job, stub, resume=True)
+        ended, message = go(job, stub, resume=True)
     assert ended
-    assert told[-1] == "left to another process that is at it: rooms/ash"
+    assert message[-1] == "left to another process that is at it: rooms/ash"
     assert [name for name, _ in stub.asked] == ["birch", "cedar"]

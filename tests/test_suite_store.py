@@ -56,13 +56,13 @@ def test_sequences_of_any_name_have_folders_of_their_own(sequence_names):
 def test_work_is_found_by_layout_or_named_data_set(tmp_path):
     write_rooms(tmp_path / "a")
     write_seven_scenes(tmp_path / "b")
-    found = find_work([str(tmp_path / "a"), f"mine={tmp_path / 'b'}", "tour:3?frames=2"])
-    assert [(item.dataset, item.layout) for item in found] == [("generic", "generic")] * 3 + [
+    result = find_work([str(tmp_path / "a"), f"mine={tmp_path / 'b'}", "tour:3?frames=2"])
+    assert [(item.dataset, item.layout) for item in result] == [("generic", "generic")] * 3 + [
         ("mine", "7scenes"),
         ("tour", "auto"),
     ]
-    assert [item.sequence for item in found[:3]] == list(NAMES)
-    assert [len(item.open()) for item in found[:4]] == [4, 4, 4, 6]
+    assert [item.sequence for item in result[:3]] == list(NAMES)
+    assert [len(item.open()) for item in result[:4]] == [4, 4, 4, 6]
 
 
 def test_sample_and_list(tmp_path):

@@ -42,11 +42,11 @@ def test_tables_have_the_papers_rows_in_its_order(number, rows):
 
 
 def test_table_4_has_the_full_rows_and_the_alternating_ones_beside_them():
-    found = list(dict.fromkeys(methods("paper-table-4")))
-    assert [name for name in found if "Full" in name] == [
+    result = list(dict.fromkeys(methods("paper-table-4")))
+    assert [name for name in result if "Full" in name] == [
         "UfM*-FullEnsemble", "UfM*-FullMCD", "UfM*-FullBatchEnsemble"
     ]  # fmt: skip
-    assert [name.replace("Full", "") for name in found[::2]] == found[1::2]
+    assert [name.replace("Full", "") for name in result[::2]] == result[1::2]
 
 
 @pytest.mark.parametrize("name", [n for n in names() if n.startswith("paper-")])

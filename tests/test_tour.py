@@ -100,8 +100,8 @@ def test_depth_of_a_box_in_front_is_its_front_or_a_side():
     expected = np.where(on_front, 2.0, np.where(on_side, side, np.inf))
     assert on_side.sum() > 20
     assert on_front.sum() > 20
-    found = depth_of(box((1.25, 0, 3.0), (0.25, 0.5, 1.0), Finish()), size=(24, 64))
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    actual = depth_of(box((1.25, 0, 3.0), (0.25, 0.5, 1.0), Finish()), size=(24, 64))
+    np.testing.assert_allclose(actual, expected, rtol=1e-9)
 
 
 def test_depth_of_a_cylinder_and_of_its_cap():
@@ -162,9 +162,9 @@ def test_entry_is_the_first_point_of_the_solid(seed, kind, taper):
         return (np.abs(p[..., 1]) <= 1) & (np.hypot(p[..., 0], p[..., 2]) <= radius)
 
     steps = np.linspace(0, 3, 3001)
-    found = inside(o + steps[:, None, None] * d)
-    hit = found.any(0)
-    first = steps[found.argmax(0)]
+    result = inside(o + steps[:, None, None] * d)
+    hit = result.any(0)
+    first = steps[result.argmax(0)]
     assert np.isfinite(t[hit]).all()
     assert ((first[hit] - t[hit] >= -1e-9) & (first[hit] - t[hit] <= 2e-3)).all()
     # A ray that grazes an edge between two samples may hit without being found, but then on the surface.
@@ -308,9 +308,9 @@ def test_no_ray_of_another_view_passes_a_point_that_was_seen(home):
             if z < 0.2:
                 continue
             aimed = torch.tensor([[1.0, 0, -x / z], [0, 1.0, -y / z], [0, 0, 1]], dtype=torch.float64)
-            found = float(cast(home, poses[j], aimed, 1, 1)[0])
-            assert found <= z * (1 + 1e-9)
-            equal += abs(found - z) <= 1e-9 * z
+            result = float(cast(home, poses[j], aimed, 1, 1)[0])
+            assert result <= z * (1 + 1e-9)
+            equal += abs(result - z) <= 1e-9 * z
     assert equal > 22
 
 
@@ -364,11 +364,11 @@ def test_mixed_tours_begin_at_home_and_end_in_a_hall(mixed):
 
 @pytest.mark.parametrize(("seed", "style"), [(0, "home"), (1, "hall")])
 def test_sizes_are_the_styles(seed, style):
-    tour, wanted = make_tour(seed, style), STYLES[style]
+    tour, expected = make_tour(seed, style), STYLES[style]
     size = tour.rooms[:, 1] - tour.rooms[:, 0]
-    assert wanted.rooms[0] <= len(tour.rooms) <= wanted.rooms[1]
-    assert ((size[:, [0, 2]] >= wanted.room_size[0]) & (size[:, [0, 2]] <= wanted.room_size[1])).all()
-    assert ((size[:, 1] >= wanted.ceiling[0]) & (size[:, 1] <= wanted.ceiling[1])).all()
+    assert expected.rooms[0] <= len(tour.rooms) <= expected.rooms[1]
+    assert ((size[:, [0, 2]] >= expected.room_size[0]) & (size[:, [0, 2]] <= expected.room_size[1])).all()
+    assert ((size[:, 1] >= expected.ceiling[0]) & (size[:, 1] <= expected.ceiling[1])).all()
     kinds = torch.bincount(tour.surfaces.kind, minlength=4)
     assert (kinds > 2).all(), "boxes, ellipsoids, frusta and quads"
 

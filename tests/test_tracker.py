@@ -47,13 +47,13 @@ def test_exact_tracks_give_exact_points(seed, count):
     baseline = np.linalg.norm(T[0, :3, 3] - T[1, :3, 3])
     if baseline < 0.1:
         return
-    found = triangulate(seen_from(points, T), seen, T, K)
-    np.testing.assert_allclose(found.point, points, atol=1e-7)
-    assert found.ahead.all()
-    assert found.error.max() < 1e-6
+    result = triangulate(seen_from(points, T), seen, T, K)
+    np.testing.assert_allclose(result.point, points, atol=1e-7)
+    assert result.ahead.all()
+    assert result.error.max() < 1e-6
     # What a view did not see does not matter.
     spoiled = np.where(seen[..., None], seen_from(points, T), 1e4)
-    np.testing.assert_allclose(triangulate(spoiled, seen, T, K).point, found.point, atol=1e-9)
+    np.testing.assert_allclose(triangulate(spoiled, seen, T, K).point, result.point, atol=1e-9)
 
 
 @given(st.integers(0, 10**6))
@@ -78,19 +78,19 @@ def test_the_variance_is_what_noise_makes_of_it():
     T, points = views(6, 3, spread=0.2), np.repeat(world_points(1, 3), 4000, axis=0)
     rng, sigma = np.random.default_rng(0), 0.3
     pixel = seen_from(points, T) + sigma * rng.standard_normal((4000, 6, 2))
-    found = triangulate(pixel, np.ones((4000, 6), dtype=bool), T, K)
-    spread = np.cov((found.point - points).T)
-    np.testing.assert_allclose(sigma**2 * found.covariance.mean(0), spread, atol=0.08 * np.trace(spread))
+    result = triangulate(pixel, np.ones((4000, 6), dtype=bool), T, K)
+    spread = np.cov((result.point - points).T)
+    np.testing.assert_allclose(sigma**2 * result.covariance.mean(0), spread, atol=0.08 * np.trace(spread))
 
 
 def test_two_views_side_by_side_in_closed_form():
     T = np.tile(np.eye(4), (2, 1, 1))
     T[1, 0, 3] = 0.1
     pixel = np.array([[[160.0, 120.0], [145.0, 120.0]]])  # a disparity of 15 px: z = f b/15
-    found = triangulate(pixel, np.ones((1, 2), dtype=bool), T, K)
-    np.testing.assert_allclose(found.point[0], [0, 0, 300 * 0.1 / 15], atol=1e-9)
+    result = triangulate(pixel, np.ones((1, 2), dtype=bool), T, K)
+    np.testing.assert_allclose(result.point[0], [0, 0, 300 * 0.1 / 15], atol=1e-9)
     # dz = z^2/(f b) d(disparity), whose variance is 2 px^2
-    np.testing.assert_allclose(found.covariance[0, 2, 2], 2 * (4 / 30) ** 2, rtol=1e-2)
+    np.testing.assert_allclose(result.covariance[0, 2, 2], 2 * (4 / 30) ** 2, rtol=1e-2)
 
 
 def test_behind_a_camera_is_told():
@@ -113,10 +113,10 @@ def true_depth(frame, pixel):
 def test_landmarks_of_a_rendered_room_are_where_they_are(tour):
     tracker, errors, counts, surprises = LandmarkTracker(), [], [], []
     for frame in tour:
-        found = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
-        z = true_depth(frame, found.pixel)
-        errors.extend(np.abs(found.depth - z) / z)
-        surprises.extend((found.depth - z) / np.sqrt(found.variance))
+        result = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        z = true_depth(frame, result.pixel)
+        errors.extend(np.abs(result.depth - z) / z)
+        surprises.extend((result.depth - z) / np.sqrt(result.variance))
         counts.append(len(z))
     assert counts[0] == 0, "one view has no parallax"
     assert counts[1] >= 10, "two have"
@@ -131,10 +131,10 @@ def test_landmarks_of_a_rendered_room_are_where_they_are(tour):
 def test_stated_variances_are_those_of_the_errors(source, name):
     landmarks, sizes, errors, counts = landmark_source(source), [], [], []
     for frame in open_sequence(name):
-        found = landmarks.update(frame.image, frame.T_world_cam, frame.intrinsics)
-        z = true_depth(frame, found.pixel)
-        sizes.extend(np.abs(1 / found.depth - 1 / z) * found.depth**2 / np.sqrt(found.variance))
-        errors.extend(np.abs(found.depth - z) / z)
+        result = landmarks.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        z = true_depth(frame, result.pixel)
+        sizes.extend(np.abs(1 / result.depth - 1 / z) * result.depth**2 / np.sqrt(result.variance))
+        errors.extend(np.abs(result.depth - z) / z)
         counts.append(len(z))
     assert 0.8 < np.median(sizes) / 0.674 < 1.25
     assert np.mean(np.array(sizes) > 5) < 0.12
@@ -176,13 +176,13 @@ def test_what_is_far_away_is_not_left_out():
         tracker._pixel[:100, step] = seen[:, :2] / seen[:, 2:] + rng.standard_normal((100, 2))
         tracker._seen[:100, step] = True
     tracker._K = K
-    found = tracker._landmarks(100)
-    far = found.depth > 2
+    result = tracker._landmarks(100)
+    far = result.depth > 2
     assert far.sum() > 25, "noise of 1 px makes some 15 % of 5 m here"
     assert (~far).sum() > 40
-    sigma = np.sqrt(found.variance[far]) / found.depth[far]
+    sigma = np.sqrt(result.variance[far]) / result.depth[far]
     assert 0.08 < np.median(sigma) < 0.5, "errors that add up from view to view are allowed for; these are independent"
-    surprise = (1 / found.depth[far] - 1 / 5) / (np.sqrt(found.variance[far]) / found.depth[far] ** 2)
+    surprise = (1 / result.depth[far] - 1 / 5) / (np.sqrt(result.variance[far]) / result.depth[far] ** 2)
     assert np.median(np.abs(surprise)) < 1.5
 
 
@@ -195,8 +195,8 @@ def test_poses_that_contradict_the_images_give_no_anchors(tour):
         if i > 1:  # two views alone can be wrong together
             T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(rng.normal(0, np.deg2rad(4), 3)).as_matrix()
         arguments = ((noisy, T), (by_chance, T), (right, frame.T_world_cam))
-        found = [len(t.update(frame.image, pose, frame.intrinsics).depth) for t, pose in arguments]
-        counts += found if i > 3 else 0  # before, most have two views
+        result = [len(t.update(frame.image, pose, frame.intrinsics).depth) for t, pose in arguments]
+        counts += result if i > 3 else 0  # before, most have two views
     assert counts[1] >= 20, "some tracks fit by chance"
     assert counts[0] == 0
     assert counts[2] > 200
@@ -219,16 +219,16 @@ def test_memory_does_not_grow_and_reset_forgets(tour):
 def test_anchors_lie_where_the_depth_map_says(tour):
     tracker = LandmarkTracker()
     for frame in tour[:8]:
-        found = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+        result = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
     small = resize_intrinsics(torch.from_numpy(frame.intrinsics), (180, 240), (90, 120))
-    anchors = found.anchors(frame.intrinsics, small, capacity=300)
-    n = len(found.depth)
+    anchors = result.anchors(frame.intrinsics, small, capacity=300)
+    n = len(result.depth)
     assert anchors.depth.shape == (1, 300)
     assert anchors.valid.sum() == n
-    np.testing.assert_allclose(anchors.pixel[0, :n].numpy(), (found.pixel + 0.5) / 2 - 0.5, atol=1e-9)
-    np.testing.assert_array_equal(anchors.variance[0, :n].numpy(), found.variance)
+    np.testing.assert_allclose(anchors.pixel[0, :n].numpy(), (result.pixel + 0.5) / 2 - 0.5, atol=1e-9)
+    np.testing.assert_array_equal(anchors.variance[0, :n].numpy(), result.variance)
     with pytest.raises(ValueError, match="capacity must be at least"):
-        found.anchors(frame.intrinsics, small, capacity=n - 1)
+        result.anchors(frame.intrinsics, small, capacity=n - 1)
 
 
 @pytest.mark.parametrize(

@@ -51,8 +51,8 @@ def ufmstar(capfd):
     def call(*words):
         capfd.readouterr()
         code = cli.main([str(word) for word in words])
-        told = capfd.readouterr()
-        return code, told.out, told.err
+        printed = capfd.readouterr()
+        return code, printed.out, printed.err
 
     return call
 
@@ -372,8 +372,8 @@ def test_a_loss_that_is_not_finite_names_its_samples_and_loses_nothing(frames, t
 
     monkeypatch.setattr(TrainingModule, "_distribution", poisoned)
     job = tiny_job(frames, tmp_path / "out", recipe, checkpoint_every=1)
-    told = r"the loss is not finite in epoch 0, batch 1 \(step 1\), samples "
-    with pytest.raises(NonFiniteLossError, match=told) as caught:
+    message = r"the loss is not finite in epoch 0, batch 1 \(step 1\), samples "
+    with pytest.raises(NonFiniteLossError, match=message) as caught:
         fit(job)
     data = make_data(job, 1, 1)
     batches = data.train_dataloader().batches
@@ -420,10 +420,10 @@ def test_training_leaves_torchs_random_numbers_alone(frames, tmp_path):
 )
 def test_an_encoder_that_starts_from_nothing_is_told(ufmstar, frames, tmp_path, words, told):
     (tmp_path / "x").write_text("nothing is trained: the folder is refused")
-    code, _, said = ufmstar("train", *words, "--data", "sequences", "--root", frames, "--out", tmp_path)
+    code, _, text = ufmstar("train", *words, "--data", "sequences", "--root", frames, "--out", tmp_path)
     assert code == cli.FAILED
     remark = "the ResNet50 encoder starts from random weights; the paper's starts from ImageNet: --init imagenet"
-    assert said.splitlines()[:-1] == [f"ufmstar train: {remark}"] * told
+    assert text.splitlines()[:-1] == [f"ufmstar train: {remark}"] * told
 
 
 def test_members_start_with_weights_of_their_own_and_the_same_again(frames, tmp_path):

@@ -141,11 +141,11 @@ def test_the_second_process_may_come_first(frames, alone, tmp_path, launch, sett
             time.sleep(0.1)
         time.sleep(2)
         processes.append(start(frames, out, tmp_path / "there", settings, {**launch(0), **port}))
-        told = [process.communicate(timeout=250)[1] for process in reversed(processes)]
+        message = [process.communicate(timeout=250)[1] for process in reversed(processes)]
     finally:
         for process in processes:
             process.kill()
-    assert [process.returncode for process in processes] == [0, 0], told
+    assert [process.returncode for process in processes] == [0, 0], message
     assert losses(out) == pytest.approx(losses(alone), abs=1e-6)
 
 
@@ -185,8 +185,8 @@ def test_all_processes_end_where_the_first_cannot_prepare(meeting, tmp_path):
 
     with pytest.raises(FolderError, match=r"^holds"), prepared_by_first(refused(), meeting(0), tmp_path, wait=10):
         pass
-    told = "^the first process could not prepare the folder: holds an earlier training"
-    with pytest.raises(FolderError, match=told), prepared_by_first(refused(), meeting(1), tmp_path, wait=10):
+    message = "^the first process could not prepare the folder: holds an earlier training"
+    with pytest.raises(FolderError, match=message), prepared_by_first(refused(), meeting(1), tmp_path, wait=10):
         pass
     # Each computer with a disk of its own.
     with prepared_by_first(nullcontext(), meeting(0), tmp_path, wait=10):
@@ -206,12 +206,12 @@ def test_one_validation_frame_for_two_processes(frames, tmp_path):
         words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=tmp_path, start_new_session=True
     )
     try:
-        told = process.communicate(timeout=250)[0]
+        message = process.communicate(timeout=250)[0]
     finally:
         # Its process group, where one waits for the other.
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-    assert process.returncode == 0, told
+    assert process.returncode == 0, message
     assert float(read_rows(tmp_path / "out" / "member_0" / METRICS)[-1]["val_rmse"]) > 0
 
 
@@ -229,13 +229,13 @@ def test_a_batch_that_cannot_be_divided_is_refused(frames, tmp_path):
 
 
 def test_settings_that_cannot_be(tmp_path):
-    for values, told in [
+    for values, message in [
         ({"strategy": "ddp_spawn"}, "'ddp', not 'ddp_spawn'"),
         ({"member_processes": 2, "devices": 2}, "goes with devices = 1"),
         ({"checkpoint_every": -1}, r"checkpoint_every must lie in \[0"),
         ({"max_minutes": float("nan")}, "max_minutes must be a number"),
     ]:
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             FitSettings(out=tmp_path, **values)
 
 

@@ -138,12 +138,12 @@ def write_mat(path, width=64, height=48):
 
 def test_the_labelled_file_becomes_fastdepths_layout(tmp_path):
     rgb, depth, _ = write_mat(tmp_path / "labelled.mat")
-    told = []
+    message = []
     counts = convert_labelled(
-        tmp_path / "labelled.mat", tmp_path / "nyu", progress=lambda done, of: told.append((done, of))
+        tmp_path / "labelled.mat", tmp_path / "nyu", progress=lambda done, of: message.append((done, of))
     )
     assert counts == {"train": 4, "val": 2}  # every fourth scene, the den, with all its frames
-    assert told == [(i + 1, 6) for i in range(6)]
+    assert message == [(i + 1, 6) for i in range(6)]
     train, val = NyuFrames(tmp_path / "nyu", "train"), NyuFrames(tmp_path / "nyu", "val")
     assert [f.parent.name for f in train.files] == SCENES[:4]
     assert [f.name for f in val.files] == ["00005.h5", "00006.h5"]

@@ -218,8 +218,8 @@ def test_a_folder_is_refused_that_is_not_this_training(frames, tmp_path):
         (replace(job, settings=replace(job.settings, seed=3)), "seed was 0, now 3"),
         (replace(job, data=replace(job.data, part="0:8")), r'data\.part was "0:12", now "0:8"'),
     ]
-    for other, told in others:
-        with pytest.raises(FolderError, match=told):
+    for other, message in others:
+        with pytest.raises(FolderError, match=message):
             fit(other, resume=True)
     # Whatever changes the speed only is no other training.
     same = replace(job, settings=replace(job.settings, checkpoint_every=7, max_minutes=3.0))

@@ -187,12 +187,12 @@ def test_tours_are_rendered_once_and_completed(tours, tmp_path):
     shutil.copytree(folder, tmp_path / "cache")
     inside = tmp_path / "cache" / frames.folder.name
     times = {path.name: path.stat().st_mtime_ns for path in inside.iterdir()}
-    told = []
-    tour_frames([5, 6], TINY, tmp_path / "cache", progress=lambda *done: told.append(done))
-    assert not told
+    message = []
+    tour_frames([5, 6], TINY, tmp_path / "cache", progress=lambda *done: message.append(done))
+    assert not message
     tour_files(inside, 6)[2].unlink()  # as a kill between the writes leaves it
-    again = tour_frames([5, 6], TINY, tmp_path / "cache", progress=lambda *done: told.append(done))
-    assert told == [(2, 2)]
+    again = tour_frames([5, 6], TINY, tmp_path / "cache", progress=lambda *done: message.append(done))
+    assert message == [(2, 2)]
     for path in tour_files(inside, 5):
         assert path.stat().st_mtime_ns == times[path.name]
     assert torch.equal(again.load(4).image, frames.load(4).image)

@@ -317,12 +317,12 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input_is_named_and_leaves_the_state(name):
-    change, error, told = BAD[name]
+    change, error, message = BAD[name]
     ufm = UfM(dtype=torch.float64)
     ufm(*frame(0))
     before = snapshot(ufm)
     good = dict(zip(("depth", "pose", "intrinsics"), frame(1), strict=True))
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         ufm(**{**good, **change})
     assert unchanged(ufm, before)
 
@@ -504,11 +504,11 @@ def test_the_world_frame_does_not_matter(seed, world):
     rng = np.random.default_rng(world)
     T = scenes.look(rng.normal(0, 50, 3), rng.uniform(-3, 3), rng.uniform(-1, 1))
     start = seed % (FRAMES - 4)
-    here, there = UfM(dtype=torch.float64), UfM(dtype=torch.float64)
+    here, present = UfM(dtype=torch.float64), UfM(dtype=torch.float64)
     for i in range(start, start + 4):
         depth, pose, intrinsics = frame(i)
         a = here(depth, pose, intrinsics, torch.full_like(depth, 0.01)).variance
-        b = there(depth, torch.tensor(T) @ pose, intrinsics, torch.full_like(depth, 0.01)).variance
+        b = present(depth, torch.tensor(T) @ pose, intrinsics, torch.full_like(depth, 0.01)).variance
     assert torch.isclose(a, b, atol=1e-8, equal_nan=True).double().mean() > 0.99  # roundings to a pixel may differ
 
 

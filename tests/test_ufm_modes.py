@@ -60,12 +60,12 @@ MODES = [aleatoric, evidential, in_turn, one_sample, depth_only, full]
 def test_agrees_with_the_loops(mode, cap):
     ufm, oracle, pruned = UfM(UfMConfig(max_points=cap), dtype=torch.float64), oracle_ufm.UfM(cap), 0
     for i in range(FRAMES):
-        said = mode(i)
-        parts = [x for x in (said.aleatoric_variance, said.epistemic_variance) if x is not None]
+        text = mode(i)
+        parts = [x for x in (text.aleatoric_variance, text.epistemic_variance) if x is not None]
         s2 = sum(part[0].numpy() for part in parts) if parts else np.zeros((H, W))
-        depth = said.depth[0].numpy()
+        depth = text.depth[0].numpy()
         want = oracle.step(depth, s2, np.isfinite(depth) & (depth > 0), POSES[i], K)
-        out = ufm(said.depth, torch.tensor(POSES[i]), torch.tensor(K), said.aleatoric_variance, said.epistemic_variance)
+        out = ufm(text.depth, torch.tensor(POSES[i]), torch.tensor(K), text.aleatoric_variance, text.epistemic_variance)
         np.testing.assert_allclose(out.variance[0].numpy(), want, rtol=0, atol=1e-9)
         assert out.statistics.points.tolist() == [len(oracle.points)]
         pruned += int(out.statistics.dropped)
@@ -75,7 +75,7 @@ def test_agrees_with_the_loops(mode, cap):
 
 def test_full_takes_the_spread_of_the_members_as_epistemic():
     depths = np.stack([drawn(3, member)[0] for member in range(MEMBERS)])
-    said = full(3)
+    text = full(3)
     seen = np.isfinite(depths[0])
-    np.testing.assert_allclose(said.depth[0].numpy()[seen], depths.mean(0)[seen], rtol=1e-12)
-    np.testing.assert_allclose(said.epistemic_variance[0].numpy()[seen], depths.var(0)[seen], atol=1e-12)
+    np.testing.assert_allclose(text.depth[0].numpy()[seen], depths.mean(0)[seen], rtol=1e-12)
+    np.testing.assert_allclose(text.epistemic_variance[0].numpy()[seen], depths.var(0)[seen], atol=1e-12)

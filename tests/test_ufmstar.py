@@ -183,8 +183,8 @@ def test_rigid_motion_of_the_world_changes_nothing():
     world = scenes.look((512.0, -64.0, 2048.0), 0.7, -0.4)
     config = UfMStarConfig(segment=SPGF)
     _, here = run(config, depths, poses, K)
-    ufm, there = run(config, depths, [world @ T for T in poses], K)
-    for a, b in zip(here, there, strict=True):
+    ufm, present = run(config, depths, [world @ T for T in poses], K)
+    for a, b in zip(here, present, strict=True):
         torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-10, equal_nan=True)
     points = torch.tensor([[[0.1, 0.2, 2.0]]], dtype=torch.float64)
     moved = torch.einsum("ij,bnj->bni", torch.tensor(world[:3, :3] @ poses[0][:3, :3]), points) + torch.tensor(
@@ -201,8 +201,8 @@ def test_kilometres_from_the_origin_float32_loses_nothing():
     far[:3, 3] = 4.5e6, -3.2e6, 120.0  # easting and northing of a map projection
     config = UfMStarConfig(segment=SPGF)
     _, here = run(config, depths, poses, K, dtype=torch.float32)
-    _, there = run(config, depths, [far @ T for T in poses], K, dtype=torch.float32)
-    for a, b in zip(here, there, strict=True):
+    _, present = run(config, depths, [far @ T for T in poses], K, dtype=torch.float32)
+    for a, b in zip(here, present, strict=True):
         torch.testing.assert_close(a.std, b.std, rtol=0, atol=1e-4, equal_nan=True)
 
 

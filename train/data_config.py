@@ -37,10 +37,10 @@ class Part:
             ValueError: anything else, a share above 100 %, or an empty part.
         """
         start, colon, stop = text.partition(":")
-        found = _PART.fullmatch(f"{start.strip() or '0'}:{stop.strip() or '100%'}") if colon else None
-        if found is None or _impossible(found[1], found[2]) or _impossible(found[3], found[4]):
+        result = _PART.fullmatch(f"{start.strip() or '0'}:{stop.strip() or '100%'}") if colon else None
+        if result is None or _impossible(result[1], result[2]) or _impossible(result[3], result[4]):
             raise ValueError(f"a part must be START:STOP in frames or percent (0:70%, 100:400), got {text!r}")
-        part = cls(float(found[1]), float(found[3]), bool(found[2]), bool(found[4]))
+        part = cls(float(result[1]), float(result[3]), bool(result[2]), bool(result[4]))
         if part.start_share == part.stop_share and part.start >= part.stop:
             raise ValueError(f"a part must end after its start, got {text!r}")
         return part
@@ -124,13 +124,13 @@ class DataConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        least, most, wanted = {
+        least, most, expected = {
             "nyu": (1, 1, "one folder"),
             "sequences": (1, None, "at least one sequence"),
             "tour": (0, 0, "nothing"),
         }[self.kind]
         if len(self.paths) < least or (most is not None and len(self.paths) > most):
-            raise ValueError(f"DataConfig.paths must name {wanted} where kind is {self.kind!r}, got {self.paths}")
+            raise ValueError(f"DataConfig.paths must name {expected} where kind is {self.kind!r}, got {self.paths}")
         if self.validation_paths and self.kind != "sequences":
             raise ValueError(f"DataConfig.validation_paths is for kind 'sequences', got kind {self.kind!r}")
         for name in ("part", "validation_part"):

@@ -93,8 +93,8 @@ def _from_trained(spec: NetworkSpec, path: Path, member: int) -> DepthNetwork:
     if own != spec:
         raise ValueError(f"init: {path} holds {info.spec}, which does not fit {spec}")
     # "mc_dropout" is an aleatoric network that samples at test time.
-    trained, wanted = ("aleatoric" if m == "mc_dropout" else m for m in (info.spec.method, spec.method))
-    if (trained, info.spec.members) == (wanted, spec.members):
+    trained, expected = ("aleatoric" if m == "mc_dropout" else m for m in (info.spec.method, spec.method))
+    if (trained, info.spec.members) == (expected, spec.members):
         network: DepthNetwork = build_network(spec)
         fill(network, source.state_dict(), str(path))
         return network

@@ -154,7 +154,7 @@ def _best(mixture: GaussianMixture, compared: Tensor) -> tuple[Tensor, Tensor]:
     covariance = torch.where(mixture.valid[..., None, None], mixture.covariance, eye)
     weight = torch.where(mixture.valid, mixture.weight, torch.ones_like(mixture.weight))
     log_det = _log_det(covariance)
-    found = []
+    result = []
     for first in range(0, k, rows):
         i, j = (slice(None), slice(first, first + rows), None), (slice(None), None)
         _, S = _joint(weight[i], weight[j], mixture.mean[i], mixture.mean[j], covariance[i], covariance[j])
@@ -167,9 +167,9 @@ def _best(mixture: GaussianMixture, compared: Tensor) -> tuple[Tensor, Tensor]:
         fits = mixture.valid[i] & mixture.valid[j] & ~(lighter & ~heavier)
         own = torch.arange(k, device=loss.device)
         fits &= own[first : first + rows, None] != own
-        found.append(torch.where(fits, loss, torch.inf).min(dim=2, keepdim=False))
-    values = torch.cat([f.values for f in found], 1)
-    return values, torch.cat([f.indices for f in found], 1)
+        result.append(torch.where(fits, loss, torch.inf).min(dim=2, keepdim=False))
+    values = torch.cat([f.values for f in result], 1)
+    return values, torch.cat([f.indices for f in result], 1)
 
 
 def _parts(weight_a: Tensor, weight_b: Tensor) -> tuple[Tensor, Tensor]:
@@ -264,12 +264,12 @@ def own_shares(mixture: GaussianMixture, config: UfMStarConfig) -> Tensor:
     k = mixture.capacity
     rows = max(1, _CHUNK // max(1, mixture.streams * k * _POINTS))
     points = _cubature(mixture)
-    found = []
+    result = []
     for first in range(0, k, rows):
         share = _mean_shares(mixture, points[:, first : first + rows], config)
         own = torch.arange(first, first + share.shape[1], device=share.device)
-        found.append(torch.gather(share, 2, own.expand(share.shape[:2])[..., None])[..., 0])
-    return torch.where(mixture.valid, torch.cat(found, 1), 0.0)
+        result.append(torch.gather(share, 2, own.expand(share.shape[:2])[..., None])[..., 0])
+    return torch.where(mixture.valid, torch.cat(result, 1), 0.0)
 
 
 def _cubature(mixture: GaussianMixture) -> Tensor:

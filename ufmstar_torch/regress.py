@@ -263,13 +263,13 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
     """
     flat = valid.flatten(1)
     pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
-    asked = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
+    requested = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
     while True:
-        order = _random_order(pixels, seed)[:asked].to(valid.device, non_blocking=not on_cpu)
+        order = _random_order(pixels, seed)[:requested].to(valid.device, non_blocking=not on_cpu)
         usable = flat[:, order]
-        if asked >= pixels or bool((usable.sum(1) >= count).all()):
+        if requested >= pixels or bool((usable.sum(1) >= count).all()):
             break
-        asked *= 2
+        requested *= 2
     behind = usable.sum(1, keepdim=True) + (~usable).cumsum(1) - 1
     place = torch.where(usable, usable.cumsum(1) - 1, behind)  # the valid ones first, each part in the random order
     index = torch.empty_like(place).scatter_(1, place, order.expand_as(place))[:, :count]

@@ -227,8 +227,8 @@ def _anchors(options: BenchSettings, config: Any, source: Any, progress: Callabl
 
 def targets(report: dict[str, Any]) -> list[dict[str, Any]]:
     """The figures that have a target, for information: name, value (None = not measured), target, met."""
-    wanted = (r for r in report["results"] if r["size"] == _TARGET_SIZE and r["backend"] == "numba")
-    result, long_run, anchors = next(wanted, None), report["long_run"], report["anchors"]
+    expected = (r for r in report["results"] if r["size"] == _TARGET_SIZE and r["backend"] == "numba")
+    result, long_run, anchors = next(expected, None), report["long_run"], report["anchors"]
     values: dict[str, float | None] = dict.fromkeys(_TARGETS)
     if result is not None:
         values["spgf_ms"] = result["kernels"]["spgf"]["median_ms"]

@@ -81,13 +81,13 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
     path, opening = options.path, options.opening.given()
     Options(**{name: value for name, value in opening.items() if name not in ("layout", "poses")})
     one = path.startswith("tour:") or any(name in opening for name in _OF_ONE) or _is_one(Path(path))
-    found = [] if one else find_sequences(path, layout=options.opening.layout)
-    if not one and not found and options.opening.layout == "auto":
+    result = [] if one else find_sequences(path, layout=options.opening.layout)
+    if not one and not result and options.opening.layout == "auto":
         raise ValueError(f"{path} has no known layout, and nothing below it has; see docs/data.md, or --layout")
-    if one or not found:  # check_data names what a layout looks for
+    if one or not result:  # check_data names what a layout looks for
         return [check_data(path, pairs=options.pairs, **opening)], False
     return [
-        check_data(item.path, item.name, options.pairs, **{**opening, "layout": item.layout}) for item in found
+        check_data(item.path, item.name, options.pairs, **{**opening, "layout": item.layout}) for item in result
     ], True
 
 

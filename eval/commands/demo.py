@@ -140,7 +140,7 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
         unfamiliar: of every frame, whether most of it shows an unfamiliar room.
         rows: how many, at most.
     """
-    groups = [[i for i, is_new in enumerate(unfamiliar) if is_new == wanted and i > 0] for wanted in (False, True)]
+    groups = [[i for i, is_new in enumerate(unfamiliar) if is_new == expected and i > 0] for expected in (False, True)]
     present = [group for group in groups if group]
     chosen: list[int] = []
     for group in present:

@@ -285,8 +285,8 @@ def _outputs(
         if job.video:
             made["preview.mp4"] = None
     except ImportError as error:  # an optional package; the frames are what a run is for
-        wanted = {"contact_sheet.png": job.sheet, "preview.mp4": job.video}
-        made |= {name: str(error) for name, asked in wanted.items() if asked and name not in made}
+        expected = {"contact_sheet.png": job.sheet, "preview.mp4": job.video}
+        made |= {name: str(error) for name, requested in expected.items() if requested and name not in made}
     return made
 
 

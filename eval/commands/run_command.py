@@ -215,8 +215,8 @@ def _check_depth(options: Mapping[str, Any]) -> None:
     """
     model, depth = options["model"], options["depth"]
     if (model is None) == (depth is None):
-        wanted = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"
-        raise ValueError(f"the depth must come from one place: give {wanted}" + (", not both" if model else ""))
+        expected = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"
+        raise ValueError(f"the depth must come from one place: give {expected}" + (", not both" if model else ""))
     if model is not None and not options["weights"]:
         raise ValueError(f"--model {model} needs --weights FILE")
     of_folder = [name for name in _OF_FOLDER if options[name] not in (None, [])]

@@ -107,8 +107,8 @@ def evaluate_sequence(
     _check_arguments(rows, networks, confident)
     indices = range(len(sequence))[limit]
     _check_sequence(sequence, rows, indices)
-    wanted = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
-    sources = {(base, how): networks[base].prepared(how) for base, how in wanted}
+    expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
+    sources = {(base, how): networks[base].prepared(how) for base, how in expected}
     used = list(sources.values())
     tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
 

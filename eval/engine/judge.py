@@ -116,9 +116,9 @@ class RowMetrics(FrameSink):
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
         targets = {key: torch.from_numpy(row.truth) for key, row in result.rows.items() if row.truth is not None}
-        wanted = {other for key in targets for other in self._references[key]}
+        expected = {other for key in targets for other in self._references[key]}
         masks = {
-            other: confident_pixels(result.rows[other].estimate, targets[other], self._confident) for other in wanted
+            other: confident_pixels(result.rows[other].estimate, targets[other], self._confident) for other in expected
         }
         for key, target in targets.items():
             self._judge(key, result.rows[key], target, masks)

@@ -263,9 +263,9 @@ def _run_by(members: Iterable[DepthNetwork], inference: Inference) -> dict[str, 
 
 def _require_same_input(members: Iterable[DepthNetwork]) -> None:
     """Raises ValueError unless the members of an ensemble want the same input."""
-    wanted = [member.preprocess for member in members]
-    if any(other != wanted[0] for other in wanted[1:]):
-        raise ValueError(f"weights: the members of an ensemble must want the same input, got {wanted}")
+    expected = [member.preprocess for member in members]
+    if any(other != expected[0] for other in expected[1:]):
+        raise ValueError(f"weights: the members of an ensemble must want the same input, got {expected}")
 
 
 def _passes(members: list[DepthNetwork], mode: str, samples: int | None) -> int | None:

@@ -233,8 +233,8 @@ class FramePredictions:
 
 def sequence_digest(sequence: FrameSequence) -> str:
     """Hex digest of a sequence's name, layout, camera and frames' names."""
-    told = (sequence.name, sequence.layout, sequence.image_size, sequence.intrinsics.tolist(), sequence.names)
-    return hashlib.sha256(repr(told).encode()).hexdigest()
+    identity = (sequence.name, sequence.layout, sequence.image_size, sequence.intrinsics.tolist(), sequence.names)
+    return hashlib.sha256(repr(identity).encode()).hexdigest()
 
 
 def frame_digest(frame: Frame) -> str:

@@ -263,9 +263,9 @@ def _missing(
     """What ``eval.json`` lists, without records and failed sequences."""
     done = {(r.dataset, r.sequence, row_of(r)) for r in records}
     broken = {(f.dataset, f.sequence) for f in failed}
-    wanted = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
+    expected = sorted((s["dataset"], s["sequence"]) for s in about.get("sequences", []))
     rows = listed_rows(about)
-    return tuple((*s, row) for s in wanted if s not in broken for row in rows if (*s, row) not in done)
+    return tuple((*s, row) for s in expected if s not in broken for row in rows if (*s, row) not in done)
 
 
 # ---- sums over sequences ----

@@ -95,19 +95,19 @@ def references(results: Results, row: Row) -> list[Row]:
     same_images = Setting(skip=row.setting.skip, preprocess=row.setting.preprocess)
     plain = Setting(preprocess=row.setting.preprocess)
     mine = [r for r in results.rows if r.method.base == base and r != row]
-    wanted: list[Row] = []
+    expected: list[Row] = []
     if method.fusion != ALONE:
-        wanted += [r for r in mine if r.method.fusion == ALONE and r.setting == same_images]
+        expected += [r for r in mine if r.method.fusion == ALONE and r.setting == same_images]
     if method.fusion == UFM_STAR and row.setting.plain:
         points = [r for r in mine if r.method.fusion == UFM and not r.method.full and r.setting == plain]
-        wanted += sorted(points, key=lambda r: r.method.max_points or math.inf)[:1]
+        expected += sorted(points, key=lambda r: r.method.max_points or math.inf)[:1]
         if method.full or method.fixed_param:
             alike = (r for r in mine if r.method.fusion == UFM_STAR and r.setting == row.setting)
-            wanted += [r for r in alike if not (r.method.full or r.method.fixed_param)]
+            expected += [r for r in alike if not (r.method.full or r.method.fixed_param)]
     if row.setting != plain:  # an ablation's row, or the paper's settings, to ours
-        wanted += [r for r in mine if r.method == method and r.setting == row.setting.chosen]
-        wanted += [r for r in mine if r.method == method and row.setting.plain and r.setting == plain]
-    return [r for r in wanted if has_variance(results, r)]
+        expected += [r for r in mine if r.method == method and r.setting == row.setting.chosen]
+        expected += [r for r in mine if r.method == method and row.setting.plain and r.setting == plain]
+    return [r for r in expected if has_variance(results, r)]
 
 
 def has_variance(results: Results, row: Row) -> bool:

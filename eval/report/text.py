@@ -163,8 +163,8 @@ def run_table(summary: Mapping[str, Any]) -> str:
 
 def _anchor_lines(anchors: Mapping[str, Any], frames: int, kind: str) -> list[str]:
     """A line on the effect of anchors, and one on the frames that had none."""
-    used, found, tracked = (anchors[f"{key}_per_frame"] for key in ("used", "found", "tracked"))
-    line = f"anchors: {used:.1f} used a frame, of {found:.1f} {_FOUND[kind][0]} and {tracked:.1f} {_FOUND[kind][1]}"
+    used, actual, tracked = (anchors[f"{key}_per_frame"] for key in ("used", "found", "tracked"))
+    line = f"anchors: {used:.1f} used a frame, of {actual:.1f} {_FOUND[kind][0]} and {tracked:.1f} {_FOUND[kind][1]}"
     if used and anchors["mean_bias"] is not None:
         way = "nearer" if anchors["mean_bias"] < 0 else "farther"
         expected = f"{abs(anchors['mean_bias']):.0%} {way} than predicted"

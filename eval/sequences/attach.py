@@ -154,10 +154,10 @@ def no_pose(options: Options) -> str:
 
 def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
     """[N] the one whole number in each name, ``frame-000012`` being 12; None where a name has none or several."""
-    found = [re.findall(r"\d+", name) for name in names]
-    if not found or any(len(groups) != 1 for groups in found):
+    result = [re.findall(r"\d+", name) for name in names]
+    if not result or any(len(groups) != 1 for groups in result):
         return None
-    return np.array([float(groups[0]) for groups in found])
+    return np.array([float(groups[0]) for groups in result])
 
 
 def stem_times(names: Sequence[str]) -> np.ndarray | None:

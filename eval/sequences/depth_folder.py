@@ -109,12 +109,12 @@ class DepthFolder:
         Raises:
             ValueError: some frames have no map (they are listed).
         """
-        wanted = names if selected is None else selected
-        orders = (names_on_disk or names, names, wanted)
-        depth = _paired(self.path, self.files, wanted, orders)
+        expected = names if selected is None else selected
+        orders = (names_on_disk or names, names, expected)
+        depth = _paired(self.path, self.files, expected, orders)
         variance: tuple[Path, ...] = ()
         if self.variance_path is not None:
-            variance = _paired(self.variance_path, self.variance_files, wanted, orders)
+            variance = _paired(self.variance_path, self.variance_files, expected, orders)
         return DepthMaps(depth, variance, self.scale)
 
 
@@ -122,9 +122,9 @@ def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
     if not folder.is_dir():
         raise NotADirectoryError(f"{what}: no such folder: {folder}")
     files = list_files(folder, suffixes)
-    found = sorted({file.suffix.lower() for file in files})
-    if len(found) != 1:
-        content = f"several formats, {', '.join(found)}" if found else f"no map ({', '.join(suffixes)})"
+    result = sorted({file.suffix.lower() for file in files})
+    if len(result) != 1:
+        content = f"several formats, {', '.join(result)}" if result else f"no map ({', '.join(suffixes)})"
         raise ValueError(f"{what}: the folder {folder} holds {content}")
     return files
 

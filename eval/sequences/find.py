@@ -53,7 +53,7 @@ def find_sequences(root: str | Path, max_depth: int = 4, layout: str = "auto") -
         raise ValueError(f"max_depth must be at least 0, got {max_depth}")
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
-    return sorted(_below(root, root, max_depth, layout, set()), key=lambda found: found.name)
+    return sorted(_below(root, root, max_depth, layout, set()), key=lambda result: result.name)
 
 
 def _below(path: Path, root: Path, depth: int, layout: str, seen: set[Path]) -> Iterator[Found]:

@@ -149,11 +149,11 @@ def _images(path: Path, options: Options) -> tuple[list[str], list[Loader], Size
     if options.images is not None:
         source = resolve(path, options.images)
     elif path.is_dir():
-        found = _image_sources(path)
-        if len(found) != 1:
-            listing = f"found {[str(f) for f in found]}" if found else f"looked for {IMAGES} and a video file"
+        result = _image_sources(path)
+        if len(result) != 1:
+            listing = f"found {[str(f) for f in result]}" if result else f"looked for {IMAGES} and a video file"
             raise ValueError(f"{path}: pass images, there must be one folder of them or one video ({listing})")
-        source = found[0]
+        source = result[0]
     if source.is_file():
         video = Video(source)
         names = [f"{i:06d}" for i in range(len(video))]
@@ -223,8 +223,8 @@ def _depth_intrinsics(options: Options, K: np.ndarray, size: Size | None, depth_
 def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...], option: str) -> Path:
     if given is not None:
         return resolve(root, given)
-    found = [root / name for name in names if (root / name).is_file()]
-    if len(found) != 1:
-        listing = f"found {[file.name for file in found]}" if found else f"looked for {', '.join(names)}"
+    result = [root / name for name in names if (root / name).is_file()]
+    if len(result) != 1:
+        listing = f"found {[file.name for file in result]}" if result else f"looked for {', '.join(names)}"
         raise ValueError(f"{root}: pass {option}, exactly one file must be it ({listing})")
-    return found[0]
+    return result[0]

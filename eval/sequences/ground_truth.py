@@ -40,8 +40,8 @@ def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size
     row = np.floor(mapping[1, 1] * v + mapping[1, 2] + 0.5 + _BORDER).astype(np.intp)
     height, width = values.shape[:2]
     inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    found = values[row.clip(0, height - 1), column.clip(0, width - 1)]
-    return np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), found, np.zeros((), values.dtype))
+    result = values[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), result, np.zeros((), values.dtype))
 
 
 def scaled_to_map(K: NDArray, image_size: Size | None, map_size: Size) -> NDArray:

@@ -170,8 +170,8 @@ def _drive(path: Path, drive: str | int | None) -> Path:
 
 
 def _same_number(drive: str, name: str) -> bool:
-    found = re.search(r"drive_(\d+)", name)
-    return found is not None and drive.isdecimal() and int(drive) == int(found[1])
+    result = re.search(r"drive_(\d+)", name)
+    return result is not None and drive.isdecimal() and int(drive) == int(result[1])
 
 
 def _number(image: Path) -> int:
@@ -238,15 +238,15 @@ def _depth(
     T_cam_laser = calibration.T_rect_laser()
     scans = {int(file.stem): file for file in place.scans.glob("*.bin") if file.stem.isdecimal()}
     near = range(-(options.scans or 0), (options.scans or 0) + 1)
-    found: dict[str, Loader] = {}
+    result: dict[str, Loader] = {}
     for name in names:
         number = int(name)
         if number in scans and number in poses and np.isfinite(poses[number]).all():
             around = [
                 n for n in (number + step for step in near) if n in scans and np.isfinite(poses.get(n, UNKNOWN)).all()
             ]
-            found[name] = LaserDepth(tuple(_scan(scans[n], n, number, poses, T_cam_laser) for n in around), K, size)
-    return found
+            result[name] = LaserDepth(tuple(_scan(scans[n], n, number, poses, T_cam_laser) for n in around), K, size)
+    return result
 
 
 def _scan(path: Path, of: int, at: int, poses: dict[int, np.ndarray], T_cam_laser: np.ndarray) -> Scan:

@@ -134,9 +134,9 @@ def detect_layout(path: Path, explicit: bool = False) -> str:
         return fitting[0]
     if fitting:
         raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
-    wanted = "\n".join(f"  {name}: {looked_for}" for name, (_, _, looked_for) in _READERS.items())
+    expected = "\n".join(f"  {name}: {looked_for}" for name, (_, _, looked_for) in _READERS.items())
     inside = sorted(p.name for p in path.iterdir())[:8] if path.is_dir() else [path.name]
-    raise ValueError(f"{path} has no known layout. Looked for\n{wanted}\nand found {inside}")
+    raise ValueError(f"{path} has no known layout. Looked for\n{expected}\nand found {inside}")
 
 
 def layouts_of(path: Path) -> list[str]:

@@ -166,8 +166,8 @@ def _index(file: BinaryIO, path: Path, count: int) -> list[_Located]:
     """Pose, time [s], and where colour and depth lie, of the frames that are there completely."""
     here = file.tell()
     end = file.seek(0, io.SEEK_END)
-    found: list[_Located] = []
-    while len(found) < count and here + _FRAME.size <= end:
+    result: list[_Located] = []
+    while len(result) < count and here + _FRAME.size <= end:
         file.seek(here)
         values = _FRAME.unpack(file.read(_FRAME.size))
         color_time, _, color_bytes, depth_bytes = values[16:]
@@ -177,8 +177,8 @@ def _index(file: BinaryIO, path: Path, count: int) -> list[_Located]:
         if here > end:
             break
         T = np.array(values[:16], dtype=np.float64).reshape(4, 4)
-        found.append((T, color_time * _MICROSECOND if color_time else None, color, depth))
-    return found
+        result.append((T, color_time * _MICROSECOND if color_time else None, color, depth))
+    return result
 
 
 def _frame(number: int, located: _Located, depth_size: Size, scale: float) -> Entry | Skipped:

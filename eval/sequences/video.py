@@ -65,8 +65,8 @@ class Video:
             self._next = 0
         while self._next < index:
             self._advance(self._capture.grab(), index)
-        found, image = self._capture.read()
-        self._advance(found, index)
+        ok, image = self._capture.read()
+        self._advance(ok, index)
         return np.ascontiguousarray(image[..., ::-1])
 
     def _advance(self, found: bool, index: int) -> None:

@@ -43,7 +43,7 @@ def follow(
     # The flag asks for the patch's eigenvalue in place of the difference of the patches, which would be computed in a
     # pass of its own; neither is used.
     quick = cv2.OPTFLOW_LK_GET_MIN_EIGENVALS
-    forward, found, _ = cv2.calcOpticalFlowPyrLK(
+    forward, result, _ = cv2.calcOpticalFlowPyrLK(
         before, after, start, np.empty_like(start), maxLevel=_LEVELS, flags=quick, **options
     )
     # Back from where it came to, starting where it should arrive: the finest level tells.
@@ -54,7 +54,7 @@ def follow(
     height, width = after.shape
     u, v = forward[:, 0, 0], forward[:, 0, 1]
     inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    fine = (found[:, 0] == 1) & (returned[:, 0] == 1) & (gap < back_tolerance) & inside
+    fine = (result[:, 0] == 1) & (returned[:, 0] == 1) & (gap < back_tolerance) & inside
     return forward[:, 0].astype(np.float64), fine
 
 

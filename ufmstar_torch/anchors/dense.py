@@ -156,9 +156,9 @@ class DenseEvidence:
         elif gray.shape != self._camera[0] or not np.array_equal(K, self._camera[1]):
             raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
         small, scale = _reduced(gray, self.config.width)
-        found = self._measured(small, scale, T, scale @ K)
+        result = self._measured(small, scale, T, scale @ K)
         self._keyframes.add(small, T, self._depth)
-        return found
+        return result
 
     def _measured(self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray) -> Landmarks:
         """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, and new
@@ -173,18 +173,18 @@ class DenseEvidence:
         agreed, trusted, factor = np.zeros(len(pixel), dtype=np.bool_), True, 1.0
         chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
         if len(chosen) >= _AGREE:
-            wanted = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
-            every = -(-len(wanted) // self.config.searches) or 1
-            wanted = wanted[self._memory.frame % every :: every]
+            expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
+            every = -(-len(expected) // self.config.searches) or 1
+            expected = expected[self._memory.frame % every :: every]
             shares = np.array([share for share, _ in chosen])
             views = self._views([keyframe for _, keyframe in chosen], shares, T, K)
-            found = measure(small, pixel[wanted], views, self._search())
-            self._learn(found, shares)
+            actual = measure(small, pixel[expected], views, self._search())
+            self._learn(actual, shares)
             factor = max(self._disagreement, self._again, 1)
-            searched = len(wanted)
-            rho[wanted], variance[wanted] = found.rho, found.variance * factor
-            agreed[wanted] = (found.agreed >= _AGREE) & (found.contradicted == 0)
-            matched = int((found.agreed > 0).sum())
+            searched = len(expected)
+            rho[expected], variance[expected] = actual.rho, actual.variance * factor
+            agreed[expected] = (actual.agreed >= _AGREE) & (actual.contradicted == 0)
+            matched = int((actual.agreed > 0).sum())
             trusted = matched < _ENOUGH or agreed.sum() >= self.config.min_share * matched
         agreed &= (rho > np.sqrt(variance)) & trusted
         both, fine, differ = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])

@@ -104,13 +104,13 @@ def inliers(anchors: AnchorInput) -> Tensor:
     apart += TIE * torch.arange(n, device=few.device)
     apart.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
     distance, neighbour = apart.topk(min(NEIGHBOURS, n - 1), dim=2, largest=False)
-    asked = (distance < torch.inf) & anchors.valid[:, :, None]
+    requested = (distance < torch.inf) & anchors.valid[:, :, None]
     differ = (log_ratio[:, :, None] - _take(log_ratio, neighbour)).abs()
-    quartile = torch.where(asked, differ, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
+    quartile = torch.where(requested, differ, torch.nan).flatten(1).nanquantile(0.25, dim=1).nan_to_num(0.0)
     noise = anchors.variance / anchors.depth.square()  # of log g: no reason for mistrust
     sigma2 = (quartile / LOWER_QUARTILE).square()[:, None, None] + 2 * LEAST_SIGMA**2
     similar = differ <= SIMILAR_SIGMAS * (sigma2 + noise[:, :, None] + _take(noise, neighbour)).sqrt()
-    return anchors.valid & (few | ((similar & asked).sum(2) >= SUPPORT))
+    return anchors.valid & (few | ((similar & requested).sum(2) >= SUPPORT))
 
 
 def _take(value: Tensor, index: Tensor) -> Tensor:

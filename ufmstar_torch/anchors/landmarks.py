@@ -176,11 +176,11 @@ class LandmarkMap:
             size = (image.shape[0], image.shape[1])
         shifted = K.copy()
         shifted[:2, 2] += offset
-        found = self.anchors(torch.from_numpy(T)[None], torch.from_numpy(shifted), size)
-        assert found.valid is not None
-        kept = np.flatnonzero(found.valid[0].numpy())
+        result = self.anchors(torch.from_numpy(T)[None], torch.from_numpy(shifted), size)
+        assert result.valid is not None
+        kept = np.flatnonzero(result.valid[0].numpy())
         kept = kept[:: -(-len(kept) // _MOST) or 1]
-        pixel, depth, variance = (x[0].numpy()[kept] for x in (found.pixel, found.depth, found.variance))
+        pixel, depth, variance = (x[0].numpy()[kept] for x in (result.pixel, result.depth, result.variance))
         return Landmarks(pixel - offset, depth, variance, len(self.sigma), none="no landmark of the map is in view")
 
     def reset(self) -> None:

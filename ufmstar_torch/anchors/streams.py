@@ -53,13 +53,13 @@ class StreamLandmarks:
         K = intrinsics.detach().double().expand(b, 3, 3).cpu()
         before = self._states()
         try:
-            found = [s.update(pictures[i], T[i], K[i].numpy()) for i, s in enumerate(self._sources)]
+            result = [s.update(pictures[i], T[i], K[i].numpy()) for i, s in enumerate(self._sources)]
         except BaseException:
             self._restore(before, range(b))
             raise
         self._before = before
-        room = max(len(landmarks.depth) for landmarks in found)
-        each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(found)]
+        room = max(len(landmarks.depth) for landmarks in result)
+        each = [landmarks.anchors(K[i].numpy(), K[i], room) for i, landmarks in enumerate(result)]
         known = [one.confirmed for one in each if one.confirmed is not None]
         parts = {name: torch.cat([getattr(one, name) for one in each]) for name in _PARTS}
         return Anchors(**parts, confirmed=torch.cat(known) if len(known) == b else None).to(image.device)

@@ -130,8 +130,8 @@ class Landmarks:
 
         valid = torch.arange(room, device=intrinsics.device)[None] < n
         confirmed = None if self.confirmed is None else padded(self.confirmed, np.int64)
-        found = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, confirmed)
-        return found.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
+        result = Anchors(padded(self.pixel), padded(self.depth), padded(self.variance), valid, confirmed)
+        return result.moved(torch.as_tensor(K_camera), intrinsics.reshape(3, 3))
 
 
 class LandmarkTracker:
@@ -245,11 +245,11 @@ class LandmarkTracker:
         if len(free) < max(1, self.config.max_points // 5):
             return
         spacing = self.config.spacing * gray.shape[1] / 640
-        found = find(gray, len(free), spacing, self._pixel[followed, self._view])
-        slots = free[: len(found)]
+        result = find(gray, len(free), spacing, self._pixel[followed, self._view])
+        slots = free[: len(result)]
         self._seen[slots] = False
         self._seen[slots, self._view] = True
-        self._pixel[slots, self._view] = found
+        self._pixel[slots, self._view] = result
 
     def _landmarks(self, tracked: int) -> Landmarks:
         """What the views in the window say of the corners that the newest one shows."""
@@ -259,22 +259,22 @@ class LandmarkTracker:
             return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked)
         from ufmstar_torch.kernels.triangulate_cpu import triangulate  # compiles when it is first needed
 
-        found = triangulate(self._pixel[chosen], self._seen[chosen], self._poses, self._K)
+        result = triangulate(self._pixel[chosen], self._seen[chosen], self._poses, self._K)
         T = self._poses[self._view]
         axis = T[:3, 2]
-        depth = (found.point - T[:3, 3]) @ axis
-        fits, views = found.error <= config.max_error, self._seen[chosen].sum(1)
-        residual = np.square(found.error) * 2 * views / np.maximum(2 * views - 3, 1)
-        long = fits & found.ahead & (views >= _LONG)
+        depth = (result.point - T[:3, 3]) @ axis
+        fits, views = result.error <= config.max_error, self._seen[chosen].sum(1)
+        residual = np.square(result.error) * 2 * views / np.maximum(2 * views - 3, 1)
+        long = fits & result.ahead & (views >= _LONG)
         if long.sum() >= _ENOUGH:
             self._noise = _MEMORY * self._noise + (1 - _MEMORY) * float(np.median(residual[long]))
         # A track that fits worse than the noise allows is as uncertain as it fits.
-        one_pixel = np.einsum("i,nij,j->n", axis, found.covariance, axis)
+        one_pixel = np.einsum("i,nij,j->n", axis, result.covariance, axis)
         variance = _DRIFT * (views - 1) * np.maximum(residual, self._noise) * one_pixel
         safe = np.maximum(depth, 1e-9)
         # Two views contradict each other across the epipolar line only; three tell, if enough tracks have them.
         telling = fits[views > 2] if (views > 2).sum() >= _ENOUGH else fits
-        fine = fits & found.ahead & (depth > 0) & (telling.mean() >= config.min_share)
+        fine = fits & result.ahead & (depth > 0) & (telling.mean() >= config.min_share)
         # Hopeless geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))

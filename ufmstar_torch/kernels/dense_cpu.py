@@ -111,17 +111,17 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
         search: see there.
     """
     n, v = len(pixel), len(views.image)
-    found = Measured(
+    result = Measured(
         *(np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)),
         *(np.full((n, v), np.nan) for _ in range(3)),
     )
     numbers = (search.start, search.low, search.high, search.sigmas, search.least_score, search.rival, search.match)
     _measure(
         *(image, pixel, views.image, views.H, views.b, views.noise, numbers),
-        *(found.rho, found.variance, found.agreed, found.contradicted),
-        *(found.across, found.across_noise, found.differ),
+        *(result.rho, result.variance, result.agreed, result.contradicted),
+        *(result.across, result.across_noise, result.differ),
     )
-    return found
+    return result
 
 
 @compiled

@@ -41,8 +41,8 @@ def own_shares(mixture: GaussianMixture, config: UfMStarConfig) -> Tensor:
     mean, covariance, weight = _arrays(mixture)
     for b in range(mixture.streams):
         occupied = np.flatnonzero(weight[b] > 0)
-        found = _own_shares(mean[b][occupied], covariance[b][occupied], weight[b][occupied], config.prior_weight)
-        own[b, torch.from_numpy(occupied)] = torch.from_numpy(found)
+        result = _own_shares(mean[b][occupied], covariance[b][occupied], weight[b][occupied], config.prior_weight)
+        own[b, torch.from_numpy(occupied)] = torch.from_numpy(result)
     return own
 
 

@@ -48,13 +48,13 @@ def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[Gauss
     spread = np.empty(absent, z.dtype) if given.variance is None else _array(given.variance)
     limits = _limits(given, before_pruning)
     labels = np.empty(z.shape, np.int64)
-    found = []
+    result = []
     for b, K in enumerate(given.intrinsics.tolist()):
         fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
         slope = given.config.slope(min(fx, fy))
         bins = _depth_bins(0.5 * min(z.shape[2] / fx, z.shape[1] / fy), limits)
-        found.append(segment_image(z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, labels[b]))
-    return _mixture(found, given, labels), torch.from_numpy(labels)
+        result.append(segment_image(z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, labels[b]))
+    return _mixture(result, given, labels), torch.from_numpy(labels)
 
 
 def _mixture(

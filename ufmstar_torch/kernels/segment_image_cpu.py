@@ -300,7 +300,7 @@ def _lift(segment, ry, h):
 @compiled
 def _best_overlap(h_int, active, before, whole):
     """The Gaussian active before this row whose stored interval overlaps the segment's most, or -1."""
-    best, found = 0.0, -1
+    best, result = 0.0, -1
     low, high = h_int[_UL], h_int[_UR]
     for i in range(before):
         o = active[i]
@@ -308,8 +308,8 @@ def _best_overlap(h_int, active, before, whole):
         if shared > 0:
             rho = shared / (max(whole[o, _UR], high) - min(whole[o, _UL], low))
             if rho > best:
-                best, found = rho, o
-    return found
+                best, result = rho, o
+    return result
 
 
 @compiled
