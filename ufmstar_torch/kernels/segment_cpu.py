@@ -1,19 +1,27 @@
 """SPGF on the CPU (numba): the same partitions as :mod:`ufmstar_torch.segment`, in well under a millisecond
 at 224 x 224.
 
-One thread per call and no shared state: calls from several Python threads run side by side (the GIL is
-released), and no thread pool stands in the way of fork.
+The rows of an image are segmented on all threads that torch may use, their segments fused on one.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.kernels.segment_image_cpu import compiled, segment_image, write_gaussians
+from ufmstar_torch.kernels.compiled_cpu import compiled
+from ufmstar_torch.kernels.segment_image_cpu import (
+    SEGMENT,
+    SEGMENT_INT,
+    join_rows,
+    scan_rows,
+    write_gaussians,
+)
+from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
 
@@ -43,18 +51,28 @@ class _Limits(NamedTuple):
 def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, for CPU tensors, float64 inside."""
     z = given.depth.contiguous().numpy()
-    absent = (z.shape[0], 1, 0)  # rows of no pixels stand for "not given"
+    absent = (z.shape[0], z.shape[1], 0)  # rows of no pixels stand for "not given"
     use = np.empty(absent, np.bool_) if given.valid is None else given.valid.contiguous().numpy()
     spread = np.empty(absent, z.dtype) if given.variance is None else _array(given.variance)
     limits = _limits(given, before_pruning)
+    streams, height, width = z.shape
+    rooms = height * given.segments_per_row
+    tables = np.empty((streams, rooms, SEGMENT)), np.empty((streams, rooms, SEGMENT_INT), np.int64)
+    spans, owner = np.empty((streams, height, 2), np.int64), np.empty(z.shape, np.int32)
     labels = np.empty(z.shape, np.int64)
-    result = []
+    shares = shares_of_stream(streams, z[0].size)
+    ends = [height * i // shares for i in range(shares + 1)]
+    scans, joins = [], []
     for b, K in enumerate(given.intrinsics.tolist()):
         fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
         slope = given.config.slope(min(fx, fy))
-        bins = _depth_bins(0.5 * min(z.shape[2] / fx, z.shape[1] / fy), limits)
-        result.append(segment_image(z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, labels[b]))
-    return _mixture(result, given, labels), torch.from_numpy(labels)
+        bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
+        written = (spans[b], tables[0][b], tables[1][b], owner[b])
+        for rows in itertools.pairwise(ends):
+            scans.append((z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, *rows, *written))
+        joins.append((fy, cy, slope, bins[0], limits, *written, labels[b]))
+    each(scan_rows, scans)
+    return _mixture(each(join_rows, joins), given, labels), torch.from_numpy(labels)
 
 
 def _mixture(
