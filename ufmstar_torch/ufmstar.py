@@ -150,7 +150,7 @@ class UfMStar(StatefulModule):
             features=out.features,
             measured=out.measured.reshape(shape),
             valid=frame.valid.reshape(shape),
-            labels=out.labels,
+            read_labels=out.read_labels,
             current_cam=out.current_cam,
             statistics=out.statistics,
         )
