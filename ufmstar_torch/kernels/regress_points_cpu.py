@@ -8,18 +8,16 @@ looks only at the components whose boxes meet its own.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
 
-compiled: Any = njit(cache=True, nogil=True)
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 _LEAF = 16  # points; below that choosing components costs more than it saves
 _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 
 
-@compiled
+@part
 def prepare(mean, covariance, weight):
     """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
     index = np.flatnonzero(weight > 0)
@@ -41,7 +39,7 @@ def prepare(mean, covariance, weight):
     return index, whitening, log_peak
 
 
-@compiled
+@kernel
 def unprojected(depth, valid, K, pixels, points):
     """Points [P, 3] of pixels [P] in the dtype of depth [H, W] (``camera.unproject_at``); NaN where not valid."""
     real = depth.dtype.type
@@ -52,7 +50,7 @@ def unprojected(depth, valid, K, pixels, points):
         points[i, 0], points[i, 1], points[i, 2] = (real(u) - cx) / fx * z, (real(v) - cy) / fy * z, z
 
 
-@compiled
+@kernel
 def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
     """Regress m [K] and features [K, F] at points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not
     finite."""
@@ -87,7 +85,7 @@ def at_points(points, mean, covariance, weight, m, features, prior_weight, prior
                 out_f[g, p] = sums[g] / evidence if known - known == 0 else np.nan
 
 
-@compiled
+@kernel
 def distribute_points(points, values, mean, covariance, weight, prior_weight, epsilon, out):
     """Add values [P, C] at points [P, 3] to the components [K, C] that explain them, by their shares; in the order of
     the points."""
@@ -121,7 +119,7 @@ def distribute_points(points, values, mean, covariance, weight, prior_weight, ep
                 out[listed[p, j], c] += density[p, j] / evidence[p] * values[p, c]
 
 
-@compiled
+@part
 def _boxes(mean, covariance, index, log_peak, limit):
     """Per component the box [2, 3] (least and greatest corner) outside of which it adds less than ``limit``.
 
@@ -139,7 +137,7 @@ def _boxes(mean, covariance, index, log_peak, limit):
     return boxes
 
 
-@compiled
+@part
 def _touched(points, chosen, candidates, boxes):
     """Those candidates, in their order, whose box meets the bounding box of the chosen points."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -159,7 +157,7 @@ def _touched(points, chosen, candidates, boxes):
     return kept[:n]
 
 
-@compiled
+@part
 def _by_place(points, everyone, components):
     """Points in the order of a k-d tree, and how many of them, next to each other, make a leaf.
 
