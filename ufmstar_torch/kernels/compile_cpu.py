@@ -12,5 +12,5 @@ from typing import Any
 from numba import njit
 from numba.extending import register_jitable
 
-kernel: Any = njit(cache=True, nogil=True, error_model="numpy")
+kernel: Any = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 part: Any = register_jitable(error_model="numpy")

@@ -130,7 +130,7 @@ def _exceeds(S, floor):
     return S[2, 2] - floor - least - l20 * S[2, 0] - c * c / b > least
 
 
-@kernel
+@part
 def floor_covariance(covariance, floor):
     """Lift the eigenvalues of every positive semidefinite covariance [N, 3, 3] to floor [N], in place."""
     M, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)

@@ -20,7 +20,7 @@ _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 @part
 def prepare(mean, covariance, weight):
     """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
-    index = np.flatnonzero(weight > 0)
+    index = _occupied(weight)
     whitening = np.empty((index.size, 6))
     log_peak = np.empty(index.size)
     for i in range(index.size):
@@ -37,6 +37,16 @@ def prepare(mean, covariance, weight):
         whitening[i, 3] = -(l20 * whitening[i, 0] + l21 * whitening[i, 1]) / l22
         log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - _HALF_LOG_TWO_PI_CUBED
     return index, whitening, log_peak
+
+
+@part
+def _occupied(weight):
+    """Indices of positive weights; ``np.flatnonzero`` takes longer to compile."""
+    index, n = np.empty(weight.size, np.int64), 0
+    for k in range(weight.size):
+        index[n] = k
+        n += weight[k] > 0
+    return index[:n]
 
 
 @kernel
@@ -169,19 +179,45 @@ def _by_place(points, everyone, components):
     while levels > 0 and leaf > _LEAF:
         levels -= 1
         for first in range(0, order.size, leaf):
-            part = order[first : first + leaf].copy()
             widest, axis = -1.0, 0
             for i in range(3):
                 low, high = np.inf, -np.inf
-                for p in part:
+                for p in order[first : first + leaf]:
                     value = np.float64(points[p, i])
                     if value - value == 0:
                         low, high = min(low, value), max(high, value)
                 if high - low > widest:
                     widest, axis = high - low, i
-            keys = np.empty(part.size)
-            for n in range(part.size):
-                keys[n] = points[part[n], axis]
-            order[first : first + leaf] = part[np.argsort(keys)]
+            _sort_along(points, axis, order[first : first + leaf])
         leaf = (leaf + 1) // 2
     return order, leaf
+
+
+@part
+def _sort_along(points, axis, order):
+    """Sort numbers of points by a coordinate, NaN last, in place (heapsort): ``np.argsort``, and a slice assignment,
+    take seconds to compile."""
+    n = order.size
+    for first in range(n // 2 - 1, -1, -1):
+        _sift(points, axis, order, first, n)
+    for last in range(n - 1, 0, -1):
+        order[0], order[last] = order[last], order[0]
+        _sift(points, axis, order, 0, last)
+
+
+@part
+def _sift(points, axis, order, root, n):
+    """Let the root of a heap of n numbers sink to its place."""
+    while 2 * root + 1 < n:
+        child = 2 * root + 1
+        if child + 1 < n and _before(points[order[child], axis], points[order[child + 1], axis]):
+            child += 1
+        if not _before(points[order[root], axis], points[order[child], axis]):
+            return
+        order[root], order[child] = order[child], order[root]
+        root = child
+
+
+@part
+def _before(a, b):
+    return a < b or (b != b and a == a)
