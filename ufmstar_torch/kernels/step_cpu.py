@@ -202,7 +202,8 @@ def _correspond(
     everyone = np.empty(0, np.bool_)
     move(stream.into_camera, *old[:3], 0, everyone, mean_cam, covariance_cam)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    c, k, overlap = matches(mean_cam, covariance_cam, old.weight, *current[:3], stream.K, *size, *thresholds)
+    weight = np.asarray(old.weight, np.float64)  # the segments' dtype: one kernel to compile instead of two
+    c, k, overlap = matches(mean_cam, covariance_cam, weight, *current[:3], stream.K, *size, *thresholds)
     matched = np.zeros(current.weight.shape, np.bool_)
     matched[c] = True
     # What is nearer than the near plane could never be matched again: it is not remembered.
