@@ -31,14 +31,14 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
+from numba import types
+from numba.extending import overload, register_jitable
 
-from ufmstar_torch.kernels.compiled_cpu import compiled, contracted, leaf
+from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf, part
 from ufmstar_torch.kernels.regress_points_cpu import prepare
 
 # Of finite numbers, so that least and greatest can be found several at a time.
-finite: Any = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, fastmath={"nnan", "nsz"})
+finite: Any = register_jitable(error_model="numpy", _nrt=False, fastmath={"nnan", "nsz"})
 
 _TILE = 8  # pixels
 _PIXELS = _TILE * _TILE
@@ -66,7 +66,8 @@ def _exp2_overload(t):
         # 2^n 2^r with |r| <= 1/2 and the minimax polynomial of degree 5 (2.3e-7 relative with its rounding), as code
         # without branches, which the compiler turns into vector instructions.
         # Adding 1.5 2^23 rounds to an integer, in the last bits, from where a shift brings it to the exponent.
-        # Below 2^-100, and for NaN, it is 0: products with numbers too small for normal floats take a hundred times as long.
+        # Below 2^-100, and for NaN, it is 0: products with numbers too small for normal floats take a hundred times
+        # as long.
         n = np.float32(t + np.float32(12582912.0))
         r = t - (n - np.float32(12582912.0))
         p = np.float32(0.00132764718)
@@ -81,7 +82,7 @@ def _exp2_overload(t):
     return exp2_32
 
 
-@compiled
+@kernel
 def exact(
     depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
 ):
@@ -110,7 +111,7 @@ def exact(
     )  # fmt: skip
 
 
-@compiled
+@kernel
 def exact_at(
     depth, valid, K, pixels, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f
 ):
@@ -133,15 +134,17 @@ def exact_at(
     )  # fmt: skip
 
 
-@compiled
+@part
 def _scratch(n, zero, out_f):
     """Memory for what is in work on a block, with n components: the points [16, 192] of its tiles, the tiles' boxes and
     origins [16, 9], depths, whether a tile has a pixel, buffer, sums of features, terms, bounds and two lists."""
     real = np.array([zero])
     return (
-        np.empty((_TILES, 3 * _PIXELS), real.dtype), np.empty((_TILES, 9)), np.empty(_PIXELS), np.empty(_TILES, np.bool_),
+        np.empty((_TILES, 3 * _PIXELS), real.dtype), np.empty((_TILES, 9)), np.empty(_PIXELS),
+        np.empty(_TILES, np.bool_),
         np.empty(8 * _PIXELS, real.dtype), np.empty((out_f.shape[0], _PIXELS), real.dtype),
-        np.empty((n + 1, _TERMS), real.dtype), np.empty((2, n), real.dtype), np.empty(n, np.int64), np.empty(n, np.int64),
+        np.empty((n + 1, _TERMS), real.dtype), np.empty((2, n), real.dtype), np.empty(n, np.int64),
+        np.empty(n, np.int64),
     )  # fmt: skip
 
 

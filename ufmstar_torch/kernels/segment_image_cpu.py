@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ufmstar_torch.kernels.compiled_cpu import compiled, leaf
+from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
 
 # Where counters start. numba gives a plain 0 a type of its own, and compiles all that is called with it twice.
 _ZERO: Any = np.int64(0)
@@ -49,7 +49,7 @@ class _Open(NamedTuple):
     dzz: float
 
 
-@compiled
+@kernel
 def scan_rows(
     z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, owner
 ):
@@ -84,14 +84,14 @@ def segments_of_row(width, limits):
     return max(width // (limits.sparse + 1), 1)
 
 
-@compiled
-def join_rows(fy, cy, slope, lengths2, limits, spans, table, table_int, owner, labels):
-    """Fuse the segments of all rows of an image, from the first row to the last, and write its labels.
+@kernel
+def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
+    """Fuse the segments of all rows of an image, from the first row to the last.
 
-    Returns which Gaussians are kept, in emission order, and all their values.
+    Returns which Gaussians are kept, in emission order, all their values, and the slot among those kept of the segment
+    that ``owner`` names (see :func:`scan_rows`), -1 for none.
     """
-    height, width = labels.shape
-    most = segments_of_row(width, limits)
+    height, most = spans.shape[0], segments_of_row(width, limits)
     member = np.empty(table.shape[0], np.int64)  # segment -> Gaussian
     active, interval = np.empty(2 * most, np.int64), np.empty((2, 2 * most), np.int64)
     gaussians, whole = np.empty((4 * most + 64, _GAUSSIAN)), np.empty((4 * most + 64, _GAUSSIAN_INT), np.int64)
@@ -104,13 +104,24 @@ def join_rows(fy, cy, slope, lengths2, limits, spans, table, table_int, owner, l
             active, interval, before, created, member, h,
         )  # fmt: skip
         before, emitted = _retire(active, interval, n, v, v == height - 1, whole, emitted)
-    kept, slot, label = np.empty(created, np.int64), np.empty(created, np.int64), np.empty(table.shape[0] + 1, np.int64)
-    n = _prune(whole, created, limits, np.empty(created, np.int64), kept, slot)
-    _label(spans, member, slot, owner, label, labels)
-    return kept[:n], gaussians, whole
+    kept, place, slot = np.empty(created, np.int64), np.empty(created, np.int64), np.empty(table.shape[0] + 1, np.int64)
+    n = _prune(whole, created, limits, np.empty(created, np.int64), kept, place)
+    slot[0] = -1
+    for v in range(height):
+        for i in range(spans[v, 0], spans[v, 1]):
+            slot[i + 1] = place[member[i]]
+    return kept[:n], gaussians, whole, slot
 
 
-@compiled
+@kernel
+def write_labels(owner, slot, labels):
+    """The slot of every pixel's segment, or -1."""
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            labels[v, u] = slot[owner[v, u]]
+
+
+@part
 def _doubled(table):
     """The same rows with as many free ones behind them."""
     out = np.empty((2 * table.shape[0], table.shape[1]), table.dtype)
@@ -247,17 +258,6 @@ def _scanline(
     for u in range(depth.size):
         owner[v, u] = place[owner[v, u]]
     return done
-
-
-@leaf
-def _label(spans, member, slot, owner, label, labels):
-    """The slot of every pixel's segment, or -1; ``label`` is scratch."""
-    label[0] = -1
-    for v in range(labels.shape[0]):
-        for i in range(spans[v, 0], spans[v, 1]):
-            label[i + 1] = slot[member[i]]
-        for u in range(labels.shape[1]):
-            labels[v, u] = label[owner[v, u]]
 
 
 @leaf
@@ -474,7 +474,7 @@ def _merge(o, o_int, h, h_int):
 
 
 @leaf
-def _prune(whole, created, limits, emitted, kept, slot):
+def _prune(whole, created, limits, emitted, kept, place):
     """Write the kept Gaussians in order of emission, and for each in order of creation its place among them or -1.
 
     Returns how many are kept; ``emitted`` is scratch.
@@ -484,16 +484,16 @@ def _prune(whole, created, limits, emitted, kept, slot):
     n = 0
     for i in range(created):
         g = emitted[i]
-        slot[g] = -1
+        place[g] = -1
         large, tall = whole[g, _N] >= limits.min_pixels, whole[g, _MERGED] >= limits.min_rows
         if limits.prune == 0 or (large and tall) or (limits.prune == 1 and (large or tall)):
             kept[n] = g
-            slot[g] = n
+            place[g] = n
             n += 1
     return n
 
 
-@compiled
+@kernel
 def write_gaussians(kept, gaussians, whole, mean, covariance, weight, count):
     """The kept Gaussians as the mixture's slots; a single pixel has no sample covariance (zeros)."""
     for i in range(kept.size):
