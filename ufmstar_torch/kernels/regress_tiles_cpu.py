@@ -46,7 +46,7 @@ _SIDE = 4  # tiles of a block
 _TILES = _SIDE * _SIDE
 _PRIOR = 1e-3  # share of the prior in a threshold
 _FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
-_TERMS = 12  # of a component beside a tile: whitening (6), whitened offset (3), log2 of the peak, m, last feature
+_TERMS = 9  # of a component, whatever the tile: whitening (6), log2 of the peak, m, last feature
 _LOG2_E = math.log2(math.e)
 # Rows of a tile's buffer, each of 64 numbers.
 _X, _Y, _Z, _EVIDENCE, _TOTAL, _LAST, _FIRST, _SECOND = (i * _PIXELS for i in range(8))
@@ -83,77 +83,73 @@ def _exp2_overload(t):
 
 
 @kernel
-def exact(
-    depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
-):
-    """One stream; of its blocks every ``shares``-th, from ``first`` on.
+def in_view(mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero):
+    """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
 
-    depth [H, W], valid [H, W], K [3, 3] and the mixture [K, ...] into out [H, W] and out_f [F, H, W]; NaN where not
-    valid.
+    Returns:
+        Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n], the terms of the sum
+        [n, 9], and the settings (prior weight and mean, epsilon, log2 of the least threshold).
     """
-    height, width = depth.shape
     index, whitening, log_peak = prepare(mean, covariance, weight)
     least = math.log2(_PRIOR * prior_weight)
-    fields, packed = np.empty((index.size, _FIELDS)), np.empty((_FIELDS, index.size), out.dtype)
-    n = _visible(
-        mean, covariance, index, whitening, log_peak, K, height, width, _limit(epsilon, index.size) + least, fields,
-        packed,
-    )  # fmt: skip
+    limit = _limit(epsilon, index.size) + least
+    fields, constants = np.empty((index.size, _FIELDS)), np.empty((index.size, _TERMS), np.array(zero).dtype)
+    n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
+    packed = np.empty((_FIELDS, n), constants.dtype)
+    for i in range(_FIELDS):
+        for k in range(n):
+            packed[i, k] = fields[k, i]
+    return index[:n], fields, packed, constants, (prior_weight, prior_mean, epsilon, least)
+
+
+@kernel
+def exact(depth, K, view, features, out, out_f, first, shares):
+    """One stream; of its blocks every ``shares``-th, from ``first`` on.
+
+    depth [H, W], K [3, 3], what is in view (:func:`in_view`) and features [K, F] into out [H, W] and out_f [F, H, W];
+    NaN where the depth is not positive.
+    """
+    height, width = depth.shape
     columns, rows = (width + _TILE - 1) // _TILE, (height + _TILE - 1) // _TILE
     across, down = np.empty((columns, _PIXELS)), np.empty((rows, _PIXELS))
     for i in range(columns * _PIXELS):
         across[i // _PIXELS, i % _PIXELS] = (i // _PIXELS * _TILE + i % _TILE - K[0, 2]) / K[0, 0]
     for i in range(rows * _PIXELS):
         down[i // _PIXELS, i % _PIXELS] = (i // _PIXELS * _TILE + i % _PIXELS // _TILE - K[1, 2]) / K[1, 1]
-    _blocks(
-        depth, valid, across, down, index, n, fields, packed, np.empty((_FIELDS, n), out.dtype), m, features,
-        (prior_weight, prior_mean, epsilon, least), *_scratch(n, out.dtype.type(0), out_f), out, out_f, first, shares,
-    )  # fmt: skip
+    _blocks(depth, across, down, view, features, _scratch(view[2], out_f), out, out_f, first, shares)
 
 
 @kernel
-def exact_at(
-    depth, valid, K, pixels, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f
-):
+def exact_at(depth, K, pixels, view, features, out, out_f):
     """One stream at some pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
     height, width = depth.shape
-    index, whitening, log_peak = prepare(mean, covariance, weight)
-    least = math.log2(_PRIOR * prior_weight)
-    fields, packed = np.empty((index.size, _FIELDS)), np.empty((_FIELDS, index.size), out.dtype)
-    n = _visible(
-        mean, covariance, index, whitening, log_peak, K, height, width, _limit(epsilon, index.size) + least, fields,
-        packed,
-    )  # fmt: skip
     side = _TILE * _SIDE
     columns, rows = (width + side - 1) // side, (height + side - 1) // side
     begin, order = np.zeros(rows * columns + 1, np.int64), np.empty(pixels.size, np.int64)
     _by_block(pixels, width, columns, begin, order)
-    _at_pixels(
-        depth, valid, K, pixels, begin, order, np.empty((2, _PIXELS)), index, n, fields, packed, m, features,
-        (prior_weight, prior_mean, epsilon, least), *_scratch(n, out.dtype.type(0), out_f), out, out_f,
-    )  # fmt: skip
+    rays = np.empty((2, _PIXELS))
+    _at_pixels(depth, K, pixels, begin, order, rays, view, features, _scratch(view[2], out_f), out, out_f)
 
 
 @part
-def _scratch(n, zero, out_f):
-    """Memory for what is in work on a block, with n components: the points [16, 192] of its tiles, the tiles' boxes and
-    origins [16, 9], depths, whether a tile has a pixel, buffer, sums of features, terms, bounds and two lists."""
-    real = np.array([zero])
+def _scratch(packed, out_f):
+    """Memory for the work on one block, of components ``packed`` [10, n]: the points [16, 192] of its tiles, their
+    boxes and origins [16, 9], depths, work on them, whether a tile has a pixel; buffer and sums of features;
+    fields, bounds and two lists of components."""
+    n, dtype = packed.shape[1], packed.dtype
     return (
-        np.empty((_TILES, 3 * _PIXELS), real.dtype), np.empty((_TILES, 9)), np.empty(_PIXELS),
+        np.empty((_TILES, 3 * _PIXELS), dtype), np.empty((_TILES, 9)), np.empty(_PIXELS), np.empty((6, _PIXELS)),
         np.empty(_TILES, np.bool_),
-        np.empty(8 * _PIXELS, real.dtype), np.empty((out_f.shape[0], _PIXELS), real.dtype),
-        np.empty((n + 1, _TERMS), real.dtype), np.empty((2, n), real.dtype), np.empty(n, np.int64),
-        np.empty(n, np.int64),
+        np.empty(8 * _PIXELS, dtype), np.empty((out_f.shape[0], _PIXELS), dtype),
+        np.empty((_FIELDS, n), dtype), np.empty((2, n), dtype), np.empty(n, np.int64), np.empty(n, np.int64),
     )  # fmt: skip
 
 
 @leaf
-def _blocks(
-    depth, valid, across, down, index, n, fields, everyone, near, m, features, settings, points, boxes, z, seen, buffer,
-    sums, terms, bounds, in_block, in_tile, out, out_f, first, shares,
-):  # fmt: skip
+def _blocks(depth, across, down, view, features, scratch, out, out_f, first, shares):
     """The blocks of an image, of which every ``shares``-th is done, from ``first`` on."""
+    points, boxes, z, work, seen, buffer, sums, near, bounds, in_block, in_tile = scratch
+    _, _, everyone, _, settings = view
     side = _TILE * _SIDE
     rows, columns = (depth.shape[0] + side - 1) // side, (depth.shape[1] + side - 1) // side
     for block in range(first, rows * columns, shares):
@@ -161,15 +157,15 @@ def _blocks(
         some = False
         for tile in range(_TILES):
             v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
-            seen[tile] = v < depth.shape[0] and u < depth.shape[1] and _depths(depth, valid, v, u, z)
+            seen[tile] = v < depth.shape[0] and u < depth.shape[1] and _depths(depth, v, u, z)
             if seen[tile]:
                 some = True
-                _place(z, across, u // _TILE, down, v // _TILE, points, boxes, tile)
+                _place(z, across, u // _TILE, down, v // _TILE, points, boxes, tile, work)
             else:
                 _blank(v, u, out, out_f)
         if not some:
             continue
-        count = _cull(everyone, n, _union(boxes, seen), settings, bounds, in_block)
+        count = _cull(everyone, everyone.shape[1], _union(boxes, seen), settings, bounds, in_block)
         for i in range(_FIELDS):
             for j in range(count):
                 near[i, j] = everyone[i, in_block[j]]
@@ -178,9 +174,8 @@ def _blocks(
                 chosen = _cull(near, count, _box(boxes, tile), settings, bounds, in_tile)
                 for j in range(chosen):
                     in_tile[j] = in_block[in_tile[j]]
-                _sum(points, boxes, tile, in_tile, chosen, index, fields, m, features, settings, buffer, sums, terms)
-                v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
-                _finish(valid, v, u, buffer, sums, out, out_f)
+                _sum(points, boxes, tile, in_tile, chosen, view, features, buffer, sums)
+                _finish(depth, v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE, buffer, sums, out, out_f)
 
 
 @leaf
@@ -201,35 +196,30 @@ def _by_block(pixels, width, columns, begin, order):
 
 
 @leaf
-def _at_pixels(
-    depth, valid, K, pixels, begin, order, rays, index, n, fields, everyone, m, features, settings, points, boxes, z,
-    seen, buffer, sums, terms, bounds, kept, unused, out, out_f,
-):  # fmt: skip
+def _at_pixels(depth, K, pixels, begin, order, rays, view, features, scratch, out, out_f):
     """The blocks of an image at some pixels."""
+    points, boxes, z, work, _, buffer, sums, _, bounds, kept, _ = scratch
+    _, _, everyone, _, settings = view
     nan = out.dtype.type(np.nan)
     for block in range(begin.size - 1):
         for low in range(begin[block], begin[block + 1], _PIXELS):
-            some = False
             high = min(low + _PIXELS, begin[block + 1])
             for i in range(_PIXELS):
                 p = pixels[order[min(low + i, high - 1)]]
                 v, u = p // depth.shape[1], p % depth.shape[1]
                 rays[0, i], rays[1, i] = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-                z[i] = depth[v, u] if valid[v, u] else np.inf
-                some = some or valid[v, u]
-            if some:
-                _nearest_instead(z)
-                _place(z, rays[:1], 0, rays[1:], 0, points, boxes, 0)
-                count = _cull(everyone, n, _box(boxes, 0), settings, bounds, kept)
-                _sum(points, boxes, 0, kept, count, index, fields, m, features, settings, buffer, sums, terms)
-                for i in range(_PIXELS):
-                    buffer[_TOTAL + i] = buffer[_TOTAL + i] / buffer[_EVIDENCE + i]
+                z[i] = depth[v, u] if depth[v, u] > 0 else np.inf
+            if _nearest_instead(z):
+                _place(z, rays[:1], 0, rays[1:], 0, points, boxes, 0, work)
+                count = _cull(everyone, everyone.shape[1], _box(boxes, 0), settings, bounds, kept)
+                _sum(points, boxes, 0, kept, count, view, features, buffer, sums)
+                _averages(buffer, sums)
             for i in range(high - low):
-                p, to = pixels[order[low + i]], order[low + i]
-                use = valid[p // depth.shape[1], p % depth.shape[1]]
+                to = order[low + i]
+                use = depth[pixels[to] // depth.shape[1], pixels[to] % depth.shape[1]] > 0
                 out[to] = buffer[_TOTAL + i] if use else nan
                 for g in range(sums.shape[0]):
-                    out_f[g, to] = sums[g, i] / buffer[_EVIDENCE + i] if use else nan
+                    out_f[g, to] = sums[g, i] if use else nan
 
 
 @leaf
@@ -239,11 +229,12 @@ def _limit(epsilon, count):
 
 
 @leaf
-def _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, packed):
-    """Fields [K, 10] and, packed, [10, K] of the components whose density can exceed 2^limit at a pixel of the image.
+def _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features):
+    """Write the fields of the components whose density can exceed 2^limit at a pixel of the image.
 
-    The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density. The indices
-    of these components move to the head of ``index``; returns how many there are.
+    The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
+    ``constants`` are the terms of the sum. The indices of these components move to the head of
+    ``index``; returns how many there are.
     """
     scale, n = math.sqrt(0.5 * _LOG2_E), 0
     for k in range(index.size):
@@ -255,8 +246,10 @@ def _visible(mean, covariance, index, whitening, log_peak, K, height, width, lim
         for i in range(6):
             fields[n, 3 + i] = whitening[k, i] * scale
         fields[n, 9] = log_peak[k] * _LOG2_E
-        for i in range(_FIELDS):
-            packed[i, n] = fields[n, i]
+        for i in range(6):
+            constants[n, i] = fields[n, 3 + i]
+        constants[n, 6], constants[n, 7] = fields[n, 9], m[index[k]]
+        constants[n, 8] = features[index[k], features.shape[1] - 1] if features.shape[1] > 0 else 0.0
         index[n] = index[k]
         n += 1
     return n
@@ -291,57 +284,81 @@ def _meets(mean, covariance, k, square, K, height, width):
 
 
 @leaf
-def _depths(depth, valid, v0, u0, z):
-    """Depths [64] of a tile; that of its nearest valid pixel for one that is not, or outside of the image.
+def _depths(depth, v0, u0, z):
+    """Depths [64] of a tile; that of its nearest pixel for one without, or outside of the image.
 
-    Returns False where no pixel is valid.
+    Returns False where no pixel has one.
     """
-    some = False
     if v0 + _TILE <= depth.shape[0] and u0 + _TILE <= depth.shape[1]:
-        for v in range(_TILE):
+        for v in range(_TILE):  # a row as a slice: indices from 0 on need no test for negative ones
+            d, row = depth[v0 + v, u0 : u0 + _TILE], z[v * _TILE : (v + 1) * _TILE]
             for u in range(_TILE):
-                use = valid[v0 + v, u0 + u]
-                z[v * _TILE + u] = np.float64(depth[v0 + v, u0 + u]) if use else np.inf
-                some |= use
+                row[u] = d[u] if d[u] > 0 else np.inf
     else:
         for i in range(_PIXELS):
             v, u = v0 + i // _TILE, u0 + i % _TILE
-            use = v < depth.shape[0] and u < depth.shape[1] and valid[v, u]
+            use = v < depth.shape[0] and u < depth.shape[1] and depth[v, u] > 0
             z[i] = np.float64(depth[v, u]) if use else np.inf
-            some |= use
-    if some:
-        _nearest_instead(z)
-    return some
+    return _nearest_instead(z)
 
 
 @finite
 def _nearest_instead(z):
-    """The least depth in place of infinity."""
-    least = np.inf
-    for i in range(_PIXELS):
-        least = z[i] if z[i] < least else least
+    """Put the least depth in place of infinity; False where all are infinite."""
+    a, b, c, d = z[0], z[1], z[2], z[3]
+    for i in range(4, _PIXELS, 4):  # four chains of comparisons, which do not wait for each other
+        a, b = z[i] if z[i] < a else a, z[i + 1] if z[i + 1] < b else b
+        c, d = z[i + 2] if z[i + 2] < c else c, z[i + 3] if z[i + 3] < d else d
+    least = min(min(a, b), min(c, d))
     for i in range(_PIXELS):
         z[i] = z[i] if z[i] < np.inf else least
+    return least < np.inf
+
+
+@leaf
+def _place(z, across, column, down, row, points, boxes, tile, work):
+    """The points [3, 64] of a tile, relative to its origin, its bounding box (low, high) and its origin.
+
+    ``work`` [6, 64] is scratch.
+    """
+    x, y = across[column], down[row]
+    for i in range(_PIXELS):
+        work[0, i] = x[i] * z[i]
+    for i in range(_PIXELS):
+        work[1, i] = y[i] * z[i]
+    for i in range(_PIXELS):
+        work[2, i] = z[i]
+    boxes[tile, 8] = z0 = _extremes(work, boxes, tile)
+    boxes[tile, 6] = x0 = 0.5 * (x[0] + x[_PIXELS - 1]) * z0
+    boxes[tile, 7] = y0 = 0.5 * (y[0] + y[_PIXELS - 1]) * z0
+    for i in range(_PIXELS):
+        points[tile, i] = x[i] * z[i] - x0
+    for i in range(_PIXELS):
+        points[tile, _PIXELS + i] = y[i] * z[i] - y0
+    for i in range(_PIXELS):
+        points[tile, 2 * _PIXELS + i] = z[i] - z0
 
 
 @finite
-def _place(z, across, column, down, row, points, boxes, tile):
-    """The points [3, 64] of a tile, relative to its origin, its bounding box (low, high) and its origin."""
-    x_low = y_low = z_low = np.inf
-    x_high = y_high = z_high = -np.inf
-    for i in range(_PIXELS):
-        x, y = across[column, i] * z[i], down[row, i] * z[i]
-        x_low, x_high = x if x < x_low else x_low, x if x > x_high else x_high
-        y_low, y_high = y if y < y_low else y_low, y if y > y_high else y_high
-        z_low, z_high = z[i] if z[i] < z_low else z_low, z[i] if z[i] > z_high else z_high
-    x0 = 0.5 * (across[column, 0] + across[column, _PIXELS - 1]) * z_low
-    y0 = 0.5 * (down[row, 0] + down[row, _PIXELS - 1]) * z_low
-    for i in range(_PIXELS):
-        points[tile, i], points[tile, _PIXELS + i] = across[column, i] * z[i] - x0, down[row, i] * z[i] - y0
-        points[tile, 2 * _PIXELS + i] = z[i] - z_low
-    boxes[tile, 0], boxes[tile, 1], boxes[tile, 2] = x_low, y_low, z_low
-    boxes[tile, 3], boxes[tile, 4], boxes[tile, 5] = x_high, y_high, z_high
-    boxes[tile, 6], boxes[tile, 7], boxes[tile, 8] = x0, y0, z_low
+def _extremes(work, boxes, tile):
+    """Least and greatest of three rows of 64 numbers, halved until few are left; returns the least of the last."""
+    for axis in range(3):
+        for i in range(_PIXELS):
+            work[3 + axis, i] = work[axis, i]
+        half = _PIXELS // 2
+        while half >= 4:
+            for i in range(half):
+                a, b = work[axis, i], work[axis, half + i]
+                work[axis, i] = a if a < b else b
+            for i in range(half):
+                a, b = work[3 + axis, i], work[3 + axis, half + i]
+                work[3 + axis, i] = a if a > b else b
+            half //= 2
+        low, high = work[axis, 0], work[3 + axis, 0]
+        for i in range(1, 4):
+            low, high = min(low, work[axis, i]), max(high, work[3 + axis, i])
+        boxes[tile, axis], boxes[tile, 3 + axis] = low, high
+    return boxes[tile, 2]
 
 
 @leaf
@@ -432,14 +449,15 @@ def _cull(packed, n, box, settings, bounds, kept):
 
 
 @contracted
-def _add_two(terms, j, buffer):
-    """Add two components to 64 points: their densities to the row of evidence, times m to that of the total, and times
-    the last feature to that of the last."""
-    a0, a1, a2, a3, a4, a5 = terms[j, 0], terms[j, 1], terms[j, 2], terms[j, 3], terms[j, 4], terms[j, 5]
-    ax, ay, az, a_peak, a_m, a_f = terms[j, 6], terms[j, 7], terms[j, 8], terms[j, 9], terms[j, 10], terms[j, 11]
-    k = j + 1
-    b0, b1, b2, b3, b4, b5 = terms[k, 0], terms[k, 1], terms[k, 2], terms[k, 3], terms[k, 4], terms[k, 5]
-    bx, by, bz, b_peak, b_m, b_f = terms[k, 6], terms[k, 7], terms[k, 8], terms[k, 9], terms[k, 10], terms[k, 11]
+def _add_two(constants, k, a_offset, j, b_offset, b_peak, buffer):
+    """Add components k and j to 64 points: their densities to the row of evidence, times m to that of the total, and
+    times the last feature to that of the last."""
+    a0, a1, a2, a3, a4 = constants[k, 0], constants[k, 1], constants[k, 2], constants[k, 3], constants[k, 4]
+    a5, a_peak, a_m, a_f = constants[k, 5], constants[k, 6], constants[k, 7], constants[k, 8]
+    b0, b1, b2, b3, b4 = constants[j, 0], constants[j, 1], constants[j, 2], constants[j, 3], constants[j, 4]
+    b5, b_m, b_f = constants[j, 5], constants[j, 7], constants[j, 8]
+    ax, ay, az = a_offset
+    bx, by, bz = b_offset
     for i in range(_PIXELS):
         x, y, z = buffer[_X + i], buffer[_Y + i], buffer[_Z + i]
         y0, y1, y2 = a0 * x + ax, a1 * x + (a2 * y + ay), a3 * x + (a4 * y + (a5 * z + az))
@@ -461,10 +479,10 @@ def _add_feature(first, second, buffer, sums, g):
 
 
 @leaf
-def _sum(points, boxes, tile, chosen, count, index, fields, m, features, settings, buffer, sums, terms):
+def _sum(points, boxes, tile, chosen, count, view, features, buffer, sums):
     """Evidence, total and sums of the features [F, 64] at the points of a tile, over ``chosen`` components."""
     real = buffer.dtype.type
-    prior_weight, prior_mean, _, _ = settings
+    index, fields, _, constants, (prior_weight, prior_mean, _, _) = view
     prior, total, last = real(prior_weight), real(prior_weight * prior_mean), sums.shape[0] - 1
     for i in range(3 * _PIXELS):
         buffer[_X + i] = points[tile, i]
@@ -474,48 +492,56 @@ def _sum(points, boxes, tile, chosen, count, index, fields, m, features, setting
         for i in range(_PIXELS):
             sums[g, i] = 0
     x, y, z = boxes[tile, 6], boxes[tile, 7], boxes[tile, 8]
-    for j in range(count):
-        _terms(fields, chosen[j], x, y, z, m, features, index, last, terms, j)
-    if count % 2 == 1:
-        for i in range(_TERMS):
-            terms[count, i] = 0
-        terms[count, 9] = -1e4  # an odd one has no companion
     for j in range(0, count, 2):
-        _add_two(terms, j, buffer)
+        a, b = chosen[j], chosen[min(j + 1, count - 1)]
+        peak = constants[b, 6] if j + 1 < count else real(-1e4)  # an odd one is not counted twice
+        _add_two(constants, a, _offset(fields, a, x, y, z, real), b, _offset(fields, b, x, y, z, real), peak, buffer)
         for g in range(last):
-            a, b = index[chosen[j]], index[chosen[min(j + 1, count - 1)]]
-            _add_feature(real(features[a, g]), real(features[b, g]), buffer, sums, g)
+            _add_feature(real(features[index[a], g]), real(features[index[b], g]), buffer, sums, g)
     if last >= 0:
         for i in range(_PIXELS):
             sums[last, i] = buffer[_LAST + i]
 
 
 @leaf
-def _terms(fields, k, x, y, z, m, features, index, last, terms, j):
-    """Write what :func:`_add_two` needs of component k, with points relative to (x, y, z), to row j."""
+def _offset(fields, k, x, y, z, real):
+    """The whitened offset of (x, y, z) from the mean of component k."""
     dx, dy, dz = x - fields[k, 0], y - fields[k, 1], z - fields[k, 2]
-    for i in range(6):
-        terms[j, i] = fields[k, 3 + i]
-    terms[j, 6] = fields[k, 3] * dx
-    terms[j, 7] = fields[k, 4] * dx + fields[k, 5] * dy
-    terms[j, 8] = fields[k, 6] * dx + fields[k, 7] * dy + fields[k, 8] * dz
-    terms[j, 9], terms[j, 10] = fields[k, 9], m[index[k]]
-    terms[j, 11] = features[index[k], last] if last >= 0 else 0.0
+    w0, w1 = fields[k, 3] * dx, fields[k, 4] * dx + fields[k, 5] * dy
+    return real(w0), real(w1), real(fields[k, 6] * dx + fields[k, 7] * dy + fields[k, 8] * dz)
 
 
 @leaf
-def _finish(valid, v0, u0, buffer, sums, out, out_f):
-    """Write the averages of a tile; NaN where not valid."""
-    nan = out.dtype.type(np.nan)
+def _averages(buffer, sums):
+    """Divide total and features by the evidence."""
     for i in range(_PIXELS):
         buffer[_TOTAL + i] = buffer[_TOTAL + i] / buffer[_EVIDENCE + i]
-    for v in range(v0, min(v0 + _TILE, out.shape[0])):
-        for u in range(u0, min(u0 + _TILE, out.shape[1])):
-            i = (v - v0) * _TILE + u - u0
-            out[v, u] = buffer[_TOTAL + i] if valid[v, u] else nan
     for g in range(sums.shape[0]):
         for i in range(_PIXELS):
             sums[g, i] = sums[g, i] / buffer[_EVIDENCE + i]
+
+
+@leaf
+def _finish(depth, v0, u0, buffer, sums, out, out_f):
+    """Write the averages of a tile; NaN without a depth."""
+    _averages(buffer, sums)
+    _write(depth, v0, u0, buffer[_TOTAL : _TOTAL + _PIXELS], out)
+    for g in range(sums.shape[0]):
+        _write(depth, v0, u0, sums[g], out_f[g])
+
+
+@leaf
+def _write(depth, v0, u0, values, out):
+    """The values [64] of a tile into a map."""
+    nan = out.dtype.type(np.nan)
+    if v0 + _TILE <= out.shape[0] and u0 + _TILE <= out.shape[1]:
+        for v in range(_TILE):
+            to, d = out[v0 + v, u0 : u0 + _TILE], depth[v0 + v, u0 : u0 + _TILE]
+            row = values[v * _TILE : (v + 1) * _TILE]
+            for u in range(_TILE):
+                value = row[u]
+                to[u] = value if d[u] > 0 else nan
+    else:
         for v in range(v0, min(v0 + _TILE, out.shape[0])):
             for u in range(u0, min(u0 + _TILE, out.shape[1])):
-                out_f[g, v, u] = sums[g, (v - v0) * _TILE + u - u0] if valid[v, u] else nan
+                out[v, u] = values[(v - v0) * _TILE + u - u0] if depth[v, u] > 0 else nan
