@@ -13,6 +13,7 @@ import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -27,7 +28,7 @@ from ufmstar_torch.disagree import with_overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import FrameStatistics, StepOutput
+from ufmstar_torch.output import FrameStatistics, StepOutput, given
 from ufmstar_torch.regress import Regression, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
@@ -279,7 +280,8 @@ def step(
         posterior=state.posterior,
     )
     stage("average")
-    return updated, StepOutput(disagreement, result.features, residual, measured, labels, current_cam, statistics)
+    out = StepOutput(disagreement, result.features, residual, measured, partial(given, labels), current_cam, statistics)
+    return updated, out
 
 
 def _unobserved(name: str) -> None:

@@ -8,11 +8,11 @@ no bit.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.anchors.evidence import (
@@ -31,19 +31,20 @@ from ufmstar_torch.anchors.hook import Learnt
 from ufmstar_torch.anchors.hook import learn as learn_reference
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.regress_cpu import EPSILON
 from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
 
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
+Floats, Mask = NDArray[np.float64], NDArray[np.bool_]
 
 # Anchors of a cell, on average, where neighbours are searched and where components are.
-_FEW, _SOME = 3, 12
+_FEW, _SOME = 3, 32
 
 
-def check_values(anchors: Anchors, frame: FrameInput, own: list[Tensor]) -> AnchorInput:
+def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
     """As :func:`ufmstar_torch.anchors.given.check_values`, for CPU tensors."""
     b, n = anchors.depth.shape
     pixel, index, valid = np.empty((b, n, 2)), np.empty((b, n), np.int64), np.empty((b, n), np.bool_)
@@ -52,12 +53,12 @@ def check_values(anchors: Anchors, frame: FrameInput, own: list[Tensor]) -> Anch
     given = (value.contiguous().numpy() for value in (anchors.pixel, anchors.depth, anchors.variance))
     maps = (value.contiguous().numpy() for value in (frame.depth, frame.valid))
     _check(*given, mask, *maps, FARTHEST_OFF, pixel, index, predicted, depth, variance, valid)
-    tensors = (torch.from_numpy(value) for value in (pixel, index, predicted, depth, variance))
     at, usable = torch.from_numpy(index), torch.from_numpy(valid)
-    return AnchorInput(*tensors, claimed(own, at, usable), usable, anchors.confirmed)
+    p, d, g, s2 = (torch.from_numpy(value) for value in (pixel, predicted, depth, variance))
+    return AnchorInput(p, at, d, g, s2, claimed(own, at, usable), usable, anchors.confirmed)
 
 
-@compiled
+@kernel
 def _check(given, measured, spread, mask, depth, use, farthest, pixel, index, predicted, out, variance, valid):
     height, width = use.shape[1:]
     for b in range(valid.shape[0]):
@@ -78,11 +79,35 @@ def _check(given, measured, spread, mask, depth, use, farthest, pixel, index, pr
 
 def inliers(anchors: AnchorInput) -> Tensor:
     """As :func:`ufmstar_torch.anchors.evidence.inliers`, for CPU tensors; the same anchors."""
-    out = np.empty(anchors.valid.shape, np.bool_)
+    b, n = anchors.valid.shape
+    out, most = np.empty((b, n), np.bool_), max(min(NEIGHBOURS, n - 1), 0)
     given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
-    for b, supported in enumerate(out):
-        _supported(*(value[b].contiguous().numpy() for value in given), supported)
+    arrays = zip(*(value.contiguous().numpy() for value in given), out, strict=True)
+    each(_inliers, [(*arguments, most) for arguments in arrays])
     return torch.from_numpy(out)
+
+
+def _inliers(
+    pixel: Floats, predicted: Floats, depth: Floats, variance: Floats, valid: Mask, out: Mask, most: int
+) -> None:
+    """One stream, N anchors, into ``out`` [N]."""
+    n = valid.size
+    neighbour, count, ratio = np.empty((n, most), np.int64), np.empty(n, np.int64), np.empty(n)
+    differ = np.empty(n * most)
+    total = _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ)
+    _support(variance, depth, valid, ratio, neighbour, count, _lower_quartile(differ[:total]), out)
+
+
+def _lower_quartile(values: Floats) -> float:
+    """``torch.quantile(values, 0.25)``, 0 of no values."""
+    if values.size == 0:
+        return 0.0
+    rank = 0.25 * (values.size - 1)
+    below = int(rank)
+    above = min(below + 1, values.size - 1)
+    part = np.partition(values, (below, above))
+    low, high, weight = float(part[below]), float(part[above]), rank - below
+    return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
 
 
 def learn(
@@ -95,19 +120,18 @@ def learn(
     """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors; with the exact sum, shares are right to twice the
     error of the regression's in the dtype of the evidence."""
     if config.regression != "exact":
-        kernels = {"distribute": distribute, "supported": inliers}
-        return learn_reference(evidence, mixture_cam, frame, anchors, config, **kernels)
+        return learn_reference(evidence, mixture_cam, frame, anchors, config, distribute, inliers)
     b, capacity, _ = evidence.component.shape
     dtype = evidence.overall.dtype
     component = torch.empty(evidence.component.shape, dtype=dtype)
     overall, used = torch.empty(b, 3, dtype=dtype), torch.zeros(b, dtype=torch.int64)
     beyond, stream = torch.empty(b, capacity, 2, dtype=torch.float64), torch.empty(b, 2, dtype=torch.float64)
     if anchors is None:
-        fields = [torch.empty(b, 0, 2, dtype=torch.float64), torch.empty(b, 0, dtype=torch.int64)]
-        fields += [torch.empty(b, 0, dtype=torch.float64)] * 4 + [torch.empty(b, 0, dtype=torch.bool)]
+        fields = [torch.empty(b, 0, dtype=torch.int64)] + [torch.empty(b, 0, dtype=torch.float64)] * 4
+        fields += [torch.empty(b, 0, dtype=torch.bool)]
     else:
-        fields = [anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance]
-        fields += [anchors.own_variance, anchors.valid]
+        fields = [anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance]
+        fields += [inliers(anchors)]
     mixture = (value.double() for value in (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight))
     given = [*fields, frame.intrinsics.double(), *mixture, evidence.component, evidence.overall]
     results = (component, overall, used[:, None], beyond, stream)
@@ -119,19 +143,17 @@ def learn(
     return Learnt(Evidence(component, overall), used, beyond, stream)
 
 
-@compiled
+@kernel
 def _learn(
-    pixel, index, predicted, depth, variance, own, valid, K, mean, covariance, weight, before, overall_before, width,
+    index, predicted, depth, variance, own, supported, K, mean, covariance, weight, before, overall_before, width,
     memory, shrinkage, prior_weight, epsilon, component, overall, used, beyond, stream,
 ):  # fmt: skip
     """One stream: N anchors, K components."""
-    n = valid.size
-    supported, rows, sums = np.empty(n, np.bool_), np.empty((n, 3)), np.zeros((component.shape[0], 3))
-    if n > 0:
-        _supported(pixel, predicted, depth, variance, valid, supported)
-        used[0] = _rows(predicted, depth, variance, own, supported, rows)
+    rows, sums = np.empty((supported.size, 3)), np.zeros((component.shape[0], 3))
+    used[0] = _rows(predicted, depth, variance, own, supported, rows)
+    if supported.size > 0:
         mixture = (mean, covariance, weight)
-        _distribute(pixel, index, predicted, supported, rows, K, width, *mixture, prior_weight, epsilon, sums)
+        _distribute(index, predicted, supported, rows, K, width, mixture, prior_weight, epsilon, sums)
     fade = memory if used[0] > 0 else 1.0
     real = np.float64
     for c in range(3):
@@ -147,7 +169,7 @@ def _learn(
             beyond[k, c] = (real(component[k, c + 1]) - count * stream[c]) / (count + shrinkage)
 
 
-@compiled
+@part
 def _rows(predicted, depth, variance, own, supported, rows):
     """Write w (1, r, e) [N, 3] of the anchors, 0 where not supported; return how many are used."""
     n = supported.size
@@ -175,7 +197,7 @@ def _rows(predicted, depth, variance, own, supported, rows):
     return used
 
 
-@compiled
+@part
 def _folded(values):
     """The sum in the order of ``fixed_order.total``: halves of a length rounded up to a power of two meet."""
     n = values.size
@@ -192,7 +214,7 @@ def _folded(values):
     return values[0]
 
 
-@compiled
+@part
 def _grid(pixel, chosen, mean_count):
     """Cells over the chosen ones of N pixels [N, 2], about so many in each: their first corner and side [px], columns
     and rows, where each cell starts in the order [cells + 1], and the order."""
@@ -224,23 +246,18 @@ def _grid(pixel, chosen, mean_count):
     return low, side, columns, rows, start, order
 
 
-@compiled
-def _supported(pixel, predicted, depth, variance, valid, out):
-    """One stream of ``evidence.inliers``."""
-    n, most = valid.size, min(NEIGHBOURS, valid.size - 1)
-    grid = _grid(pixel, valid, _FEW)
-    believed = grid[5].size <= SUPPORT
-    for i in range(n):
-        out[i] = valid[i] and believed
-    if believed:
-        return
-    ratio, noise = np.empty(n), np.empty(n)
-    for i in range(n):
-        ratio[i], noise[i] = math.log(depth[i] / predicted[i]), variance[i] / (depth[i] * depth[i])
-    neighbour, count = np.empty((n, most), np.int64), np.zeros(n, np.int64)
-    distance, differ, total = np.empty(most), np.empty(grid[5].size * most), 0
-    low, side, columns, rows, start, order = grid
-    ordered = pixel[order]
+@kernel
+def _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ):
+    """Write log g/d of the valid anchors of N, their nearest ones [N, most] and how many these are; return the number
+    of differences of log g/d that are written to ``differ``."""
+    low, side, columns, rows, start, order = _grid(pixel, valid, _FEW)
+    ordered, distance, total = np.empty((order.size, 2)), np.empty(neighbour.shape[1]), 0
+    for place in range(order.size):
+        a = order[place]
+        ordered[place, 0], ordered[place, 1] = pixel[a, 0], pixel[a, 1]
+        ratio[a] = math.log(depth[a] / predicted[a])
+    if order.size <= SUPPORT:
+        return 0
     for a in order:
         count[a] = _nearest(
             ordered, pixel[a, 0], pixel[a, 1], a, low, side, columns, rows, start, order, distance, neighbour
@@ -248,17 +265,28 @@ def _supported(pixel, predicted, depth, variance, valid, out):
         for i in range(count[a]):
             differ[total] = abs(ratio[a] - ratio[neighbour[a, i]])
             total += 1
-    quartile = _lower_quartile(differ[:total])
-    sigma2 = (quartile / LOWER_QUARTILE) * (quartile / LOWER_QUARTILE) + 2 * LEAST_SIGMA**2
-    for a in order:
-        support = 0
+    return total
+
+
+@kernel
+def _support(variance, depth, valid, ratio, neighbour, count, quartile, out):
+    """Which of the valid anchors enough of their neighbours support; all of a few."""
+    sigma2, few = (quartile / LOWER_QUARTILE) * (quartile / LOWER_QUARTILE) + 2 * LEAST_SIGMA**2, 0
+    for a in range(valid.size):
+        few += valid[a]
+    for a in range(valid.size):
+        out[a] = valid[a]
+        if not valid[a] or few <= SUPPORT:
+            continue
+        support, noise = 0, variance[a] / (depth[a] * depth[a])
         for i in range(count[a]):
             b = neighbour[a, i]
-            support += abs(ratio[a] - ratio[b]) <= SIMILAR_SIGMAS * math.sqrt(sigma2 + noise[a] + noise[b])
+            allowed = sigma2 + noise + variance[b] / (depth[b] * depth[b])
+            support += abs(ratio[a] - ratio[b]) <= SIMILAR_SIGMAS * math.sqrt(allowed)
         out[a] = support >= SUPPORT
 
 
-@compiled
+@part
 def _nearest(ordered, u_a, v_a, a, low, side, columns, rows, start, order, distance, neighbour):
     """The anchors nearest to anchor a at (u_a, v_a), and how many there are: ring after ring of cells around its own,
     until all beyond the ring are farther than the farthest of them. ``ordered`` [N, 2] are pixels in the grid's order.
@@ -290,33 +318,18 @@ def _nearest(ordered, u_a, v_a, a, low, side, columns, rows, start, order, dista
     return n
 
 
-@compiled
-def _lower_quartile(values):
-    """``torch.quantile(values, 0.25)``, 0 of no values."""
-    if values.size == 0:
-        return 0.0
-    rank = 0.25 * (values.size - 1)
-    below = int(rank)
-    part = np.partition(values, below)
-    low, high = part[below], part[below]
-    if below + 1 < values.size:
-        high = part[below + 1 :].min()
-    weight = rank - below
-    return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
-
-
-@compiled
-def _distribute(
-    pixel, index, predicted, chosen, rows, K, width, mean, covariance, weight, prior_weight, epsilon, sums
-):  # fmt: skip
+@part
+def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight, epsilon, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
     Left out is what adds less than eps/K of the prior or of the largest component to the denominator.
     """
-    points = np.empty((chosen.size, 3))
+    mean, covariance, weight = mixture
+    points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
     for i in range(chosen.size):
-        x, y, z = index[i] % width, index[i] // width, predicted[i]
-        points[i, 0], points[i, 1], points[i, 2] = (x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z
+        u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
+        pixel[i, 0], pixel[i, 1] = u, v
+        points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
     occupied, whitening, log_peak = prepare(mean, covariance, weight)
     share = math.log(epsilon / max(occupied.size, 1))
     boxes = _boxes(mean, covariance, occupied, log_peak, share + math.log(prior_weight))
@@ -357,7 +370,7 @@ def _distribute(
                 sums[k, 2] += density * r2
 
 
-@compiled
+@part
 def _exponents(fields, n, x, y, z, out):
     """log of the densities of n components at a point."""
     for i in range(n):
