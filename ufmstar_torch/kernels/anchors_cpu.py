@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,7 +39,8 @@ from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
 
-Floats, Mask = NDArray[np.float64], NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # Anchors of a cell, on average, where neighbours are searched and where components are.
 _FEW, _SOME = 3, 32
@@ -123,9 +125,10 @@ def learn(
         return learn_reference(evidence, mixture_cam, frame, anchors, config, distribute, inliers)
     b, capacity, _ = evidence.component.shape
     dtype = evidence.overall.dtype
-    component = torch.empty(evidence.component.shape, dtype=dtype)
-    overall, used = torch.empty(b, 3, dtype=dtype), torch.zeros(b, dtype=torch.int64)
-    beyond, stream = torch.empty(b, capacity, 2, dtype=torch.float64), torch.empty(b, 2, dtype=torch.float64)
+    # In float64 for every dtype, so that there is one kernel to compile.
+    real: Any = {"dtype": torch.float64}
+    component, beyond = torch.empty(b, capacity, 3, **real), torch.empty(b, capacity, 2, **real)
+    overall, stream, used = torch.empty(b, 3, **real), torch.empty(b, 2, **real), torch.zeros(b, dtype=torch.int64)
     if anchors is None:
         fields = [torch.empty(b, 0, dtype=torch.int64)] + [torch.empty(b, 0, dtype=torch.float64)] * 4
         fields += [torch.empty(b, 0, dtype=torch.bool)]
@@ -133,20 +136,27 @@ def learn(
         fields = [anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance]
         fields += [inliers(anchors)]
     mixture = (value.double() for value in (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight))
-    given = [*fields, frame.intrinsics.double(), *mixture, evidence.component, evidence.overall]
+    given = [*fields, frame.intrinsics.double(), *mixture, evidence.component.double(), evidence.overall.double()]
     results = (component, overall, used[:, None], beyond, stream)
     memory = 0.5 ** (1 / config.anchor_half_life)
-    settings = (frame.size[1], memory, config.anchor_shrinkage, config.prior_weight, EPSILON[dtype])
+    settings = (
+        frame.size[1],
+        memory,
+        config.anchor_shrinkage,
+        config.prior_weight,
+        EPSILON[dtype],
+        dtype == torch.float32,
+    )
     arrays = zip(*(value.contiguous().numpy() for value in given), strict=True)
     out = zip(*(value.numpy() for value in results), strict=True)
     each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
-    return Learnt(Evidence(component, overall), used, beyond, stream)
+    return Learnt(Evidence(component.to(dtype), overall.to(dtype)), used, beyond, stream)
 
 
 @kernel
 def _learn(
     index, predicted, depth, variance, own, supported, K, mean, covariance, weight, before, overall_before, width,
-    memory, shrinkage, prior_weight, epsilon, component, overall, used, beyond, stream,
+    memory, shrinkage, prior_weight, epsilon, single, component, overall, used, beyond, stream,
 ):  # fmt: skip
     """One stream: N anchors, K components."""
     rows, sums = np.empty((supported.size, 3)), np.zeros((component.shape[0], 3))
@@ -155,18 +165,21 @@ def _learn(
         mixture = (mean, covariance, weight)
         _distribute(index, predicted, supported, rows, K, width, mixture, prior_weight, epsilon, sums)
     fade = memory if used[0] > 0 else 1.0
-    real = np.float64
     for c in range(3):
-        overall[c] = fade * real(overall_before[c]) + _folded(rows[:, c])
+        overall[c] = _rounded(fade * overall_before[c] + _folded(rows[:, c]), single)
+    for c in range(2):
+        stream[c] = overall[c + 1] / (overall[0] + shrinkage)
     for k in range(component.shape[0]):
         for c in range(3):
-            component[k, c] = fade * real(before[k, c]) + sums[k, c]
-    for c in range(2):
-        stream[c] = real(overall[c + 1]) / (real(overall[0]) + shrinkage)
-    for k in range(component.shape[0]):
-        count = real(component[k, 0])
+            component[k, c] = _rounded(fade * before[k, c] + sums[k, c], single)
         for c in range(2):
-            beyond[k, c] = (real(component[k, c + 1]) - count * stream[c]) / (count + shrinkage)
+            beyond[k, c] = (component[k, c + 1] - component[k, 0] * stream[c]) / (component[k, 0] + shrinkage)
+
+
+@part
+def _rounded(value, single):
+    """A value as the state keeps it."""
+    return np.float64(np.float32(value)) if single else value
 
 
 @part
