@@ -38,7 +38,11 @@ def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size
     """
     source, inside = _source((K_from @ np.linalg.inv(K_to)).tobytes(), values.shape[:2], size)
     result = values.reshape(-1, *values.shape[2:])[source]
-    return result if inside is None else np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), result, np.zeros((), values.dtype))
+    return (
+        result
+        if inside is None
+        else np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), result, np.zeros((), values.dtype))
+    )
 
 
 @lru_cache(maxsize=16)
