@@ -105,8 +105,8 @@ def accuracy_sums(depth: Any, target: Any, use: Any, tolerance: float) -> tuple[
             continue
         judged += 1
         error = abs(d - g)
-        hits += error <= tolerance * g
-        hits_ratio += d > 0 and max(d / g, g / d) < 1 + tolerance
+        hits += int(error <= tolerance * g)
+        hits_ratio += int(d > 0 and max(d / g, g / d) < 1 + tolerance)
         relative += error / g
         squared += error * error
     return with_truth, judged, hits, hits_ratio, relative, squared

@@ -28,8 +28,8 @@ from ufmstar_torch.eval.results.files import write_atomic, write_json_atomic, wr
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
 DEPTH_UNITS = (0.001, 1 / 256, 0.01, 0.1)
 FULL = 65535
-# zlib's level of the PNGs. Level 6 takes 3-5 times as long for 10 % less. One filter for all rows (the difference to the
-# row above) takes six tenths of the time of a choice for every row, and makes files of the same size.
+# zlib's level of the PNGs. Level 6 takes 3-5 times as long for 10 % less. One filter for all rows, the difference to
+# the row above, takes six tenths of the time of a choice for every row, and the files are as large.
 PNG_LEVEL = 1
 _AFTER_HEADER = 33  # bytes: signature and IHDR
 

@@ -36,13 +36,12 @@ def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size
     Returns:
         [h, w, ...] of the same type; 0 (False) where the first camera does not look.
     """
-    source, inside = _source((K_from @ np.linalg.inv(K_to)).tobytes(), values.shape[:2], size)
+    mapping = np.asarray(K_from @ np.linalg.inv(K_to), np.float64)
+    source, inside = _source(mapping.tobytes(), values.shape[:2], size)
     result = values.reshape(-1, *values.shape[2:])[source]
-    return (
-        result
-        if inside is None
-        else np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), result, np.zeros((), values.dtype))
-    )
+    if inside is None:
+        return result
+    return np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), result, np.zeros((), values.dtype))
 
 
 @lru_cache(maxsize=16)
