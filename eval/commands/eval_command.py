@@ -30,7 +30,7 @@ class SuiteOptions:
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
         ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
         network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
-        samples: passes of MC-Dropout where a row asks for all; default: 10
+        samples: passes of MC-Dropout of a row that needs all of them; default: 10
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         precision: of the networks; bf16: torch's autocast
         recalibration: file of `ufmstar recalibrate`: its row is judged under it as well, as a row of its own, on
