@@ -69,7 +69,7 @@ def main() -> int:
                 times[n].append((wall, cpu))
             figures[n] = [one.figures for one in outcomes]
     frames, first = given.tours * given.frames, given.streams[0]
-    print("| streams | frames/s, median | most | CPU ms a frame, median | least | times as fast as the first | RMSE [m] |")
+    print("| streams | frames/s, median | most | CPU ms a frame, median | least | times as fast | RMSE [m] |")
     print("|---|---|---|---|---|---|---|")
     for n in given.streams:
         wall, cpu = zip(*times[n], strict=True)
@@ -77,7 +77,8 @@ def main() -> int:
         rmse = statistics.mean(sequence["rmse"] for sequence in figures[n])
         print(
             f"| {n} | {frames / statistics.median(wall):.1f} | {frames / min(wall):.1f} "
-            f"| {1e3 * statistics.median(cpu) / frames:.1f} | {1e3 * min(cpu) / frames:.1f} | {ratio:.2f} | {rmse:.6f} |"
+            f"| {1e3 * statistics.median(cpu) / frames:.1f} | {1e3 * min(cpu) / frames:.1f} "
+            f"| {ratio:.2f} | {rmse:.4f} |"
         )
     return 0
 
