@@ -133,11 +133,13 @@ class UfMStarStreams:
 
 
 def stream_of(batch: _Batch, stream: int) -> _Batch:
-    """One stream of a dataclass of tensors, as a batch of one."""
+    """One stream of a dataclass of tensors, and of functions that return one, as a batch of one."""
 
     def one(value: Any) -> Any:
         if isinstance(value, Tensor):
             return value[stream : stream + 1]
+        if callable(value):
+            return lambda: one(value())
         return None if value is None else stream_of(value, stream)
 
     kind: Any = type(batch)
