@@ -95,8 +95,12 @@ def test_fuse(weighted, seed):
 
 
 def floored(cov, floor):
-    out = cov.clone()
-    fuse_cpu.floor_covariance(out.view(-1, 3, 3).numpy(), floor.expand(cov.shape[:-2]).contiguous().view(-1).numpy())
+    out, mean = torch.zeros_like(cov), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
+    mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
+    given = (
+        value.reshape(-1, *value.shape[cov.dim() - 2 :]).numpy() for value in (mean, cov, torch.ones_like(mean[..., 0]))
+    )
+    fuse_cpu.floored(*given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy())
     return out
 
 

@@ -150,7 +150,7 @@ class UfMStar(StatefulModule):
             features=out.features,
             measured=out.measured.reshape(shape),
             valid=frame.valid.reshape(shape),
-            labels=out.labels,
+            read_labels=out.read_labels,
             current_cam=out.current_cam,
             statistics=out.statistics,
         )
@@ -207,16 +207,24 @@ class UfMStar(StatefulModule):
         error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
         return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, measured, out.statistics)
 
-    def warm_up(self, size: tuple[int, int], *, streams: int = 1, anchored: bool | None = None) -> None:
+    def warm_up(
+        self,
+        size: tuple[int, int],
+        *,
+        streams: int = 1,
+        anchored: bool | None = None,
+        progress: Callable[[int, int], object] | None = None,
+    ) -> None:
         """Compile, or load from disk, all that the first frames of this size would otherwise wait for.
 
         The state stays as it is: a module of its own takes two frames of a wall. On a machine's very first call that is
-        some half a minute on the CPU, later below a second.
+        some twenty seconds on the CPU, later below a second.
 
         Args:
             size: (H, W) of the depth maps [px].
             streams: B.
             anchored: with the corners' triangulation (``LandmarkTracker``); None = as ``config.anchored``.
+            progress: is called with the stages that are done and all of them, to show that something happens.
 
         Raises:
             ValueError: a size or number of streams that is not positive.
@@ -225,7 +233,7 @@ class UfMStar(StatefulModule):
         twin = UfMStar(
             self.config.replace(anchored=anchored, spill=None), dtype=self.mean.dtype, device=self.mean.device
         )
-        warm_up(twin, size, streams)
+        warm_up(twin, size, streams, progress)
 
     def query(self, points: Tensor, frame: str = "world") -> Regression:
         """The disagreement at any 3D point, from the present mixture, without touching the state.

@@ -2,7 +2,7 @@
 
 A camera walks through rendered rooms. Small depth networks that come with the package, trained on other rooms of
 the same kind, predict depth; the last room looks and measures like none of them, so there is an uncertainty to find.
-UfM and UfM* judge the same predictions, and the table says how well.
+UfM and UfM* judge the same predictions; the table shows how well.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 from statistics import median
+from threading import Event
 from time import perf_counter
 from typing import Any
 
@@ -243,14 +244,20 @@ def _walk(
 def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[[Progress], None]) -> FrameSequence:
     """All frames in memory. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the very first
     run."""
+    frames, rendered = [], Event()
+
+    def compiling(done: int, total: int) -> None:
+        if rendered.is_set():
+            progress(Progress("kernels", done, total, None, 0))
+
     progress(Progress("rooms", 0, len(sequence), None, 0))
-    frames = [sequence[index] for index in range(2)]
     with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(_compile, frames, device)
-        for index in range(2, len(sequence)):
+        compiled = beside.submit(UfMStar(device=device).warm_up, (64, 64), progress=compiling)
+        for index in range(len(sequence)):
             frames.append(sequence[index])
             progress(Progress("rooms", index + 1, len(sequence), None, 0))
         progress(Progress("kernels", 0, 1, None, 0))
+        rendered.set()
         compiled.result()
     progress(Progress("kernels", 1, 1, None, 0))
     entries = [
@@ -263,15 +270,6 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
 def _same(array: np.ndarray | None) -> np.ndarray:
     assert array is not None
     return array
-
-
-def _compile(frames: list[Frame], device: torch.device) -> None:
-    """UfM* on two frames with their true depth, whose segments match, so that every kernel is called."""
-    ufm_star = UfMStar().to(device)
-    for frame in frames:
-        depth = torch.from_numpy(frame.depth)[None].to(device)
-        pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-        ufm_star(depth, pose, K, torch.full_like(depth, 0.01))
 
 
 def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -29,7 +30,7 @@ class SuiteOptions:
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
         ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
         network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
-        samples: passes of MC-Dropout where a row asks for all; default: 10
+        samples: passes of MC-Dropout of a row that needs all of them; default: 10
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         precision: of the networks; bf16: torch's autocast
         recalibration: file of `ufmstar recalibrate`: its row is judged under it as well, as a row of its own, on
@@ -251,13 +252,17 @@ def launch_from(options: EvalOptions) -> LaunchOptions:
 
 
 def _evaluate(options: EvalOptions) -> int:
+    from ufmstar_torch import UfMStar
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.results.launch import evaluate_suite
 
     with Bars() as bars, stop_signals(bars.say) as stop:
         job, launch = job_from(options), launch_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
+        if any(row.method.fusion == UFM_STAR for row in job.suite.rows):
+            UfMStar().warm_up((32, 32), progress=partial(bars.frames, "kernels, compiled on the first run"))
         outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
     if outcome.reports:
         return _report(outcome, options.threads, draws=not options.output.no_report)

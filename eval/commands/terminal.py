@@ -27,8 +27,12 @@ class Bars:
         if progress.stage != self._stage:
             self._close()
             first = progress.done if progress.components is None and progress.stage == "frames" else 0
-            self._bar = tqdm(total=progress.total, initial=first, desc=progress.stage, unit="frame", dynamic_ncols=True)
+            unit = "frame" if progress.stage == "frames" else "step"
+            self._bar = tqdm(total=progress.total, initial=first, desc=progress.stage, unit=unit, dynamic_ncols=True)
+            if progress.stage == "kernels":
+                self._bar.set_postfix_str("compiled on the first run")
             self._stage = progress.stage
+        self._bar.total = progress.total
         if progress.components is not None:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
             self._bar.set_postfix(K=progress.components, refresh=False, **skipped)

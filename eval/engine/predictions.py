@@ -123,7 +123,7 @@ class DepthSource(Protocol):
     def runtime(self) -> Mapping[str, Any] | None: ...
 
     def prepared(self, how: str) -> DepthSource:
-        """The same source with its images prepared as ``Setting.preprocess`` says; itself where that is no change.
+        """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change.
 
         Raises:
             ValueError: there are no images to prepare.

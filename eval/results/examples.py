@@ -58,7 +58,7 @@ class Examples:
 
 
 class ExampleWriter(FrameSink):
-    """A sink that writes what ``Examples`` asks for."""
+    """A sink that writes what ``Examples`` selects."""
 
     def __init__(self, examples: Examples) -> None:
         self._examples = examples

@@ -308,7 +308,7 @@ class _Process:
 
 @dataclass
 class _ClusterJob:
-    """A job of submitit, which nobody waits for once it is cancelled."""
+    """A job of submitit; once it is cancelled, its end is not awaited."""
 
     job: Any
     cancelled: bool = False

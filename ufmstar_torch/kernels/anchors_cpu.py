@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from ufmstar_torch.anchors.evidence import LEAST_SIGMA, LOWER_QUARTILE, NEIGHBOURS, SIMILAR_SIGMAS, SUPPORT, TIE
 from ufmstar_torch.anchors.given import AnchorInput
-
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 
 def inliers(anchors: AnchorInput) -> Tensor:
@@ -33,7 +30,7 @@ def inliers(anchors: AnchorInput) -> Tensor:
     return torch.from_numpy(out)
 
 
-@compiled
+@kernel
 def _supported(pixel, valid, ratio, noise, tie, order, most, out):
     """One stream; ``order`` are its valid anchors by u."""
     neighbour = np.empty((order.size, most), np.int64)
@@ -57,7 +54,7 @@ def _supported(pixel, valid, ratio, noise, tie, order, most, out):
         out[a] = out[a] or support >= SUPPORT
 
 
-@compiled
+@part
 def _nearest(pixel, tie, order, place, distance, neighbour):
     """The nearest anchors in the image, and how many there are: from the place in the order to both sides, until the
     difference in u alone is farther than the farthest of them."""
@@ -81,7 +78,7 @@ def _nearest(pixel, tie, order, place, distance, neighbour):
     return n
 
 
-@compiled
+@part
 def _lower_quartile(values):
     """``torch.quantile(values, 0.25)``, 0 of no values."""
     if values.size == 0:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
-from ufmstar_torch.kernels.regress_points_cpu import at_points, compiled, distribute_points, unprojected
+from ufmstar_torch.kernels.regress_points_cpu import at_points, distribute_points, unprojected
 from ufmstar_torch.kernels.regress_tiles_cpu import exact
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
@@ -85,7 +86,7 @@ def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Ten
     return memory, shown
 
 
-@compiled
+@kernel
 def _smooth(previous, current, alpha, memory, shown):
     for i in range(previous.size):
         before, now = previous[i], memory.dtype.type(current[i])

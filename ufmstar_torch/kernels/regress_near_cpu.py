@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.regress_points_cpu import compiled, prepare
+from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.regress_points_cpu import prepare
 
 
-@compiled
+@kernel
 def near_image(
     depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
     first, shares,
@@ -32,7 +33,7 @@ def near_image(
                 out_f[g, v, u] = sums[g] if valid[v, u] else np.nan
 
 
-@compiled
+@kernel
 def near_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f):
     """At points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not finite."""
     index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
@@ -49,7 +50,7 @@ def near_points(points, mean, covariance, weight, m, features, prior_weight, pri
             out_f[g, p] = sums[g] if finite else np.nan
 
 
-@compiled
+@part
 def _components(mean, covariance, weight, sigmas):
     """Occupied components: index, log peak density, mean and whitening [K, 9], and half the sides of their boxes."""
     index, whitening, log_peak = prepare(mean, covariance, weight)
@@ -63,7 +64,7 @@ def _components(mean, covariance, weight, sigmas):
     return index, log_peak, local, extent
 
 
-@compiled
+@part
 def _point(x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums):
     """The regression at one point; its features are left in ``sums`` [F]."""
     count, least = 0, np.inf

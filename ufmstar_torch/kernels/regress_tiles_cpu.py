@@ -28,13 +28,14 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
+from numba import types
+from numba.extending import overload, register_jitable
 
-from ufmstar_torch.kernels.regress_points_cpu import compiled, prepare
+from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.regress_points_cpu import prepare
 
 # Multiply and add joined where the processor can: one rounding less, not one more.
-contracted: Any = njit(cache=True, nogil=True, fastmath={"contract"})
+contracted: Any = register_jitable(error_model="numpy", fastmath={"contract"})
 
 _TILE = 8  # pixels
 _PIXELS = _TILE * _TILE
@@ -77,7 +78,7 @@ def _exp2_overload(t):
     return exp2_32
 
 
-@compiled
+@kernel
 def exact(
     depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
 ):
@@ -128,13 +129,13 @@ def exact(
             _finish(valid, v, u, buffer, sums, out, out_f)
 
 
-@compiled
+@part
 def _limit(epsilon, count):
     """log2 of the share of a lower bound that one component may add at one level, a little less for rounding."""
     return math.log2(epsilon / (3 * max(count, 1))) - 0.01
 
 
-@compiled
+@part
 def _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit):
     """Index and fields [K, 10] of the components whose density can exceed 2^limit at a pixel of the image.
 
@@ -156,7 +157,7 @@ def _visible(mean, covariance, index, whitening, log_peak, K, height, width, lim
     return chosen[:n], fields[:n]
 
 
-@compiled
+@part
 def _meets(mu, S, square, K, height, width):
     """Whether the ellipsoid (x - mu)^T S^-1 (x - mu) = square can have a point in the view.
 
@@ -181,7 +182,7 @@ def _meets(mu, S, square, K, height, width):
     return True
 
 
-@compiled
+@part
 def _rays(K, height, width):
     """x/z of every column and y/z of every row."""
     across, down = np.empty(width), np.empty(height)
@@ -192,7 +193,7 @@ def _rays(K, height, width):
     return across, down
 
 
-@compiled
+@part
 def _points(depth, valid, rays, v_low, u_low, points, boxes, seen):
     """Points [16, 3, 64] of the tiles of a block and their bounding boxes [16, 2, 3]; False where no pixel is valid.
 
@@ -218,7 +219,7 @@ def _points(depth, valid, rays, v_low, u_low, points, boxes, seen):
     return some
 
 
-@compiled
+@part
 def _place(depth, valid, rays, v0, v1, u0, u1, first, points, box):
     """The points [3, 64] of one tile and their bounding box [2, 3]; ``first`` is the point of its first valid pixel."""
     x, y, z = points[0], points[1], points[2]
@@ -244,7 +245,7 @@ def _place(depth, valid, rays, v0, v1, u0, u1, first, points, box):
     box[1, 0], box[1, 1], box[1, 2] = x_high, y_high, z_high
 
 
-@compiled
+@part
 def _union(boxes, seen):
     """The least and the greatest corner of the boxes of the tiles that are seen."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -255,7 +256,7 @@ def _union(boxes, seen):
     return low, high
 
 
-@compiled
+@part
 def _blank(v_low, u_low, side, out, out_f):
     """NaN at the pixels of a patch."""
     for v in range(v_low, min(v_low + side, out.shape[0])):
@@ -291,7 +292,7 @@ def _bounds(packed, n, centre, half, slack, lower, upper):
         upper[j] = peak[j] - (q0 * q0 + q1 * q1 + q2 * q2)
 
 
-@compiled
+@part
 def _greatest(values, n, start):
     """The greatest of ``start`` and n values without NaN."""
     a = b = c = start  # four chains of comparisons, which do not wait for each other
@@ -305,7 +306,7 @@ def _greatest(values, n, start):
     return max(max(start, a), max(b, c))
 
 
-@compiled
+@part
 def _cull(packed, n, low, high, epsilon, least, bounds, kept):
     """Write the packed components that matter in the box from low to high to ``kept``; return how many."""
     real = packed.dtype.type
@@ -357,7 +358,7 @@ def _add_feature(first, second, buffer, row):
         row[i] += buffer[_FIRST + i] * first + buffer[_SECOND + i] * second
 
 
-@compiled
+@part
 def _sum(points, least, chosen, count, index, fields, m, features, prior_weight, prior_mean, buffer, sums, coefficient):
     """Evidence, total and sums of the features [F, 64] at the points of a tile, over ``chosen`` components.
 
@@ -380,7 +381,7 @@ def _sum(points, least, chosen, count, index, fields, m, features, prior_weight,
             _add_feature(real(features[index[a], g]), real(features[index[b], g]), buffer, sums[g])
 
 
-@compiled
+@part
 def _start(points, least, prior_weight, prior_mean, buffer, sums):
     """Fill the buffer with the points relative to the nearest one, whose number is returned, and with the prior."""
     nearest = 0
@@ -397,7 +398,7 @@ def _start(points, least, prior_weight, prior_mean, buffer, sums):
     return nearest
 
 
-@compiled
+@part
 def _finish(valid, v0, u0, buffer, sums, out, out_f):
     """Write the averages of a tile; NaN where not valid."""
     nan = out.dtype.type(np.nan)

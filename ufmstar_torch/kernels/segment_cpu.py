@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.kernels.segment_image_cpu import compiled, segment_image, write_gaussians
+from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.kernels.segment_image_cpu import segment_image, write_gaussians
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
 
@@ -103,7 +104,7 @@ def _limits(given: SegmentInput, before_pruning: bool) -> _Limits:
     )
 
 
-@compiled
+@kernel
 def _depth_bins(s, limits):
     """Squared length and far edge of every depth bin [m^2, m]."""
     lengths2, edges = np.empty(limits.depth_bins), np.empty(limits.depth_bins)
@@ -116,7 +117,7 @@ def _depth_bins(s, limits):
     return lengths2, edges
 
 
-@compiled
+@kernel
 def _feature_means(features, labels, weight):
     """Mean of the features [B, F, H, W] over the pixels of each Gaussian, in raster order."""
     streams, channels, height, width = features.shape

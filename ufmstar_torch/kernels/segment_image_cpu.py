@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
+from ufmstar_torch.kernels.compile_cpu import kernel, part
+
 # Where counters start. numba gives a plain 0 a type of its own, and compiles all that is called with it twice.
 _ZERO: Any = np.int64(0)
 
@@ -49,7 +49,7 @@ class _Open(NamedTuple):
     dzz: float
 
 
-@compiled
+@kernel
 def segment_image(z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, labels):
     """One image; writes its labels. Returns which Gaussians are kept, in emission order, and all their values."""
     height, width = z.shape
@@ -86,7 +86,7 @@ def segment_image(z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits
     return _prune(whole, created, limits, labels), gaussians, whole
 
 
-@compiled
+@part
 def _doubled(table):
     """The same rows with as many free ones behind them."""
     out = np.empty((2 * table.shape[0], table.shape[1]), table.dtype)
@@ -96,7 +96,7 @@ def _doubled(table):
     return out
 
 
-@compiled
+@part
 def _usable(z, use, spread, max_depth, depth, s2):
     """Depth and variance of a row's pixels, depth 0 for those that take no part. NaN fails every comparison."""
     for u in range(z.size):
@@ -109,7 +109,7 @@ def _usable(z, use, spread, max_depth, depth, s2):
         depth[u] = depth[u] if (s2[u] >= 0) & (s2[u] < np.inf) else 0.0
 
 
-@compiled
+@part
 def _scanline(
     depth, s2, rx, ry, slope, lengths2, edges, limits, older, older_int, segments, segments_int, place, owner
 ):
@@ -159,7 +159,7 @@ def _scanline(
     return done, started
 
 
-@compiled
+@part
 def _push(newest, older, older_int, front, waiting, room, sparse, segments, segments_int, done, place):
     """Let the newest open segment wait, and finish the oldest if there is no room."""
     if room == 0:
@@ -174,7 +174,7 @@ def _push(newest, older, older_int, front, waiting, room, sparse, segments, segm
     return front, waiting, done
 
 
-@compiled
+@part
 def _fits(o, x, z, u, slope, length2, limits):
     """Does the point continue the open segment?"""
     if u - o.u_right > limits.occlusion_gap or not o.w2 < length2:
@@ -187,7 +187,7 @@ def _fits(o, x, z, u, slope, length2, limits):
     return o.dx != 0 and abs(o.z_left + o.dz * (x - o.x_left) / o.dx - z) < tau_z
 
 
-@compiled
+@part
 def _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, length2, limits):
     """The newest of the waiting segments that the point continues, or -1."""
     for i in range(waiting):
@@ -197,7 +197,7 @@ def _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, lengt
     return -1
 
 
-@compiled
+@part
 def _extended(o, x, z, u, k, y_factor, rx, s2):
     """The open segment with a pixel added."""
     dx, dz = x - o.x_left, z - o.z_left
@@ -210,19 +210,19 @@ def _extended(o, x, z, u, k, y_factor, rx, s2):
     )  # fmt: skip
 
 
-@compiled
+@part
 def _store(values, whole, o):
     whole[0], whole[1], whole[2], whole[3], whole[4] = o.n, o.u_left, o.u_right, o.nearest, o.born
     values[0], values[1], values[2], values[3], values[4] = o.x_left, o.z_left, o.x_right, o.z_right, o.w2
     values[5], values[6], values[7], values[8], values[9] = o.dx, o.dz, o.dxx, o.dxz, o.dzz
 
 
-@compiled
+@part
 def _load(f, i):
     return _Open(i[0], i[1], i[2], i[3], i[4], f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9])
 
 
-@compiled
+@part
 def _finish(o, sparse, segments, segments_int, done, place):
     """Output an open segment unless it is too sparse; returns the new number of finished ones."""
     if o.n <= sparse:
@@ -239,7 +239,7 @@ def _finish(o, sparse, segments, segments_int, done, place):
     return done + 1
 
 
-@compiled
+@part
 def _join_row(
     segments, segments_int, done, v, ry, slope, lengths2, limits, gaussians, whole, active, before, created, member
 ):
@@ -267,7 +267,7 @@ def _join_row(
     return n, created
 
 
-@compiled
+@part
 def _retire(active, n, v, last, whole, emitted):
     """Emit the Gaussians that row v did not extend, after the last row all of them in the order of the list.
 
@@ -285,7 +285,7 @@ def _retire(active, n, v, last, whole, emitted):
     return going, emitted
 
 
-@compiled
+@part
 def _lift(segment, ry, h):
     """A segment as a Gaussian of its own: y and the moments with y follow from y = ry z."""
     for i in range(h.size):
@@ -297,7 +297,7 @@ def _lift(segment, ry, h):
     h[_L], h[_L + 1], h[_L + 2] = segment[_LX], ry * segment[_LZ], segment[_LZ]
 
 
-@compiled
+@part
 def _best_overlap(h_int, active, before, whole):
     """The Gaussian active before this row whose stored interval overlaps the segment's most, or -1."""
     best, result = 0.0, -1
@@ -312,7 +312,7 @@ def _best_overlap(h_int, active, before, whole):
     return result
 
 
-@compiled
+@part
 def _same_plane(o, o_int, h, slope, lengths2, limits):
     """Does segment h continue the surface of Gaussian o?"""
     if not o[_PI2] < lengths2[o_int[_NEAREST]]:
@@ -330,7 +330,7 @@ def _same_plane(o, o_int, h, slope, lengths2, limits):
     return distance * distance < (nx * nx + ny * ny + nz * nz) * (limits.noise_floor * limits.noise_floor)
 
 
-@compiled
+@part
 def _merge(o, o_int, h, h_int):
     """Add segment h to Gaussian o: moments about the means (Chan et al.), then interval and plane state."""
     n_o, n_h = o_int[_N], h_int[_N]
@@ -360,7 +360,7 @@ def _merge(o, o_int, h, h_int):
     o_int[_MERGED] += 1
 
 
-@compiled
+@part
 def _prune(whole, created, limits, labels):
     """Kept Gaussians in order of emission; turns the labels from orders of creation into slots."""
     emitted = np.empty(created, np.int64)
@@ -382,7 +382,7 @@ def _prune(whole, created, limits, labels):
     return kept[:n]
 
 
-@compiled
+@kernel
 def write_gaussians(kept, gaussians, whole, mean, covariance, weight, count):
     """The kept Gaussians as the mixture's slots; a single pixel has no sample covariance (zeros)."""
     for i in range(kept.size):

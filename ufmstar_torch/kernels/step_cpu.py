@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ from ufmstar_torch.kernels.rigid_cpu import move, relative
 from ufmstar_torch.kernels.segment_cpu import segment
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import FrameStatistics, StepOutput
+from ufmstar_torch.output import FrameStatistics, StepOutput, given
 from ufmstar_torch.regress import moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
@@ -161,7 +162,8 @@ def step(
         posterior=state.posterior,
     )
     stage("average")
-    return state, StepOutput(disagreement, result.features, residual, measured, labels, current_cam, statistics)
+    out = StepOutput(disagreement, result.features, residual, measured, partial(given, labels), current_cam, statistics)
+    return state, out
 
 
 def _unobserved(name: str) -> None:
@@ -200,7 +202,8 @@ def _correspond(
     everyone = np.empty(0, np.bool_)
     move(stream.into_camera, *old[:3], 0, everyone, mean_cam, covariance_cam)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    c, k, overlap = matches(mean_cam, covariance_cam, old.weight, *current[:3], stream.K, *size, *thresholds)
+    weight = np.asarray(old.weight, np.float64)  # the segments' dtype: one kernel to compile instead of two
+    c, k, overlap = matches(mean_cam, covariance_cam, weight, *current[:3], stream.K, *size, *thresholds)
     matched = np.zeros(current.weight.shape, np.bool_)
     matched[c] = True
     # What is nearer than the near plane could never be matched again: it is not remembered.

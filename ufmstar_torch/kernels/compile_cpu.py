@@ -1,0 +1,16 @@
+"""How code for the CPU is compiled (numba): kernels, which Python calls, and their parts, which only kernels call.
+
+A kernel is kept on disk. A part is compiled into the kernels that call it and has no interface of its own, which would
+take longer to compile than the part itself; called from Python it is a plain function. Neither numba's cache nor a
+kernel notices a change of these options, nor of a part in another file: delete ``__pycache__`` after one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import njit
+from numba.extending import register_jitable
+
+kernel: Any = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+part: Any = register_jitable(error_model="numpy")
