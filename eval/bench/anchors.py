@@ -141,8 +141,8 @@ def measure_anchored_step(built: UfMStar, frames: Sequence[PosedDepth], points: 
         points: anchors of a frame, at random pixels.
 
     Returns:
-        "plain", "anchored" and "posterior": times [ms]; "ratio" of the first two; "used": anchors that were not rejected; "extra_bytes":
-        what the state keeps of anchors, in all and per slot of the mixture.
+        "plain", "anchored" and "posterior": times [ms]; "ratio" of the first two; "used": anchors that were not
+        rejected; "extra_bytes": what the state keeps of anchors, in all and per slot of the mixture.
     """
     plain, anchored, posterior = (copy.deepcopy(built) for _ in range(3))
     plain.config = built.config.replace(anchored=False)
