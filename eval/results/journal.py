@@ -102,6 +102,10 @@ class Journal(FrameSink):
         self._folder.commit(self._record(result), checkpoint)
         self._saving = 1000 * (perf_counter() - before)
 
+    def end(self) -> None:
+        """Store the last state, before pictures are drawn."""
+        self._folder.store()
+
     def _record(self, result: FrameResult) -> dict[str, Any]:
         """The frame's line of frames.jsonl."""
         about = {"index": result.index, "name": result.name}
