@@ -1,7 +1,7 @@
 """One image through steps 2 to 5: a pure function from state and frame to state and output.
 
 The mixture is kept in the frame of each stream's first camera: poses are taken relative to it in
-float64, so large world coordinates never reach the float32 state, and components nobody touches never change.
+float64, so large world coordinates never reach the float32 state, and what a frame does not update never changes.
 
 :class:`Step` is what ``UfMStar`` calls; :func:`step` is the reference. Its kernels can be replaced one by one
 (:class:`Kernels`); another implementation of the whole step has the same signature.

@@ -30,7 +30,7 @@ from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
-from ufmstar_torch.posterior.update import Posterior, update
+from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.spill import Spill
@@ -439,8 +439,8 @@ class UfMStar(StatefulModule):
         claimed = claimed.clamp_min(self.config.variance_floor)
         if self.recalibration is not None:
             claimed = self.recalibration(claimed)
-        kernels = select_posterior(self.config.backend, frame.depth.device.type)
-        learnt, posterior = update(state.posterior, frame, anchors, claimed, kernels)
+        update = select_posterior(self.config.backend, frame.depth.device.type)
+        learnt, posterior = update(state.posterior, frame, anchors, claimed)
         posterior = replace(posterior, variance=posterior.variance.clamp_min(self.config.variance_floor))
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return replace(state, posterior=learnt), replace(out, statistics=statistics), posterior

@@ -17,8 +17,8 @@ from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
-from ufmstar_torch.posterior.update import PosteriorKernels
+from ufmstar_torch.posterior.update import PosteriorUpdate
+from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
@@ -126,14 +126,14 @@ def _on_gpu(name: str, device_type: str) -> bool:
     return name == "auto" and device_type in _TRITON_DEVICES and _has_triton(device_type)
 
 
-def select_posterior(name: str, device_type: str) -> PosteriorKernels:
-    """The posterior's kernels for a device; arguments and errors as :func:`select_step`. An accelerator takes the
+def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
+    """The posterior's update for a device; arguments and errors as :func:`select_step`. An accelerator takes the
     reference."""
     if not _compiled(name, device_type):
-        return POSTERIOR_REFERENCE
+        return update_posterior
     from ufmstar_torch.kernels import posterior_cpu
 
-    return PosteriorKernels(solve=posterior_cpu.solve, distance=posterior_cpu.distance, read=posterior_cpu.read)
+    return posterior_cpu.update
 
 
 @functools.cache
