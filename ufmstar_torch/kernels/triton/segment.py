@@ -54,7 +54,7 @@ def fit(
     Args:
         given: checked.
         before_pruning: keep every Gaussian.
-        floor: of the covariances; the mixture is float64 then. None = none, in the dtype that ``given`` asks for.
+        floor: of the covariances; the mixture is float64 then. None = none, in the dtype that ``given`` states.
 
     Returns:
         The mixture [B, C], and a function that writes and returns the labels [B, H, W] int64.
