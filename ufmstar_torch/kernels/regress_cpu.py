@@ -36,24 +36,36 @@ def regress_image(
     pixels: Tensor | None = None,
 ) -> Regression:
     """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors; every feature is a contiguous map."""
+    return regress_maps(mixture_cam, torch.where(valid, depth.detach(), 0), intrinsics, config, pixels)
+
+
+def regress_maps(
+    mixture_cam: GaussianMixture,
+    depth: Tensor,
+    intrinsics: Tensor,
+    config: UfMStarConfig,
+    pixels: Tensor | None = None,
+) -> Regression:
+    """:func:`regress_image` of a depth that is positive where it is valid, and only there."""
     if pixels is not None and config.regression != "exact":
-        return regress_pixels(mixture_cam, depth, intrinsics, valid, config, pixels, regress)
-    z, K = torch.where(valid, depth.detach(), 0).contiguous().numpy(), _doubles(intrinsics)[0]
+        return regress_pixels(mixture_cam, depth, intrinsics, depth > 0, config, pixels, regress)
+    z, K = depth.contiguous().numpy(), _doubles(intrinsics)[0]
     shape = z.shape if pixels is None else tuple(pixels.shape)
     out, features = np.empty(shape, z.dtype), np.empty((len(z), mixture_cam.features.shape[2], *shape[1:]), z.dtype)
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
     settings = _settings(config, depth.dtype)
+    kernel = near_image if config.regression != "exact" else exact if pixels is None else exact_at
     calls: list[tuple[Any, ...]] = []
     for b, fields in enumerate(zip(*_fields(mixture_cam), strict=True)):
-        if config.regression != "exact":
+        if kernel is near_image:
             calls += [(z[b], K[b], *fields, *settings, out[b], features[b], i, shares) for i in range(shares)]
             continue
         view = in_view(*fields, K[b], *z.shape[1:], *settings, z.dtype.type(0))
-        if pixels is None:
+        if kernel is exact:
             calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
         else:
             calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, fields[4], out[b], features[b]))
-    each(near_image if config.regression != "exact" else exact if pixels is None else exact_at, calls)
+    each(kernel, calls)
     return _regression(out, features)
 
 
