@@ -43,9 +43,20 @@ def _add_up(logs, valid, total, count):
 
 def features(logs: Floats, u: Floats, v: Floats, hats: int) -> Floats:
     """[N, F] of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
-    across, along = (np.maximum(1 - np.abs(x * (hats - 1) - np.arange(hats)[:, None]), 0) for x in (u, v))
-    products = (along[:, None] * across).reshape(hats * hats, -1)
-    return np.concatenate([[np.ones_like(logs), logs, 2 * u - 1, 2 * v - 1], products]).T.copy()
+    out = np.empty((len(logs), 4 + hats * hats))
+    _fill(logs, u, v, hats, out)
+    return out
+
+
+@compiled
+def _fill(logs, u, v, hats, out):
+    for k in range(len(out)):
+        row = out[k]
+        row[0], row[1], row[2], row[3] = 1.0, logs[k], 2 * u[k] - 1, 2 * v[k] - 1
+        for i in range(hats):
+            across = max(1 - abs(u[k] * (hats - 1) - i), 0.0)
+            for j in range(hats):
+                row[4 + j * hats + i] = across * max(1 - abs(v[k] * (hats - 1) - j), 0.0)
 
 
 def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int64]) -> Floats:

@@ -57,15 +57,14 @@ class Observed(NamedTuple):
 def given(prior: Prior, observed: Observed, weight: Floats) -> Field:
     """As :meth:`ufmstar_torch.posterior.field.Field.given`."""
     n, F = len(prior.diagonal), len(prior.mean)
+    nodes, offset, coefficients = np.zeros((n, RIGHT)), np.empty(n), prior.mean.copy()
     diagonal, precision, right_side = prior.diagonal.copy(), prior.precision.copy(), np.zeros(F)
-    nodes = np.zeros((n, RIGHT))
     _gather(*observed, weight, prior.mean, diagonal, nodes, precision, right_side)
     solved, variance = solve(diagonal, prior.right, prior.down, nodes, prior.cols)
     _give_way(nodes, solved, precision, right_side)
-    covariance = np.linalg.inv(precision).astype(np.float64)
-    b = (covariance * right_side).sum(1)
-    response = solved[:, :F]
-    return Field(prior.mean + b, covariance, solved[:, F] - (response * b).sum(1), response, variance)
+    _invert(precision)
+    _back(precision, right_side, solved, coefficients, offset)
+    return Field(coefficients, precision, offset, solved[:, :F], variance)
 
 
 @compiled
@@ -99,6 +98,37 @@ def _give_way(nodes, solved, precision, right_side):
                     precision[f, g] -= x[f] * y[g]
 
 
+@compiled
+def _invert(A):
+    """A positive definite matrix [F, F], in place, one pivot after the other (Gauss-Jordan)."""
+    for k in range(len(A)):
+        pivot = 1 / A[k, k]
+        A[k, k] = 1.0
+        for c in range(len(A)):
+            A[k, c] *= pivot
+        for r in range(len(A)):
+            if r != k:
+                times = A[r, k]
+                A[r, k] = 0.0
+                for c in range(len(A)):
+                    A[r, c] -= times * A[k, c]
+
+
+@compiled
+def _back(covariance, right_side, solved, coefficients, offset):
+    """What the observations add to the coefficients, and the mean of the field."""
+    F = len(right_side)
+    b = np.zeros(F)
+    for f in range(F):
+        for g in range(F):
+            b[f] += covariance[f, g] * right_side[g]
+        coefficients[f] += b[f]
+    for i in range(len(offset)):
+        offset[i] = solved[i, F]
+        for f in range(F):
+            offset[i] -= solved[i, f] * b[f]
+
+
 def at(field: Field, node: NDArray[np.int64], features: Floats) -> tuple[Floats, Floats]:
     """As :meth:`ufmstar_torch.posterior.field.Field.at`."""
     mean, variance = field.offset[node], field.variance[node]
@@ -124,10 +154,8 @@ def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: 
     """A^-1 columns [n, RIGHT], and the diagonal of A^-1, as :func:`ufmstar_torch.posterior.field.solve`."""
     n = len(diagonal)
     factor, solved, variance = np.empty((n, _WIDTH)), np.empty((n, RIGHT)), np.empty(n)
-    window = np.zeros((WINDOW, _WIDTH))
-    _eliminate(diagonal, right, down, columns, cols, window, factor)
-    window[:] = 0
-    _covary(factor, window, np.empty(_WIDTH), solved, variance)
+    _eliminate(diagonal, right, down, columns, cols, np.zeros((WINDOW, _WIDTH)), factor)
+    _covary(factor, np.zeros((WINDOW, _WIDTH)), np.empty(_WIDTH), solved, variance)
     return solved, variance
 
 
