@@ -8,12 +8,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.field_cpu import Floats
+from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.model import Model
 
-compiled: Any = njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 # What is claimed may be NaN.
-with_nan: Any = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+with_nan: Any = njit(
+    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, fastmath={"contract", "reassoc", "nsz", "arcp"}
+)
 
 
 def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: int) -> Floats:
@@ -24,7 +25,7 @@ def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: in
     return np.where(count > 0, mean, mean.sum() / max(np.count_nonzero(count), 1)).ravel()
 
 
-@compiled
+@fast
 def _add_up(logs, valid, total, count):
     """Sums over the cells."""
     height, width = logs.shape
@@ -48,7 +49,7 @@ def features(logs: Floats, u: Floats, v: Floats, hats: int) -> Floats:
     return out
 
 
-@compiled
+@fast
 def _fill(logs, u, v, hats, out):
     for k in range(len(out)):
         row = out[k]
@@ -66,7 +67,7 @@ def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int6
     return np.log(out)
 
 
-@compiled
+@fast
 def _highest_over_lowest(depth, valid, index, out):
     height, width = depth.shape
     for k in range(len(index)):

@@ -14,14 +14,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ufmstar_torch.kernels.compile_cpu import kernel, part
+
 WINDOW = 32
 # Right-hand sides: the features and y, and zeros to a multiple of four.
 RIGHT = 16
 _WIDTH = WINDOW + RIGHT
 
-compiled: Any = njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-# Distances are compared with infinity, which fast arithmetic leaves undefined.
-exactly: Any = njit(cache=True, nogil=True, error_model="numpy")
+# Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
+fast: Any = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=True)
 Floats = NDArray[np.float64]
 
 
@@ -67,7 +68,7 @@ def given(prior: Prior, observed: Observed, weight: Floats) -> Field:
     return Field(coefficients, precision, offset, solved[:, :F], variance)
 
 
-@compiled
+@fast
 def _gather(node, features, value, weight, mean, diagonal, nodes, precision, right_side):
     """The observations' part of what is prior to begin with: w at the diagonal of their nodes, w x and w (y - x b_0)
     at their right-hand sides, x w x^T and x w (y - x b_0) at the coefficients'."""
@@ -85,7 +86,7 @@ def _gather(node, features, value, weight, mean, diagonal, nodes, precision, rig
                 precision[f, g] += w * x[f] * x[g]
 
 
-@compiled
+@fast
 def _give_way(nodes, solved, precision, right_side):
     """The Schur complement: what the field explains of the observations is left out of the coefficients' part."""
     F = len(right_side)
@@ -98,7 +99,7 @@ def _give_way(nodes, solved, precision, right_side):
                     precision[f, g] -= x[f] * y[g]
 
 
-@compiled
+@fast
 def _invert(A):
     """A positive definite matrix [F, F], in place, one pivot after the other (Gauss-Jordan)."""
     for k in range(len(A)):
@@ -114,7 +115,7 @@ def _invert(A):
                     A[r, c] -= times * A[k, c]
 
 
-@compiled
+@fast
 def _back(covariance, right_side, solved, coefficients, offset):
     """What the observations add to the coefficients, and the mean of the field."""
     F = len(right_side)
@@ -136,7 +137,7 @@ def at(field: Field, node: NDArray[np.int64], features: Floats) -> tuple[Floats,
     return mean, variance
 
 
-@compiled
+@fast
 def _add_coefficients(features, left, b, covariance, mean, variance):
     """x . b, and the variance of what is ``left`` of x."""
     F = len(b)
@@ -159,7 +160,7 @@ def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: 
     return solved, variance
 
 
-@compiled
+@fast
 def _eliminate(diagonal, right, down, columns, cols, window, factor):
     """Row j of the factor [n, 48] has the entries of the window's nodes at their places, then the right-hand sides."""
     n = len(diagonal)
@@ -182,7 +183,7 @@ def _eliminate(diagonal, right, down, columns, cols, window, factor):
             window[own, c] = 0.0
 
 
-@compiled
+@part
 def _enter(window, i, diagonal, right, down, columns, cols):
     """Node i with its links to those before it, at a place that is 0."""
     own, n = i % WINDOW, len(diagonal)
@@ -204,7 +205,7 @@ def _enter(window, i, diagonal, right, down, columns, cols):
         window[own, WINDOW + c] = columns[i, c]
 
 
-@compiled
+@fast
 def _covary(factor, window, out, solved, variance):
     """Backwards through the factor, of which the diagonal is overwritten."""
     for j in range(len(factor) - 1, -1, -1):
@@ -235,7 +236,7 @@ def distance(source: NDArray[np.bool_], right: Floats, down: Floats, cols: int, 
     return way
 
 
-@exactly
+@kernel
 def _sweep(way, right, down, cols):
     """Forth and back until nothing gets shorter."""
     n, shorter = len(way), True
