@@ -87,18 +87,19 @@ def in_view(mean, covariance, weight, m, features, K, height, width, prior_weigh
     """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
 
     Returns:
-        Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n], the terms of the sum
-        [n, 9], and the settings (prior weight and mean, epsilon, log2 of the least threshold).
+        Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n and more], the terms of the
+        sum [n, 9], and the settings (prior weight and mean, epsilon, log2 of the least threshold).
     """
     index, whitening, log_peak = prepare(mean, covariance, weight)
     least = math.log2(_PRIOR * prior_weight)
     limit = _limit(epsilon, index.size) + least
     fields, constants = np.empty((index.size, _FIELDS)), np.empty((index.size, _TERMS), np.array(zero).dtype)
     n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
-    packed = np.empty((_FIELDS, n), constants.dtype)
+    packed = np.empty((_FIELDS, _padded(n)), constants.dtype)
     for i in range(_FIELDS):
         for k in range(n):
             packed[i, k] = fields[k, i]
+    _pad(packed, n)
     return index[:n], fields, packed, constants, (prior_weight, prior_mean, epsilon, least)
 
 
@@ -136,7 +137,7 @@ def _scratch(packed, out_f):
     """Memory for the work on one block, of components ``packed`` [10, n]: the points [16, 192] of its tiles, their
     boxes and origins [16, 9], depths, work on them, whether a tile has a pixel; buffer and sums of features;
     fields, bounds and two lists of components."""
-    n, dtype = packed.shape[1], packed.dtype
+    n, dtype = packed.shape[1], packed.dtype  # padded
     return (
         np.empty((_TILES, 3 * _PIXELS), dtype), np.empty((_TILES, 9)), np.empty(_PIXELS), np.empty((6, _PIXELS)),
         np.empty(_TILES, np.bool_),
@@ -149,7 +150,7 @@ def _scratch(packed, out_f):
 def _blocks(depth, across, down, view, features, scratch, out, out_f, first, shares):
     """The blocks of an image, of which every ``shares``-th is done, from ``first`` on."""
     points, boxes, z, work, seen, buffer, sums, near, bounds, in_block, in_tile = scratch
-    _, _, everyone, _, settings = view
+    index, _, everyone, _, settings = view
     side = _TILE * _SIDE
     rows, columns = (depth.shape[0] + side - 1) // side, (depth.shape[1] + side - 1) // side
     for block in range(first, rows * columns, shares):
@@ -165,10 +166,11 @@ def _blocks(depth, across, down, view, features, scratch, out, out_f, first, sha
                 _blank(v, u, out, out_f)
         if not some:
             continue
-        count = _cull(everyone, everyone.shape[1], _union(boxes, seen), settings, bounds, in_block)
+        count = _cull(everyone, index.size, _union(boxes, seen), settings, bounds, in_block)
         for i in range(_FIELDS):
             for j in range(count):
                 near[i, j] = everyone[i, in_block[j]]
+        _pad(near, count)
         for tile in range(_TILES):
             if seen[tile]:
                 chosen = _cull(near, count, _box(boxes, tile), settings, bounds, in_tile)
@@ -199,7 +201,7 @@ def _by_block(pixels, width, columns, begin, order):
 def _at_pixels(depth, K, pixels, begin, order, rays, view, features, scratch, out, out_f):
     """The blocks of an image at some pixels."""
     points, boxes, z, work, _, buffer, sums, _, bounds, kept, _ = scratch
-    _, _, everyone, _, settings = view
+    index, _, everyone, _, settings = view
     nan = out.dtype.type(np.nan)
     for block in range(begin.size - 1):
         for low in range(begin[block], begin[block + 1], _PIXELS):
@@ -211,7 +213,7 @@ def _at_pixels(depth, K, pixels, begin, order, rays, view, features, scratch, ou
                 z[i] = depth[v, u] if depth[v, u] > 0 else np.inf
             if _nearest_instead(z):
                 _place(z, rays[:1], 0, rays[1:], 0, points, boxes, 0, work)
-                count = _cull(everyone, everyone.shape[1], _box(boxes, 0), settings, bounds, kept)
+                count = _cull(everyone, index.size, _box(boxes, 0), settings, bounds, kept)
                 _sum(points, boxes, 0, kept, count, view, features, buffer, sums)
                 _averages(buffer, sums)
             for i in range(high - low):
@@ -226,6 +228,21 @@ def _at_pixels(depth, K, pixels, begin, order, rays, view, features, scratch, ou
 def _limit(epsilon, count):
     """log2 of the share of a lower bound that one component may add at one level, a little less for rounding."""
     return math.log2(epsilon / (3 * max(count, 1))) - 0.01
+
+
+@leaf
+def _padded(n):
+    """A multiple, not below n, of what a vector loop takes at a time: its remainder would take as long again."""
+    return (n + 15) // 16 * 16
+
+
+@leaf
+def _pad(packed, n):
+    """Fill the fields behind n components up to the padded number with those of one that is nowhere."""
+    for j in range(n, _padded(n)):
+        for i in range(_FIELDS - 1):
+            packed[i, j] = 0
+        packed[_FIELDS - 1, j] = -1e30
 
 
 @leaf
@@ -439,7 +456,7 @@ def _cull(packed, n, box, settings, bounds, kept):
     cx, cy, cz = 0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high)
     hx, hy, hz = 0.5 * (x_high - x_low), 0.5 * (y_high - y_low), 0.5 * (z_high - z_low)
     hx, hy, hz = hx + slack * (hx + abs(cx)), hy + slack * (hy + abs(cy)), hz + slack * (hz + abs(cz))
-    _bounds(packed, n, (real(cx), real(cy), real(cz)), (real(hx), real(hy), real(hz)), slack, bounds)
+    _bounds(packed, _padded(n), (real(cx), real(cy), real(cz)), (real(hx), real(hy), real(hz)), slack, bounds)
     threshold = _greatest(bounds, n, real(least)) + _limit(epsilon, n)
     count = 0
     for j in range(n):
