@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.bench.timing import pinned_threads
+from ufmstar_torch.eval.bench.timing import most_threads, pinned_threads
 
 # Milliseconds and ratios at 224 x 224, bytes and ratios for one room; the tracker's mean processor time for 300 corners
 # at 640 x 480. For information.
@@ -115,7 +115,7 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
     if options.against is not None and not options.against.is_file():
         raise FileNotFoundError(f"--against {options.against} does not exist")
     config = UfMStarConfig()
-    threads = machine.available_cores() if options.threads is None else options.threads
+    threads = most_threads() if options.threads is None else options.threads
     report: dict[str, Any] = {
         "schema": 1,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
