@@ -111,11 +111,8 @@ class DenseEvidence:
     def state(self) -> dict[str, Tensor]:
         """A copy of all that is remembered, for :meth:`load_state`."""
         size, K = ((0, 0), np.eye(3)) if self._camera is None else self._camera
-        held = {
-            "size": torch.tensor(size),
-            "K": torch.tensor(K),
-            "depth": torch.tensor(self._depth, dtype=torch.float64),
-        }
+        depth = torch.tensor(self._depth, dtype=torch.float64)
+        held = {"size": torch.tensor(size), "K": torch.tensor(K), "depth": depth}
         return held | self._keyframes.state() | self._memory.state() | self._errors.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:

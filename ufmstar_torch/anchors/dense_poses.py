@@ -1,9 +1,9 @@
 """Errors of the poses and of the camera, from what all pixels of a frame show together.
 
-A keyframe's relative pose that is wrong by (w, s) moves the pixels of its whole image together, and so does a camera whose
-focal length, centre or distortion is wrong. Across the epipolar lines this shows at once; along them it shows where
-keyframes of other baselines and other pixels contradict it. To first order, with the errors d and the Jacobians of
-``kernels.poses_cpu``,
+A keyframe's relative pose that is wrong by (w, s) moves the pixels of its whole image together, and so does a camera
+whose focal length, centre or distortion is wrong. Across the epipolar lines this shows at once; along them it shows
+where keyframes of other baselines and other pixels contradict it. To first order, with the errors d and the Jacobians
+of ``kernels.poses_cpu``,
 
     value_k = rho + c_k d + noise,      across_k = a_k d + noise,
 
@@ -12,9 +12,9 @@ have a Gaussian prior. Their posterior, N(d, C), corrects the depths, and what n
 
     rho = mean(value) - mean(c) d,      variance = own + mean(c) C mean(c)^T,
 
-means over the keyframes by their precisions. ``own`` is the variance by the match alone, the smallest of the keyframes':
-they share the patch. The prior follows: the variances of the poses' errors are running means of d^2 + C for each
-baseline, those of the camera's errors are what earlier frames left of them.
+means over the keyframes by their precisions. ``own`` is the variance by the match alone, the smallest of the
+keyframes': they share the patch. The prior follows: the variances of the poses' errors are running means of d^2 + C for
+each baseline, those of the camera's errors are what earlier frames left of them.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
-from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, equations, linearised
+from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, linearised, solved
 
-# Rounds of Student-t weights and their degrees of freedom; matches on which running estimates are based.
-_ROUNDS, _STUDENT, _ENOUGH = 3, 4.0, 10
+# Matches on which running estimates are based.
+_ENOUGH = 10
 # The median of the square of a standard normal variable.
 _MEDIAN_SQUARE = 0.4549
 # [px] Standard deviation of a position by errors of the poses before it is estimated, and the least one.
@@ -92,7 +92,8 @@ class PoseErrors:
         self._known = bool(known)
 
     def positions(self, K: NDArray[np.float64], width: int, depth: float) -> NDArray[np.float64]:
-        """[baselines] variance of a position in a keyframe by all errors, at a depth [m] in an image ``width`` wide [px^2]."""
+        """[baselines] variance of a position in a keyframe by all errors [px^2], at a depth [m], in an image ``width``
+        wide."""
         f = K[0, 0]
         if not self._known:
             self._turned[:], self._moved[:] = _FIRST**2 / 2 / f**2, _FIRST**2 / 2 * depth**2 / f**2
@@ -124,35 +125,21 @@ class PoseErrors:
         speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
         along = np.where(used[..., None], measured.along, 0.0)
         on_line, across_change = linearised(pixel, measured.rho, along, slope, views, K)
-        change = on_line / speed[..., None]
-        value = np.where(used, measured.value - measured.rho[:, None], 0.0)
-        across = np.where(shows, measured.across, 0.0)
         left = self._left[shares]
-        own = (np.where(used, measured.noise, 1.0) + left * (1 + slope**2)) / speed**2
-        across_noise = np.where(shows, measured.across_noise, 1.0)
-        precision, start = self._before(shares)
-        student, student_across = used.astype(np.float64), shows.astype(np.float64)
-        for round_ in range(_ROUNDS):
-            A, r = precision.copy(), precision @ start
-            mean_change, mean = np.zeros((len(pixel), len(r))), np.zeros(len(pixel))
-            equations(
-                *(change, value, student / own, across_change, across, student_across / (across_noise + left)),
-                *(A, r, mean_change, mean),
-            )
-            covariance = np.linalg.inv(A)
-            error = covariance @ r
-            each = np.concatenate([error[:-CAMERA].reshape(-1, POSE), np.tile(error[-CAMERA:], (len(shares), 1))], 1)
-            rho = mean - mean_change @ error
-            residual = np.square(value - (change * each).sum(-1) - rho[:, None]) / own
-            beside = np.square(across - (across_change * each).sum(-1))
-            if round_ + 1 < _ROUNDS:
-                student = used * (_STUDENT + 1) / (_STUDENT + residual)
-                student_across = shows * (_STUDENT + 1) / (_STUDENT + beside / (across_noise + left))
-        self._learn(error, covariance, shares, K, views.image.shape[2], depth)
-        self._learn_noise(residual[used], beside, measured.across_noise, shows, shares)
-        common = ((mean_change @ covariance) * mean_change).sum(1)
-        smallest = np.where(used, own, np.inf).min(1, initial=np.inf)
-        return Fit(measured.rho + rho, max(self._disagreement, 1.0) * smallest + common)
+        own = np.where(used, (measured.noise + left * (1 + slope**2)) / speed**2, np.inf)
+        shown = Shown(
+            on_line / speed[..., None],
+            np.where(used, measured.value - measured.rho[:, None], 0.0),
+            own,
+            across_change,
+            np.where(shows, measured.across, 0.0),
+            np.where(shows, measured.across_noise + left, np.inf),
+        )
+        solution = solved(shown, *self._before(shares))
+        self._learn(solution.error, solution.covariance, shares, K, views.image.shape[2], depth)
+        self._learn_noise(solution.residual[used], solution.beside, measured.across_noise, shows, shares)
+        variance = max(self._disagreement, 1.0) * own.min(1, initial=np.inf) + solution.common
+        return Fit(measured.rho + solution.rho, variance)
 
     def _before(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Precision [S, S] and mean [S] of the errors of some keyframes and of the camera, S = 6 V + 4."""

@@ -1,7 +1,7 @@
 """What the anchors around an anchor say of it: on which side of an edge its surface is, and whether it stands alone.
 
-A pixel of large gradient lies on an edge of a thing. The patch is matched as a whole, but the pixel shows one surface or
-the other. Of the anchors around it, some have its depth: on their side of the edge is its surface.
+A pixel of large gradient lies on an edge of a thing. The patch is matched as a whole, but the pixel shows one surface
+or the other. Of the anchors around it, some have its depth: on their side of the edge is its surface.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from ufmstar_torch.kernels.dense_cpu import compiled
 
 # Two anchors are alike within so many standard deviations of their difference, or this share of the inverse depth.
 _SIGMAS, _SHARE = 3.0, 0.05
-# An anchor with _SOME others around it, of which fewer than _FEW are alike, stands alone. On tours, _WRONG of those have
-# another depth; their squared error is that share of the squared difference from those around them.
+# An anchor with _SOME others around it, of which fewer than _FEW are alike, stands alone. On tours, _WRONG of those
+# have another depth: their squared error is that share of the squared difference from those around them.
 _SOME, _FEW, _WRONG = 4, 2, 0.25
 # A side is that of the surface where the mean directions of those alike and of the others differ by this much along the
 # gradient (2 = opposite); the pixel then moves to it by so many pixels.
