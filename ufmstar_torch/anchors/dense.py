@@ -163,7 +163,7 @@ class DenseEvidence:
         from ufmstar_torch.kernels.beside_cpu import beside  # kernels compile when they are first needed
         from ufmstar_torch.kernels.dense_cpu import measure
 
-        cell = _cell(small.shape[1])
+        cell, K = _cell(small.shape[1]), self._errors.camera(K)
         sighted = self._memory.sighted(small, T, K, cell)
         known, searched = len(sighted.slot), 0
         pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])

@@ -42,7 +42,7 @@ _FIRST_LEFT = 0.1
 _SHARED = 0.5
 # Standard deviations of the camera's errors: the focal length as a share, its centre as a share of the width, and the
 # radial distortion. Frames share keyframes: each counts as a part of its information. What is learnt fades.
-_CAMERA, _PART, _FADES = (0.01, 0.01, 0.01, 0.03), 0.2, 0.02
+_CAMERA, _PART, _FADES = (0.003, 0.003, 0.003, 0.01), 0.2, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +101,11 @@ class PoseErrors:
             self._known = True
         return self._left + f**2 * (self._turned + self._moved / depth**2)
 
+    def camera(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[3, 3] the intrinsics K [3, 3] with what is known of their errors [px]."""
+        focal, u, v, _ = self._camera
+        return np.array([[K[0, 0] * (1 + focal), 0, K[0, 2] + u], [0, K[1, 1] * (1 + focal), K[1, 2] + v], [0, 0, 1]])
+
     def corrected(
         self,
         pixel: NDArray[np.float64],
@@ -117,7 +122,7 @@ class PoseErrors:
             measured: N pixels in V views.
             shares: [V] to which baseline each view belongs.
             views: V keyframes.
-            K: [3, 3] [px].
+            K: [3, 3] of :meth:`camera` [px], which the views have.
             depth: median of the scene [m].
         """
         used = (measured.agreed >= 2)[:, None] & np.isfinite(measured.value)
@@ -138,7 +143,8 @@ class PoseErrors:
         solution = solved(shown, *self._before(shares))
         self._learn(solution.error, solution.covariance, shares, K, views.image.shape[2], depth)
         self._learn_noise(solution.residual[used], solution.beside, measured.across_noise, shows, shares)
-        variance = max(self._disagreement, 1.0) * own.min(1, initial=np.inf) + solution.common
+        factor = max(self._disagreement, (1 + self._disagreement) / 2)  # half is the patch's, which all views share
+        variance = factor * own.min(1, initial=np.inf) + solution.common
         return Fit(measured.rho + solution.rho, variance)
 
     def _before(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -150,7 +156,7 @@ class PoseErrors:
         precision = np.zeros((n + CAMERA, n + CAMERA))
         precision[:n, :n] = np.linalg.inv(poses.reshape(n, n))
         precision[n:, n:] = np.linalg.inv(self._covariance)
-        return precision, np.concatenate([np.zeros(n), self._camera])
+        return precision, np.concatenate([np.zeros(n + 3), self._camera[3:]])  # K has the first three
 
     def _learn(
         self,
@@ -168,7 +174,8 @@ class PoseErrors:
             self._moved[share] = max(self._faded(self._moved[share], moved), least * depth**2)
         before, first = np.linalg.inv(self._covariance), np.linalg.inv(self._prior(width))
         now = np.linalg.inv(covariance[-CAMERA:, -CAMERA:])
-        weighted = (1 - _PART) * before @ self._camera + _PART * now @ error[-CAMERA:]
+        measured = error[-CAMERA:] + np.append(self._camera[:3], 0)
+        weighted = (1 - _PART) * before @ self._camera + _PART * now @ measured
         self._covariance = np.linalg.inv((1 - _FADES) * ((1 - _PART) * before + _PART * now) + _FADES * first)
         self._camera = self._covariance @ weighted * (1 - _FADES)
 
