@@ -33,6 +33,8 @@ _BASELINES = (0.04, 0.1, 0.22, 0.45)
 _NEAREST, _FARTHEST = 6.0, -0.03
 # Views that must agree; anchors on which running estimates of noise are based.
 _AGREE, _ENOUGH = 2, 10
+# Frames in a row that contradict their poses, after which keyframes and landmarks are forgotten: the poses have jumped.
+_JUMPED = 3
 # Standard deviation of an inverse depth, as a share, by what no image shows: the scale of the poses.
 _SCALE = 0.005
 
@@ -106,13 +108,13 @@ class DenseEvidence:
         self._memory.reset()
         self._errors.reset()
         self._camera: tuple[tuple[int, ...], NDArray[np.float64]] | None = None
-        self._depth = self.config.start_depth
+        self._depth, self._contradicted = self.config.start_depth, 0
 
     def state(self) -> dict[str, Tensor]:
         """A copy of all that is remembered, for :meth:`load_state`."""
         size, K = ((0, 0), np.eye(3)) if self._camera is None else self._camera
-        depth = torch.tensor(self._depth, dtype=torch.float64)
-        held = {"size": torch.tensor(size), "K": torch.tensor(K), "depth": depth}
+        numbers = torch.tensor([self._depth, self._contradicted], dtype=torch.float64)
+        held = {"size": torch.tensor(size), "K": torch.tensor(K), "numbers": numbers}
         return held | self._keyframes.state() | self._memory.state() | self._errors.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
@@ -126,7 +128,8 @@ class DenseEvidence:
         self._errors.load_state(state)
         height, width = state["size"].tolist()
         self._camera = ((height, width), np.array(state["K"].numpy())) if height else None
-        self._depth = state["depth"].item()
+        self._depth, contradicted = state["numbers"].tolist()
+        self._contradicted = int(contradicted)
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -154,6 +157,10 @@ class DenseEvidence:
             raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
         small, scale = _reduced(gray, self.config.width)
         result = self._measured(small, scale, T, scale @ K)
+        if self._contradicted >= _JUMPED:
+            self._contradicted = 0
+            self._keyframes.reset()
+            self._memory.forget()
         self._keyframes.add(small, T, self._depth)
         return result
 
@@ -184,6 +191,7 @@ class DenseEvidence:
             agreed[expected] = (actual.agreed >= _AGREE) & (actual.contradicted == 0)
             matched = int((actual.agreed > 0).sum())
             trusted = matched < _ENOUGH or agreed.sum() >= self.config.min_share * matched
+        self._contradicted = 0 if trusted else self._contradicted + 1
         agreed &= (rho > np.sqrt(variance)) & trusted
         both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
         again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known

@@ -126,6 +126,10 @@ class Memory:
         rho = 1 / depth[kept]
         return Sighted(slot, pixel[kept], rho, np.square(spread[kept] * rho * rho), due)
 
+    def forget(self) -> None:
+        """Forget all landmarks, and keep the running estimate."""
+        self._used[:] = False
+
     def _forget(self, slot: NDArray[np.int64]) -> None:
         self._used[slot[self._failed[slot] > _FAILURES + self.confirmed[slot]]] = False
 

@@ -13,8 +13,8 @@ have a Gaussian prior. Their posterior, N(d, C), corrects the depths, and what n
     rho = mean(value) - mean(c) d,      variance = own + mean(c) C mean(c)^T,
 
 means over the keyframes by their precisions. ``own`` is the variance by the match alone, the smallest of the
-keyframes': they share the patch. The prior follows: the variances of the poses' errors are running means of d^2 + C for
-each baseline, those of the camera's errors are what earlier frames left of them.
+keyframes': they share the patch. The prior follows: the variances of the poses' errors follow d^2 for each baseline, as
+far as the pixels show d, and those of the camera's errors are what earlier frames left of them.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class PoseErrors:
     def reset(self) -> None:
         """Forget everything."""
         self._known = False
-        self._turned, self._moved = np.zeros(self._baselines), np.zeros(self._baselines)  # [rad^2], [m^2]
+        self._variance = np.zeros((self._baselines, 2))  # of w and s [rad^2, m^2]
         self._left = np.full(self._baselines, _FIRST_LEFT**2)  # [px^2]
         self._disagreement = 1.0
         self._camera, self._covariance = np.zeros(CAMERA), np.eye(CAMERA)
@@ -96,10 +96,10 @@ class PoseErrors:
         wide."""
         f = K[0, 0]
         if not self._known:
-            self._turned[:], self._moved[:] = _FIRST**2 / 2 / f**2, _FIRST**2 / 2 * depth**2 / f**2
+            self._variance[:] = _FIRST**2 / 2 / f**2 * np.array([1, depth**2])
             self._covariance = self._prior(width)
             self._known = True
-        return self._left + f**2 * (self._turned + self._moved / depth**2)
+        return self._left + f**2 * (self._variance @ [1, 1 / depth**2])
 
     def camera(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
         """[3, 3] the intrinsics K [3, 3] with what is known of their errors [px]."""
@@ -149,7 +149,7 @@ class PoseErrors:
 
     def _before(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Precision [S, S] and mean [S] of the errors of some keyframes and of the camera, S = 6 V + 4."""
-        sigma = np.sqrt(np.repeat(np.stack([self._turned, self._moved], 1)[shares], 3, axis=1))
+        sigma = np.sqrt(np.repeat(self._variance[shares], 3, axis=1))
         alike = np.where(np.eye(len(shares)), 1.0, _SHARED)
         poses = np.einsum("kl,kc,lc,cd->kcld", alike, sigma, sigma, np.eye(POSE))
         n = POSE * len(shares)
@@ -167,11 +167,14 @@ class PoseErrors:
         width: int,
         depth: float,
     ) -> None:
-        square = (np.square(error) + covariance.diagonal())[:-CAMERA].reshape(-1, 2, 3).mean(2)
-        least = np.square(_LEAST / K[0, 0])
-        for share, (turned, moved) in zip(shares, square, strict=True):
-            self._turned[share] = max(self._faded(self._turned[share], turned), least)
-            self._moved[share] = max(self._faded(self._moved[share], moved), least * depth**2)
+        remains = covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
+        square = np.square(error[:-CAMERA]).reshape(-1, 2, 3).sum(2)
+        least = np.square(_LEAST / K[0, 0]) * np.array([1, depth**2])
+        for share, left, each in zip(shares, remains, square, strict=True):
+            before = self._variance[share]
+            shown = 3 - left / before  # of the three numbers, what the pixels showed
+            step = (1 - self._memory) * (each - shown * before) / np.maximum(shown, 1)
+            self._variance[share] = np.maximum(before + step, least)
         before, first = np.linalg.inv(self._covariance), np.linalg.inv(self._prior(width))
         now = np.linalg.inv(covariance[-CAMERA:, -CAMERA:])
         measured = error[-CAMERA:] + np.append(self._camera[:3], 0)
@@ -204,8 +207,7 @@ class PoseErrors:
 
 
 _HELD = {
-    "pose_turned": "_turned",
-    "pose_moved": "_moved",
+    "pose_variance": "_variance",
     "pose_left": "_left",
     "camera_error": "_camera",
     "camera_covariance": "_covariance",

@@ -87,7 +87,7 @@ def _beside(image, pixel, rho, variance, cell, lies_in, moved, alone):
 
 @compiled
 def _gradient(image, u, v):
-    """Direction of the gradient around a pixel, of either sign: the main axis of the structure tensor."""
+    """Direction of the gradient around a pixel, of either sign: the structure tensor's main axis. 0 without one."""
     uu = uv = vv = 0.0
     for j in range(v - _HALF, v + _HALF + 1):
         for i in range(u - _HALF, u + _HALF + 1):
@@ -96,5 +96,7 @@ def _gradient(image, u, v):
             uu += du * du
             uv += du * dv
             vv += dv * dv
+    if uu + vv == 0:
+        return 0.0, 0.0
     angle = 0.5 * np.arctan2(2 * uv, uu - vv)
     return np.cos(angle), np.sin(angle)
