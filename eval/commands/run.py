@@ -199,7 +199,7 @@ def run(
 def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
     UfMStar(job.config, device=job.device).warm_up(
-        (32, 32), progress=lambda *n: progress(Progress("kernels", *n, None, 0))
+        (32, 32), progress=lambda done, total: progress(Progress("kernels", done, total, None, 0))
     )
     position = folder.checkpoint.position
     row = job.row(folder.checkpoint.module, position)

@@ -6,6 +6,7 @@ import copy
 import hashlib
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, cast
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
@@ -61,7 +62,8 @@ class NetworkSource:
         self.identity, self.label, self.digest = dict(identity), label, digest
         self._timer = StageTimer(device)
         self._generator = torch.Generator(device)
-        self._input: tuple[Frame, Tensor, Tensor] | None = None
+        self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()
+        self._seeded: Frame | None = None
         for network in stochastic(networks.networks) if seeding is not None else ():
             set_sampling(network, True, self._generator)
 
@@ -101,7 +103,7 @@ class NetworkSource:
             return self
         other = copy.copy(self)
         other._turns = NetworksInTurn(self._members, samples=self._turns.samples, preprocess=changed)
-        other._input, other._timer = None, StageTimer(self._device)
+        other._inputs, other._seeded, other._timer = WeakKeyDictionary(), None, StageTimer(self._device)
         other.identity = {**self.identity, "preprocess": how}
         other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
         return other
@@ -134,15 +136,25 @@ class NetworkSource:
             made = Prediction.of(prediction, K[0], self._timer.take()["network"])
             return made.to(torch.float32) if reduced else made
 
+    def prepare(self, frame: Frame) -> None:
+        """See ``DepthSource``; on the processor."""
+        if self._device.type == "cpu" and frame.image is not None:
+            self._input_of(frame)
+
     def _prepared(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """:meth:`_input_of`; a frame seeds what is drawn for all members."""
+        if self._seeding == "frame" and self._seeded is not frame:
+            self._generator.manual_seed(frame.index)
+            self._seeded = frame
+        return self._input_of(frame)
+
+    def _input_of(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3]; once for all members."""
-        if self._input is None or self._input[0] is not frame:
+        if frame not in self._inputs:
             image, K = image_tensor(frame).to(self._device), torch.from_numpy(frame.intrinsics)[None]
-            x, K = self._turns.prepare(image, K)
-            if self._seeding == "frame":
-                self._generator.manual_seed(frame.index)
-            self._input = (frame, x, K)
-        return self._input[1], self._input[2]
+            with torch.no_grad():
+                self._inputs[frame] = self._turns.prepare(image, K)
+        return self._inputs[frame]
 
 
 def prepared_as(own: Preprocess, how: str) -> Preprocess:

@@ -139,7 +139,7 @@ class FrameStream:
         """
         for sink in sinks:
             sink.begin(self)
-        with FramesAhead(self.sequence, self._needed()) as frames:
+        with FramesAhead(self.sequence, self._needed(), self._prepare) as frames:
             while self.position < len(self.indices):
                 if stop():
                     raise Stopped
@@ -172,6 +172,12 @@ class FrameStream:
         """Of the frames that are left, those that a row selects; without rows all."""
         left = range(self.position, len(self.indices))
         return [self.indices[n] for n in left if not self.rows or any(row.selects(n) for row in self.rows)]
+
+    def _prepare(self, frame: Frame) -> None:
+        """The networks' input, unless it may be that a store has all predictions."""
+        if self._store is None:
+            for row in self.rows:
+                row.source.prepare(frame)
 
     def _next(self, frames: FramesAhead) -> FrameResult:
         number, index = self.position, self.indices[self.position]
