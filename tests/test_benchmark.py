@@ -20,9 +20,10 @@ from ufmstar_torch.eval.bench import benchmark
 from ufmstar_torch.eval.bench.compare import compare, measure_peer
 from ufmstar_torch.eval.bench.floors import stage_floors
 from ufmstar_torch.eval.bench.frames import PosedDepth, RecordedSequence, RenderedRoom
+from ufmstar_torch.eval.bench.growth import measure_long_run
 from ufmstar_torch.eval.bench.memory import state_memory
 from ufmstar_torch.eval.bench.runtimes import fastest
-from ufmstar_torch.eval.bench.step import build_up, components_in_view, measure_long_run
+from ufmstar_torch.eval.bench.step import build_up, components_in_view
 from ufmstar_torch.eval.bench.text import format_report
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
 from ufmstar_torch.eval.commands import bench_command
