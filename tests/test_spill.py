@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.spill import MEMORY
-from ufmstar_torch.spill_index import PAGE, Page, PageIndex, View
+from ufmstar_torch.spill_index import CELL, Page, PageIndex, View
 from ufmstar_torch.spill_store import Folder
 
 FRAMES, LIMIT = 36, 60
@@ -130,7 +130,7 @@ def test_files_are_named_by_their_content_and_the_journal_keeps_what_changed(tmp
     assert frames == sorted(set(frames))
     assert frames[-1] <= 30
     written = [page for change in changes for page in change["out"]]
-    assert {page["name"] for page in written} == {p.name for p in tmp_path.glob("*.npy")}
+    assert {page["name"] for page in written} == {p.name for p in tmp_path.glob("*.f64")}
     back = {number for change in changes for number in change["back"]}
     assert len(back) == ufm.spilled.read > 0
     out = [page["count"] for number, page in enumerate(written) if number not in back]
@@ -183,17 +183,16 @@ def test_the_index_returns_what_a_look_at_every_page_returns(seed, pages):
     rng = np.random.default_rng(seed)
     index, scale = PageIndex(), 10 ** rng.uniform(0, 3.5)
     for number in range(pages):
-        corner = PAGE * np.floor(rng.normal(0, scale, 3) / PAGE)
-        means = np.sort(corner + rng.uniform(0, PAGE, (2, 3)), 0)
+        corner = CELL * np.floor(rng.normal(0, scale, 3) / CELL)
+        means = np.sort(corner + rng.uniform(0, CELL, (2, 3)), 0)
         reach = means + np.array([[-1], [1]]) * rng.exponential(2.0, 3)
-        index.add(number, Page(f"{number}", 1, *(tuple(map(tuple, box.tolist())) for box in (means, reach))))
+        index.add(number, Page(f"{number}", 1, np.stack([means, reach])))
     for number in rng.permutation(pages)[: pages // 3]:
         index.remove(int(number))
     for _ in range(5):
         planes = [np.concatenate([rng.normal(size=(n, 3)), rng.normal(0, scale, (n, 1))], 1) for n in (3, 4)]
         view = View(*planes)
-        boxes = np.array([[index[n].means, index[n].reach] for n in index]).reshape(-1, 2, 2, 3)
-        every = view.reaches(boxes[:, 0], boxes[:, 1])
+        every = view.reaches(np.array([index[n].boxes for n in index]).reshape(-1, 2, 2, 3))
         assert index.reached(view) == [number for number, hit in zip(index, every, strict=True) if hit]
     for number in list(index):
         index.remove(number)
@@ -204,9 +203,9 @@ def test_a_frame_looks_at_few_of_many_pages(monkeypatch):
     """A street of 8 km: the boxes that a view is compared with do not depend on the length behind it."""
     looked = []
 
-    def counting(self, means, reach):
-        looked[-1] += len(means)
-        return reaches(self, means, reach)
+    def counting(self, boxes):
+        looked[-1] += len(boxes)
+        return reaches(self, boxes)
 
     reaches = View.reaches
     monkeypatch.setattr(View, "reaches", counting)
@@ -214,8 +213,8 @@ def test_a_frame_looks_at_few_of_many_pages(monkeypatch):
     for length in (500, 2000):  # pages of 4 m
         index = PageIndex()
         for number in range(length):
-            box = ((0.0, 0.0, -4.0 * number), (3.0, 3.0, -4.0 * number + 3.0))
-            index.add(number, Page("", 1, box, box))
+            box = np.array([[0.0, 0.0, -4.0 * number], [3.0, 3.0, -4.0 * number + 3.0]])
+            index.add(number, Page("", 1, np.stack([box, box])))
         looked.append(0)
         assert index.reached(View(ahead, ahead)) == [0]
     assert max(looked) < 40

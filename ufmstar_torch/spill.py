@@ -19,11 +19,10 @@ and pages. A folder belongs to one run.
 from __future__ import annotations
 
 import hashlib
-import io
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -32,12 +31,16 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.spill_index import PAGE, Box, Page, PageIndex, View
+from ufmstar_torch.spill_index import CELL, Page, PageIndex, View
 from ufmstar_torch.spill_store import Change, Folder, Memory
 from ufmstar_torch.state import UfMStarState
 
 MEMORY = "memory"
 _COLUMNS = ("mean", "covariance", "weight", "disagreement", "count", "features", "evidence")
+_CUBE = 4.0  # [m] edge of the cubes whose components go together
+_CUBES = round(CELL / _CUBE)
+_SPREAD = np.array([0, 1, 8, 9, 64, 65, 72, 73])  # the bits of 0 to 7, two places between them
+_PAGE = 64  # components from which on a page is full
 _KEPT = 0.75  # share of the limit that is left after writing out
 _NEGLIGIBLE = 1e-9  # density at a point, in units of the prior's weight
 
@@ -147,7 +150,7 @@ class _StreamPages:
 
     def __init__(self, place: str, name: str) -> None:
         self.index, self.back, self.read, self.frames = PageIndex(), list[int](), 0, -1
-        self._store = Memory() if place == MEMORY else Folder(Path(place, name))
+        self._store = Memory() if place == MEMORY else Folder(os.path.join(place, name))
         self._journal: tuple[Change, ...] | None = None  # to be written where that of the store is of another run
         self._next = 0
 
@@ -164,16 +167,16 @@ class _StreamPages:
 
     def joined(self, rows: NDArray, numbers: Sequence[int] | PageIndex) -> NDArray:
         """Rows, and behind them those of pages."""
-        contents = [np.load(io.BytesIO(self._store.read(self.index[number].name))) for number in numbers]
+        pages = [self.index[number] for number in numbers]
+        contents = [np.frombuffer(self._store.read(page.name)).reshape(page.count, -1) for page in pages]
         return np.concatenate([rows, *contents])
 
-    def write(self, rows: NDArray, means: NDArray, reach: NDArray) -> Page:
-        """A page of rows with their boxes, which is not listed yet."""
-        buffer = io.BytesIO()
-        np.save(buffer, rows)
-        name = f"{hashlib.sha256(buffer.getvalue()).hexdigest()[:24]}.npy"
-        self._store.write(name, buffer.getvalue())
-        return Page(name, len(rows), _around(means), _around(reach))
+    def write(self, rows: NDArray, boxes: NDArray) -> Page:
+        """A page of rows [n, C] with their boxes [n, 2, 2, 3], which is not listed yet."""
+        content = rows.tobytes()
+        name = f"{hashlib.sha256(content).hexdigest()[:24]}.f64"
+        self._store.write(name, content)
+        return Page(name, len(rows), np.stack([boxes[:, :, 0].min(0), boxes[:, :, 1].max(0)], 1))
 
     def changing(self) -> None:
         """From here on the pages are between two states: an error sends the next frame to the journal."""
@@ -202,26 +205,43 @@ class _StreamPages:
 
 def _parted(
     rows: NDArray, state: UfMStarState, frame: FrameInput, b: int, config: UfMStarConfig, limit: int
-) -> tuple[NDArray, list[tuple[NDArray, NDArray, NDArray]]]:
+) -> tuple[NDArray, list[tuple[NDArray, NDArray]]]:
     """The rows that stay, and those of every page that goes, with their boxes."""
-    means, reach = _boxes(rows, config)
-    free = np.flatnonzero(~_view(state, frame, b, config).reaches(means, reach))
+    boxes = _boxes(rows, config)
+    free = np.flatnonzero(~_view(state, frame, b, config).reaches(boxes))
+    cubes, member, count = _cubes(rows[free, :3])
     camera = torch.linalg.inv(state.T_world_first[b]) @ frame.T_world_cam[b].to(state.T_world_first)
-    cubes, member = np.unique(np.floor(rows[free, :3] / PAGE), axis=0, return_inverse=True)
-    distance = np.linalg.norm((cubes + 0.5) * PAGE - camera[:3, 3].cpu().numpy(), axis=1)
-    stays, out = np.ones(len(rows), np.bool_), []
-    for cube in np.argsort(-distance, kind="stable"):
-        if stays.sum() <= _KEPT * limit:
-            break
-        going = free[member.ravel() == cube]
-        stays[going] = False
-        out.append((rows[going], means[going], reach[going]))
-    return rows[stays], out
+    distance = np.linalg.norm((cubes + 0.5) * _CUBE - camera[:3, 3].cpu().numpy(), axis=1)
+    farthest = np.argsort(-distance, kind="stable")
+    left = len(rows) - np.cumsum(count[farthest]) + count[farthest]  # components when it is a cube's turn
+    page = _packed(cubes, count, farthest[left > _KEPT * limit])[member]
+    order = np.argsort(page, kind="stable")
+    parts = np.split(free[order], np.searchsorted(page[order], np.arange(page.max(initial=-1) + 1)))
+    stays = np.ones(len(rows), np.bool_)
+    stays[free[page >= 0]] = False
+    return rows[stays], [(rows[part], boxes[part]) for part in parts[1:]]
 
 
-def _around(boxes: NDArray) -> Box:
-    low, high = boxes[:, 0].min(0).tolist(), boxes[:, 1].max(0).tolist()
-    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+def _cubes(means: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Of points [n, 3] the cubes [q, 3] in which they lie, cell by cell and neighbours next to each other; the number
+    of each point's cube [n]; and how many points each cube has [q]."""
+    cube = np.floor(means / _CUBE).astype(np.int64)
+    cell, inner = (cube // _CUBES) % 2**18, _SPREAD[cube % _CUBES]  # cells repeat after 8,000 km
+    key = (cell @ [2**36, 2**18, 1]) * _CUBES**3 + inner @ [4, 2, 1]
+    _, first, member, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    return cube[first], member, count
+
+
+def _packed(cubes: NDArray, count: NDArray, going: NDArray) -> NDArray:
+    """[q] the page of every cube that goes, -1 for the others. Cubes of one cell share a page until it is full."""
+    page, going = np.full(len(cubes), -1), np.sort(going)
+    last, size, number = None, _PAGE, -1
+    for cube, cell in zip(going.tolist(), (cubes[going] // _CUBES).tolist(), strict=True):
+        if size >= _PAGE or cell != last:
+            last, size, number = cell, 0, number + 1
+        page[cube] = number
+        size += count[cube]
+    return page
 
 
 def _rows(state: UfMStarState, b: int) -> NDArray:
@@ -248,13 +268,13 @@ def _with_rows(state: UfMStarState, rows: Sequence[NDArray], capacity: int | Non
     return replace(state, **changed)
 
 
-def _boxes(rows: NDArray, config: UfMStarConfig) -> tuple[NDArray, NDArray]:
-    """[n, 2, 3] the means as boxes, and the boxes outside of which a component's density is negligible [m]."""
+def _boxes(rows: NDArray, config: UfMStarConfig) -> NDArray:
+    """[n, 2, 2, 3] the means as boxes, and the boxes outside of which a component's density is negligible [m]."""
     mean, covariance, weight = rows[:, :3], rows[:, 3:12].reshape(-1, 3, 3), rows[:, 12]
     log_peak = np.log(weight) - 1.5 * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(covariance)[1]
     square = np.maximum(2 * (log_peak - math.log(_NEGLIGIBLE * config.prior_weight)), 0.0)
     half = np.sqrt(square[:, None] * np.einsum("kii->ki", covariance)) * (1 + 1e-6)
-    return np.stack([mean, mean], 1), np.stack([mean - half, mean + half], 1)
+    return np.stack([mean, mean, mean - half, mean + half], 1).reshape(-1, 2, 2, 3)
 
 
 def _view(state: UfMStarState, frame: FrameInput, b: int, config: UfMStarConfig) -> View:

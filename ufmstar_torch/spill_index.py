@@ -1,9 +1,9 @@
 """Which pages a frame may reach, without a look at all of them: a tree of boxes around boxes.
 
-A page lies in one cube of a grid. Eight cubes along every axis share a node, eight nodes the next one, up to 2 km; the
-root is above them. A node has the union of its pages' boxes: where a frame does not reach it, it reaches none of them.
-So the pages returned are those of a look at every page, and the work depends on what is reached, and hardly on how many
-there are.
+Space is divided into cells of 32 m, and a page lies in one of them. Eight cells along every axis share a node, eight
+nodes the next one, up to 2 km; the root is above them. A node has the union of its pages' boxes: where a frame does not
+reach it, it reaches none of them. So the pages returned are those of a look at every page, and the work depends on what
+is reached, and hardly on how many there are.
 """
 
 from __future__ import annotations
@@ -14,28 +14,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-PAGE = 4.0  # [m] edge of the cubes whose components share a page
+CELL = 32.0  # [m]
 _BITS = 3  # eight children along each axis
 _LEVELS = 3
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Page:
     """Components that were written out together.
 
     Attributes:
         name: of the file.
         count: of its components.
-        means: box around their means, in one cube; lower and upper corner in the frame of the first camera [m].
-        reach: box outside of which none of them counts [m].
+        boxes: [2, 2, 3] float64, lower and upper corner in the frame of the first camera [m] of a box around their
+            means, in one cell, and of a box outside of which none of them counts.
     """
 
     name: str
     count: int
-    means: Box
-    reach: Box
+    boxes: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,23 +47,24 @@ class View:
     matching: NDArray[np.float64]
     density: NDArray[np.float64]
 
-    def reaches(self, means: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[n] False where boxes [n, 2, 3] (see :class:`Page`) lie outside for certain."""
-        return _meets(means, self.matching) | _meets(reach, self.density)
+    def reaches(self, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """[n] False where a page with boxes [n, 2, 2, 3] lies outside for certain."""
+        return _meets(boxes[:, 0], self.matching) | _meets(boxes[:, 1], self.density)
 
 
 class _Node:
-    """A box around boxes; it never shrinks, but goes with its last page.
+    """Boxes around those of pages; they never shrink, but go with the last page.
 
     Attributes:
-        boxes: [2, 2, 3] union of the pages' ``means`` and ``reach``.
-        children: nodes by cell, on the lowest level pages by number.
-        page: its number where it is one.
+        boxes: [2, 2, 3] as those of a page.
+        children: nodes by cell, on the lowest level numbers of pages.
     """
 
-    def __init__(self, boxes: NDArray[np.float64], page: int = -1) -> None:
-        self.boxes, self.page = boxes, page
-        self.children: dict[tuple[int, ...], _Node] = {}
+    __slots__ = ("boxes", "children")
+
+    def __init__(self, boxes: NDArray[np.float64]) -> None:
+        self.boxes = boxes
+        self.children: dict[tuple[int, ...] | int, _Node | Page] = {}
 
 
 class PageIndex:
@@ -93,43 +91,50 @@ class PageIndex:
 
     def add(self, number: int, page: Page) -> None:
         """One more page; its number is new."""
-        boxes, node = np.array([page.means, page.reach]), self._root
+        node = self._root
         for cell in _cells(page):
-            node = node.children.setdefault(cell, _Node(boxes))
-            node.boxes = np.stack([np.minimum(node.boxes, boxes)[:, 0], np.maximum(node.boxes, boxes)[:, 1]], 1)
-        node.children[(number,)] = _Node(boxes, number)
-        self._pages[number] = page
+            inner = node.children.setdefault(cell, _Node(page.boxes))
+            assert isinstance(inner, _Node)
+            inner.boxes, node = _union(inner.boxes, page.boxes), inner
+        node.children[number] = self._pages[number] = page
         self.components += page.count
 
     def remove(self, number: int) -> None:
         """The page goes, and the nodes that are empty without it."""
         page = self._pages.pop(number)
         self.components -= page.count
-        cells = _cells(page)
-        way = [self._root]
+        way, cells = [self._root], _cells(page)
         for cell in cells:
-            way.append(way[-1].children[cell])
-        for node, cell in zip(reversed(way), reversed([*cells, (number,)]), strict=True):
-            del node.children[cell]
+            inner = way[-1].children[cell]
+            assert isinstance(inner, _Node)
+            way.append(inner)
+        for node, key in zip(reversed(way), reversed([*cells, number]), strict=True):
+            del node.children[key]
             if node.children:
                 return
 
     def reached(self, view: View) -> list[int]:
         """The numbers of the pages that a view reaches, in the order in which they came."""
-        nodes = [self._root]
+        reached: list[tuple[tuple[int, ...] | int, _Node | Page]] = [((), self._root)]
         for _ in range(_LEVELS + 1):
-            inner = [child for node in nodes for child in node.children.values()]
+            inner = [child for _, node in reached if isinstance(node, _Node) for child in node.children.items()]
             if not inner:
                 return []
-            boxes = np.array([node.boxes for node in inner])
-            nodes = [inner[i] for i in np.flatnonzero(view.reaches(boxes[:, 0], boxes[:, 1]))]
-        return sorted(node.page for node in nodes)
+            hits = view.reaches(np.array([node.boxes for _, node in inner]))
+            reached = [inner[i] for i in np.flatnonzero(hits)]
+        return sorted(key for key, _ in reached if isinstance(key, int))
 
 
 def _cells(page: Page) -> list[tuple[int, ...]]:
     """The cells of a page, from the largest to the smallest."""
-    cube = [int(np.floor(x / PAGE)) for x in page.means[0]]
-    return [tuple(x >> _BITS * level for x in cube) for level in range(_LEVELS, 0, -1)]
+    cell = [int(x) for x in np.floor(page.boxes[0, 0] / CELL)]
+    return [tuple(x >> _BITS * level for x in cell) for level in reversed(range(_LEVELS))]
+
+
+def _union(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    out = np.minimum(a, b)
+    np.maximum(a[:, 1], b[:, 1], out=out[:, 1])
+    return out
 
 
 def _meets(boxes: NDArray[np.float64], planes: NDArray[np.float64]) -> NDArray[np.bool_]:
