@@ -49,7 +49,7 @@ class Preprocess(Checked):
             into an image of that height, it is resized larger, to the smallest size that holds the crop.
         crop: (height, width) [px] of the centre crop, None = everything.
         size: (height, width) [px] of the network's input, None = as it is by then.
-        aspect_multiple: [px] keep the aspect: of the two factors that ``size`` asks for, both sides take the
+        aspect_multiple: [px] keep the aspect: of the two factors that lead to ``size``, both sides take the
             one that changes the image less, and the result is rounded to this multiple (a vision
             transformer's patch). ``size`` is then approximate. None = exactly ``size``.
         value_range: what white becomes: 1 for networks trained on [0, 1], 255 for those on bytes.

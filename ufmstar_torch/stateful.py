@@ -29,7 +29,7 @@ class StatefulModule(nn.Module):
     """A module whose state is a fixed set of buffers.
 
     Buffers are float32 or float64 whatever ``.half()`` is asked for. A saved state brings its own shapes (streams,
-    components, image size) and says with which config it was made.
+    components, image size) and contains the config with which it was made.
 
     Attributes:
         STATE: the buffers' names.
@@ -79,7 +79,7 @@ class StatefulModule(nn.Module):
         return self
 
     def get_extra_state(self) -> Tensor:
-        """The config as bytes, so that a checkpoint (safetensors too) says what it was made with."""
+        """The config as bytes, so that a checkpoint (safetensors too) contains it."""
         return torch.tensor(list(json.dumps(self.config.to_dict()).encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:

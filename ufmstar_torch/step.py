@@ -1,7 +1,7 @@
 """One image through steps 2 to 5: a pure function from state and frame to state and output.
 
 The mixture is kept in the frame of each stream's first camera: poses are taken relative to it in
-float64, so large world coordinates never reach the float32 state, and components nobody touches never change.
+float64, so large world coordinates never reach the float32 state, and what a frame does not update never changes.
 
 :class:`Step` is what ``UfMStar`` calls; :func:`step` is the reference. Its kernels can be replaced one by one
 (:class:`Kernels`); another implementation of the whole step has the same signature.
@@ -9,16 +9,18 @@ float64, so large world coordinates never reach the float32 state, and component
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch import correspond, fuse, gaussian, regress, segment, unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression
+from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression, learn
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
@@ -26,7 +28,7 @@ from ufmstar_torch.disagree import with_overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.output import FrameStatistics, StepOutput
+from ufmstar_torch.output import FrameStatistics, StepOutput, given
 from ufmstar_torch.regress import Regression, moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
@@ -234,7 +236,7 @@ def step(
     mixture, dropped = fuse.append(mixture, current_first, new)
     evidence, used, mixture_cam, stream = before_regression(
         Evidence(state.evidence, state.overall_evidence), mixture.to(torch.float64).rigid(R_cam, t_cam),
-        frame, anchors, config, kernels.distribute,
+        frame, anchors, config, functools.partial(learn, distribute=kernels.distribute),
     )  # fmt: skip
     mixture_cam = unmeasured.before_regression(mixture_cam, config)
     stage("append")
@@ -278,7 +280,8 @@ def step(
         posterior=state.posterior,
     )
     stage("average")
-    return updated, StepOutput(disagreement, result.features, residual, measured, labels, current_cam, statistics)
+    out = StepOutput(disagreement, result.features, residual, measured, partial(given, labels), current_cam, statistics)
+    return updated, out
 
 
 def _unobserved(name: str) -> None:

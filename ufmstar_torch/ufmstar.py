@@ -17,13 +17,20 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import LateStep, select_check, select_merge, select_posterior, select_step
+from ufmstar_torch.kernels.select import (
+    LateStep,
+    select_anchor_check,
+    select_check,
+    select_merge,
+    select_posterior,
+    select_step,
+)
 from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
-from ufmstar_torch.posterior.update import Posterior, update
+from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
 from ufmstar_torch.spill import Spill, Spilled
@@ -150,7 +157,7 @@ class UfMStar(StatefulModule):
             features=out.features,
             measured=out.measured.reshape(shape),
             valid=frame.valid.reshape(shape),
-            labels=out.labels,
+            read_labels=out.read_labels,
             current_cam=out.current_cam,
             statistics=out.statistics,
         )
@@ -352,8 +359,8 @@ class UfMStar(StatefulModule):
             return None
         if not self.config.anchored:
             raise ValueError("anchors need UfMStarConfig(anchored=True)")
-        own = self._own(frame)
-        return check_anchors(anchors, frame, torch.stack(own).sum(0) if own else None)
+        kernel = select_anchor_check(self.config.backend, frame.depth.device.type)
+        return check_anchors(anchors, frame, self._own(frame), kernel)
 
     def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
@@ -437,8 +444,8 @@ class UfMStar(StatefulModule):
         claimed = claimed.clamp_min(self.config.variance_floor)
         if self.recalibration is not None:
             claimed = self.recalibration(claimed)
-        kernels = select_posterior(self.config.backend, frame.depth.device.type)
-        learnt, posterior = update(state.posterior, frame, anchors, claimed, kernels)
+        update = select_posterior(self.config.backend, frame.depth.device.type)
+        learnt, posterior = update(state.posterior, frame, anchors, claimed)
         posterior = replace(posterior, variance=posterior.variance.clamp_min(self.config.variance_floor))
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return replace(state, posterior=learnt), replace(out, statistics=statistics), posterior

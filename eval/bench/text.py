@@ -142,6 +142,7 @@ def _anchors(measured: Mapping[str, Any]) -> list[str]:
         **{f"  {name}": times for name, times in tracker["parts"].items()},
         "step without anchors": step["plain"],
         "step with anchors": step["anchored"],
+        "  and posterior": step["posterior"],
     }
     return [
         f"anchors, one thread: {followed['mean']:.0f} corners followed at {width} x {height} ({followed['min']:.0f} to "

@@ -2,7 +2,7 @@
 
 A camera walks through rendered rooms. Small depth networks that come with the package, trained on other rooms of
 the same kind, predict depth; the last room looks and measures like none of them, so there is an uncertainty to find.
-UfM and UfM* judge the same predictions, and the table says how well.
+UfM and UfM* judge the same predictions; the table shows how well.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from ufmstar_torch.kernels.compile_cpu import kernel, part
 # worst geometry, which the tests of parallax refuse anyway.
 STEPS = 3
 # Added to the normal matrix's diagonal, relative to its trace, so that rays without parallax stay solvable; their huge
-# variance then tells.
+# variance then shows.
 DAMPING = 1e-12
 
 
