@@ -89,6 +89,7 @@ def measure_growth(
     *,
     size: int,
     frames: int,
+    window: int = 100,
     progress: Callable[[str], object] = lambda text: None,
 ) -> list[dict[str, Any]]:
     """Long runs in every world, with every limit of merging and every one of the components in memory.
@@ -97,7 +98,7 @@ def measure_growth(
         worlds: frames and config by name.
         merge: values of ``UfMStarConfig.merge``.
         limits: values of ``max_components``, the others in a temporary folder; 0 = all in memory.
-        size, frames: see :func:`measure_long_run`.
+        size, frames, window: see :func:`measure_long_run`; the early window is around frame ``window``.
         progress: is called with a description of what is measured next.
 
     Returns:
@@ -108,6 +109,7 @@ def measure_growth(
         progress(f"long run, {world}, {frames} frames, merge {limit:g}, at most {most or 'all'} components in memory")
         with TemporaryDirectory() as folder:
             spill = {"max_components": most, "spill": folder} if most else {}
-            run = measure_long_run(source, config.replace(merge=limit, **spill), size=size, frames=frames)
+            settings = config.replace(merge=limit, **spill)
+            run = measure_long_run(source, settings, size=size, frames=frames, early=window, window=window)
         runs.append({"world": world, "merge": limit, "max_components": most or None, **run})
     return runs
