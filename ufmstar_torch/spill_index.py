@@ -108,7 +108,8 @@ class PageIndex:
             inner = way[-1].children[cell]
             assert isinstance(inner, _Node)
             way.append(inner)
-        for node, key in zip(reversed(way), reversed([*cells, number]), strict=True):
+        keys: list[tuple[int, ...] | int] = [*cells, number]
+        for node, key in zip(reversed(way), reversed(keys), strict=True):
             del node.children[key]
             if node.children:
                 return
@@ -143,5 +144,4 @@ def _meets(boxes: NDArray[np.float64], planes: NDArray[np.float64]) -> NDArray[n
     centre, half = (boxes[:, 1] + boxes[:, 0]) / 2, (boxes[:, 1] - boxes[:, 0]) / 2
     farthest = centre @ normal.T + half @ abs(normal).T
     slack = 1e-9 * ((abs(centre) + half) @ abs(normal).T)  # rounding, many times over
-    inside: NDArray[np.bool_] = (farthest + offset >= -slack).all(1)
-    return inside
+    return np.asarray((farthest + offset >= -slack).all(1))
