@@ -21,7 +21,7 @@ from ufmstar_torch.correspond import Correspondence, correspond
 from ufmstar_torch.fuse import fuse
 from ufmstar_torch.kernels import check_cpu, correspond_cpu, fuse_cpu, posterior_cpu, regress_cpu, select, step_cpu
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
+from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.step import REFERENCE, step
 
 pytestmark = pytest.mark.numerics
@@ -161,8 +161,8 @@ def test_seam():
     compiled = select.select_step("numba", "cpu")
     assert select.select_step("auto", "cpu") is compiled is step_cpu.step
     assert select.select_check("auto", "cpu") is check_cpu.check_values
-    assert select.select_posterior("auto", "cpu").solve is posterior_cpu.solve
-    assert select.select_posterior("torch", "cpu") == select.select_posterior("auto", "cuda") == POSTERIOR_REFERENCE
+    assert select.select_posterior("auto", "cpu") is posterior_cpu.update
+    assert select.select_posterior("torch", "cpu") is select.select_posterior("auto", "cuda") is update_posterior
     for device in ("cpu", "cuda"):
         assert select.select_kernels("torch", device) is select.select_step("torch", device).keywords["kernels"]
         assert select.select_kernels("torch", device) is REFERENCE
