@@ -158,10 +158,10 @@ def test_suites_and_words(tmp_path):
         "UfM*-Anchored-DepthOnly, disagreement overlap",
         "UfM*-Anchored-DepthOnly, depth corrected on",
         "UfM*-Posterior-DepthOnly",
-        f"{NAME}, anchored by dense",
-        f"{NAME}, anchored by dense, posterior on",
+        f"{NAME}, anchored by dense evidence",
+        f"{NAME}, anchored by dense evidence, posterior",
         f"{NAME}, anchored by ground truth",
-        f"{NAME}, anchored by ground truth, posterior on",
+        f"{NAME}, anchored by ground truth, posterior",
     ]
     every = suite_named("all-anchored")
     assert set(every.bases) == set(BASES)
