@@ -449,6 +449,8 @@ class UfMStar(StatefulModule):
         """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
         if self._warned or frame.depth.device.type != "cpu":
             return
+        if all(out.statistics.segments.tolist()):
+            return
         given = out.statistics.valid_pixels + frame.beyond + frame.out_of_range
         empty = (given > 0) & (out.statistics.segments == 0)
         if not bool(empty.any()):
@@ -469,7 +471,7 @@ class UfMStar(StatefulModule):
         return [value for value, counts in both if value is not None and counts]
 
     def _stored(self) -> UfMStarState:
-        return UfMStarState(**{name: getattr(self, name) for name in self.STATE})
+        return UfMStarState(**{name: self._buffers[name] for name in self.STATE})
 
     def _step(self, device_type: str) -> Step:
         """The step for a device, the same one as long as the state goes on."""
