@@ -163,6 +163,11 @@ def test_suites_and_words(tmp_path):
         f"{NAME}, anchored by ground truth",
         f"{NAME}, anchored by ground truth, posterior",
     ]
+    posterior = suite_named("posterior")
+    assert posterior.bases == ("depth_only", "ensemble")
+    assert {r.setting.anchors for r in posterior.rows if r.setting.posterior} == {"tracked", "dense", "truth"}
+    varied = [name for name in posterior.sweep if any(name in r.setting.to_dict() for r in posterior.rows)]
+    assert varied == list(posterior.sweep)
     every = suite_named("all-anchored")
     assert set(every.bases) == set(BASES)
     assert [r.label for r in every.rows if r.method.base == "evidential"] == [

@@ -58,6 +58,7 @@ from ufmstar_torch.ufmstar import UfMStar
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
 STYLE = "mixed"
 SHEET_ROWS = 6
+_POSTERIOR = UfMStarConfig(anchored=True, posterior=True)
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
 DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
@@ -156,13 +157,12 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
 def demo_rows(source: DepthSource, device: torch.device) -> list[RowRunner]:
     """The rows of the table, at the start. The first four judge one prediction, of the member in turn; the last one
     is all members on every image, which is what alternation saves. A single network is no ensemble."""
-    posterior, config = Setting(anchors=DENSE, posterior=True), UfMStarConfig(anchored=True, posterior=True)
-    dense = AnchorSource(posterior, Tracks(landmarks_of(DENSE, None)))
+    dense = AnchorSource(Setting(anchors=DENSE, posterior=True), Tracks(landmarks_of(DENSE, None)))
     rows = [
         RowRunner(NETWORK, source, Alone(), device=device),
         RowRunner(UFM, source, Pointwise(UfMConfig(), device), device=device),
         RowRunner(UFM_STAR, source, Gaussians(UfMStarConfig(), device), device=device),
-        RowRunner(POSTERIOR, source, Gaussians(config, device, posterior=True), anchors=dense, device=device),
+        RowRunner(POSTERIOR, source, Gaussians(_POSTERIOR, device, posterior=True), anchors=dense, device=device),
     ]
     several = [RowRunner(ENSEMBLE, source, Alone(), every=True, device=device)]
     return rows + (several if source.passes > 1 else [])
@@ -258,7 +258,7 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
 
     progress(Progress("rooms", 0, len(sequence), None, 0))
     with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(UfMStar(device=device).warm_up, (64, 64), progress=compiling)
+        compiled = beside.submit(UfMStar(_POSTERIOR, device=device).warm_up, (64, 64), progress=compiling)
         for index in range(len(sequence)):
             frames.append(sequence[index])
             progress(Progress("rooms", index + 1, len(sequence), None, 0))

@@ -321,11 +321,12 @@ class MapColumn:
 
 
 def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
-    """Scales over all panels: depth between its 1st and 99th percentile; sigma and error share one, from 0.
+    """Scales over all panels: depths between their 1st and 99th percentile; sigma and error share one, from 0.
 
     That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
     """
-    depth = robust_range([(p.depth, p.valid) for p in panels], from_zero=False)
+    corrected = [(p.posterior, p.valid) for p in panels if p.posterior is not None]
+    depth = robust_range([*((p.depth, p.valid) for p in panels), *corrected], from_zero=False)
     maps = ([(getattr(p, name), p.valid) for p in panels] for name in _LENGTHS)
     ranges = [robust_range(known, from_zero=True) for of in maps if (known := [m for m in of if m[0] is not None])]
     return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(0.0, max(high for _, high in ranges), ERROR_MAP))
