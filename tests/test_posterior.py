@@ -44,7 +44,7 @@ def checked(depth, pixel, g, variance):
     frame = check_frame(torch.from_numpy(depth)[None], torch.eye(4)[None], K[None], None, None, None, None,
                         feature_count=0, rotation_tolerance=0.01)  # fmt: skip
     given = Anchors(*(torch.from_numpy(x)[None] for x in (pixel, g, variance)))
-    return frame, check_anchors(given, frame, None)
+    return frame, check_anchors(given, frame)
 
 
 @pytest.mark.parametrize("tier", [update, posterior_cpu.update], ids=["torch", "numba"])

@@ -9,6 +9,7 @@ float64, so large world coordinates never reach the float32 state, and what a fr
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch import correspond, fuse, gaussian, regress, segment, unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression
+from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression, learn
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
@@ -235,7 +236,7 @@ def step(
     mixture, dropped = fuse.append(mixture, current_first, new)
     evidence, used, mixture_cam, stream = before_regression(
         Evidence(state.evidence, state.overall_evidence), mixture.to(torch.float64).rigid(R_cam, t_cam),
-        frame, anchors, config, kernels.distribute,
+        frame, anchors, config, functools.partial(learn, distribute=kernels.distribute),
     )  # fmt: skip
     mixture_cam = unmeasured.before_regression(mixture_cam, config)
     stage("append")

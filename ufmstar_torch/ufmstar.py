@@ -17,7 +17,14 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import LateStep, select_check, select_merge, select_posterior, select_step
+from ufmstar_torch.kernels.select import (
+    LateStep,
+    select_anchor_check,
+    select_check,
+    select_merge,
+    select_posterior,
+    select_step,
+)
 from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
@@ -347,8 +354,8 @@ class UfMStar(StatefulModule):
             return None
         if not self.config.anchored:
             raise ValueError("anchors need UfMStarConfig(anchored=True)")
-        own = self._own(frame)
-        return check_anchors(anchors, frame, torch.stack(own).sum(0) if own else None)
+        kernel = select_anchor_check(self.config.backend, frame.depth.device.type)
+        return check_anchors(anchors, frame, self._own(frame), kernel)
 
     def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional

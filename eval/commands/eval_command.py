@@ -114,6 +114,11 @@ class EvalOptions:
     Attributes:
         device: cpu or cuda; of several processes, each takes the next GPU in turn
         threads: number of CPU threads of each process; default: all cores, divided among --processes
+        streams: number of sequences that a process evaluates at the same time: each network and UfM* get their frames
+            as one batch. UfM* gives the same bits; a network may differ in its last bits from one image at a time
+            (torch and ONNX Runtime choose algorithms by the batch), and must not mix the images of a batch.
+            MC-Dropout, UfM and tracked anchors go sequence by sequence; times in records are a batch's, divided by its
+            frames
         processes: number of processes on this computer
         shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n
         slurm: KEY=VALUE for submitit, as partition=gpu; jobs=N is the number of jobs; repeatable
@@ -127,6 +132,7 @@ class EvalOptions:
 
     device: str = "cpu"
     threads: int | None = None
+    streams: int = 1
     processes: int = 1
     shard: str | None = None
     slurm: tuple[str, ...] = option((), repeat=True)
@@ -145,7 +151,8 @@ class EvalOptions:
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        for name, least in (("processes", 1), ("examples", 0), ("threads", 1), ("seed", 0), ("samples", 2)):
+        least_of = {"processes": 1, "streams": 1, "examples": 0, "threads": 1, "seed": 0, "samples": 2}
+        for name, least in least_of.items():
             if values[name] is not None and values[name] < least:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
         if not 0 < self.output.confident <= 1:
@@ -219,6 +226,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         samples=what.samples,
         runtime=what.runtime,
         precision=what.precision,
+        streams=options.streams,
     )
 
 

@@ -19,6 +19,7 @@ class Bars:
     def __init__(self) -> None:
         self._bar: Any = None
         self._stage = ""
+        self._sequences: dict[str, Any] = {}
 
     def show(self, progress: Progress) -> None:
         """Bring the bar of the stage up to date."""
@@ -42,14 +43,13 @@ class Bars:
         """Bring the bar of a sequence's frames up to date; it goes when they are done."""
         from tqdm import tqdm
 
-        if label != self._stage:
-            self._close()
-            self._bar = tqdm(total=total, desc=label, unit="frame", dynamic_ncols=True, leave=False, disable=None)
-            self._stage = label
-        self._bar.update(done - self._bar.n)
+        if label not in self._sequences:
+            new = tqdm(total=total, desc=label, unit="frame", dynamic_ncols=True, leave=False, disable=None)
+            self._sequences[label] = new
+        bar = self._sequences[label]
+        bar.update(done - bar.n)
         if done == total:
-            self._close()
-            self._stage = ""
+            self._sequences.pop(label).close()
 
     def say(self, text: str) -> None:
         """Print a line without breaking the bar."""
@@ -64,6 +64,8 @@ class Bars:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._close()
+        for bar in self._sequences.values():
+            bar.close()
 
     def _close(self) -> None:
         if self._bar is not None:

@@ -180,7 +180,7 @@ def _of_stream(
 def _scene(
     grid: _Grid, depth: NDArray[Any], valid: NDArray[np.bool_], anchors: _Anchors, running: _Running
 ) -> _Scene:  # fmt: skip
-    (u, v), log_depth = ((anchors.pixel + 0.5) / depth.shape[::-1]).T, np.log(anchors.predicted)
+    (u, v), log_depth = ((anchors.pixel + 0.5) / depth.shape[::-1]).T.copy(), np.log(anchors.predicted)
     column, row = ((x * n).astype(np.int64).clip(0, n - 1) for x, n in ((u, grid.cols), (v, grid.rows)))
     x = features(log_depth - grid.mean, u, v, MODEL.hats)
     observed = Observed(row * grid.cols + column, x, np.log(anchors.depth) - log_depth)

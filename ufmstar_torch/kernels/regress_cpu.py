@@ -16,12 +16,11 @@ from torch import Tensor
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
-from ufmstar_torch.kernels.regress_points_cpu import at_points, distribute_points, unprojected
+from ufmstar_torch.kernels.regress_points_cpu import at_points, unprojected
 from ufmstar_torch.kernels.regress_tiles_cpu import exact
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression
-from ufmstar_torch.regress import distribute as distribute_reference
 
 # Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
@@ -65,17 +64,6 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
     streams = zip(x, *_fields(mixture), out, features, strict=True)
     each(kernel, [(*given[:6], *settings, *given[6:]) for given in streams])
     return _regression(out, features)
-
-
-def distribute(mixture: GaussianMixture, points: Tensor, values: Tensor, config: UfMStarConfig) -> Tensor:
-    """As :func:`ufmstar_torch.regress.distribute`, for CPU tensors; shares are right to 1e-14."""
-    if config.regression != "exact":
-        return distribute_reference(mixture, points, values, config)
-    out = torch.zeros(*mixture.weight.shape, values.shape[2], dtype=torch.float64)
-    fields = _doubles(points, values, mixture.mean, mixture.covariance, mixture.weight)
-    settings = (config.prior_weight, EPSILON[torch.float64])
-    each(distribute_points, [(*given, *settings, o) for *given, o in zip(*fields, out.numpy(), strict=True)])
-    return out
 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:

@@ -23,10 +23,10 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
-from ufmstar_torch.kernels.anchors_cpu import inliers
+from ufmstar_torch.kernels.anchors_cpu import learn
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
-from ufmstar_torch.kernels.regress_cpu import distribute, regress_image
+from ufmstar_torch.kernels.regress_cpu import regress_image
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.rigid_cpu import move, relative
 from ufmstar_torch.kernels.segment_cpu import segment
@@ -122,8 +122,7 @@ def step(
     mixture = updated.mixture()
     moved = mixture.replace(mean=torch.from_numpy(in_camera[0]), covariance=torch.from_numpy(in_camera[1]))
     evidence, used, mixture_cam, stream = before_regression(
-        Evidence(state.evidence, state.overall_evidence), moved.to(torch.float64), frame, anchors, config, distribute,
-        inliers,
+        Evidence(state.evidence, state.overall_evidence), moved.to(torch.float64), frame, anchors, config, learn
     )  # fmt: skip
     mixture_cam = unmeasured.before_regression(mixture_cam, config)
     stage("append")
