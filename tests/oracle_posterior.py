@@ -175,8 +175,10 @@ def update(state, depth, claimed, pixel, g, variance):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    half = 0.5 * np.nan_to_num(claimed)
-    new |= discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([half[r, c] for c, r in at]) / d**2)
+    quarter = 0.25 * np.nan_to_num(claimed)
+    new |= discs(
+        state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([quarter[r, c] for c, r in at]) / d**2
+    )
     q = GLOBALS + HATS * HATS
     after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
     for name, (value, prior, low, high) in START.items():
@@ -186,9 +188,13 @@ def update(state, depth, claimed, pixel, g, variance):
         after["sums"][name] = [min(max(above, low * below), high * below), below]
     HX = design(X, np.arange(n), n)
     spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness
-    spread = 1.7 * local(logs.shape, node, residual**2 / total, noise) * spread + 0.0009 + away * (0.09 + ratio(state, "unseen"))
+    spread = (
+        1.7 * local(logs.shape, node, residual**2 / total, noise) * spread
+        + 0.0009
+        + away * (0.06 + ratio(state, "unseen"))
+    )
     offset = HX[:, 4:] @ mean[4:]
-    return after, *read(depth, half, logs, mean[:q], offset, spread, np.minimum(away / 0.6, 1))
+    return after, *read(depth, quarter, logs, mean[:q], offset, spread, np.minimum(away / 0.6, 1))
 
 
 def local(shape, node, z2, noise):
@@ -221,7 +227,7 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     square = np.minimum(error, 9 * total) / 0.995
     believed = np.where(held, 1 / (1 + noise / 0.04), 0.0)
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
-    final = 1.7 * var + noise + 0.0009 + away * (0.09 + ratio(state, "unseen")) + np.minimum(away / 0.6, 1) * claimed
+    final = 1.7 * var + noise + 0.0009 + away * (0.06 + ratio(state, "unseen")) + np.minimum(away / 0.6, 1) * claimed
     return {
         "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
         "unseen": ((area * (np.minimum(error, 4) - total)).sum(), (area * away).sum()),

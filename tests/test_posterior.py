@@ -57,7 +57,7 @@ def test_values_against_the_oracle_over_frames(tier):
         np.testing.assert_allclose(out.depth[0], expected, rtol=1e-8)
         np.testing.assert_allclose(out.variance[0], variance, rtol=1e-7)
         assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
-        assert float(out.unseen) == pytest.approx(0.09 + oracle.ratio(state, "unseen"), rel=1e-7)
+        assert float(out.unseen) == pytest.approx(0.06 + oracle.ratio(state, "unseen"), rel=1e-7)
 
 
 def test_the_model_fits_the_compiled_window():
@@ -174,7 +174,7 @@ def test_far_from_evidence_the_variance_is_larger_and_contains_what_ufm_star_cla
         for v in (0.0, 0.5)
     )
     assert float(small[:, 44:].mean() / small[8:, :10].mean()) > 4
-    assert float((large - small)[:, 44:].mean()) > 0.2
+    assert float((large - small)[:, 44:].mean()) > 0.1
     assert float((large - small)[8:, :8].mean()) < 0.1
 
 
@@ -201,7 +201,7 @@ def test_before_the_first_anchor_it_is_plain_ufm_star_to_the_bit():
 
 def test_before_the_first_anchor_of_a_source_nothing_reads_as_certain():
     """Given anchors of which none is valid: the depth is the network's, but its variance is the error's before any."""
-    depth, _, claimed, *anchors = scene(0)
+    depth, _, _, *anchors = scene(0)
     frame, given = checked(depth, *anchors)
     given = dataclasses.replace(given, valid=torch.zeros_like(given.valid))
     packed, out = update(torch.zeros(1, SIZE), frame, given, torch.zeros(1, 36, 48))

@@ -57,8 +57,8 @@ class Model(NamedTuple):
     inflation: float = 1.7
     common: float = 0.03**2
     limit: float = 2.0
-    growth: float = 0.09
-    claimed: float = 0.5
+    growth: float = 0.06
+    claimed: float = 0.25
     far: float = 0.6
     square: float = 4.0
     near: int = 2

@@ -3,7 +3,8 @@
 Everything here is learnt from anchors alone, in frames that have some: how far the network's error varies (amplitude),
 how much anchors and network differ from one pixel to the next (roughness), by what factor the anchors' variances are
 stated too small (noise), how fast the error grows with the distance from evidence (unseen), and how well held-out
-anchors were predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do not decide.
+anchors were predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do
+not decide.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from torch import Tensor
 
 from ufmstar_torch.posterior.model import GLOBALS, MODEL
 
-# (prior value, its weight in anchors, least, largest): amplitude 1, roughness (.05)^2, noise 1 and unseen (.22)^2
-# over a width of the image, as variances of y relative to, or added to, those of the model; calibration as mean z^2, of which nothing is known before.
+# (prior value, its weight in anchors, least, largest). Amplitude and noise are factors of the model's variances;
+# roughness and unseen are variances of y, at a pixel and over a width of the image. Calibration is a mean z^2, of
+# which nothing is known before.
 RATIOS = {
     "amplitude": (1.0, 20.0, 0.1, 100.0),
     "roughness": (0.05**2, 60.0, 0.01**2, 0.2**2),

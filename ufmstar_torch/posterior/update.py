@@ -18,7 +18,7 @@ outliers out.
 
 Variance of y at a node:
 
-    local 1.7 (the field's + roughness) + .03^2 + distance (.09 + unseen) + min(1, distance/.6) V/(2 d^2).
+    local 1.7 (the field's + roughness) + .03^2 + distance (.06 + unseen) + min(1, distance/.6) V/(4 d^2).
 
 ``local`` is the mean z^2 of the leave-one-out residuals of the anchors in the cells around: the error is rougher on one
 surface than on another. The distance from evidence is geodesic, in widths of the image, and depth edges lengthen it: on
