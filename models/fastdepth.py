@@ -249,7 +249,7 @@ class FastDepth(Backbone):
         """The network with the weights of an ONNX export, in eval mode.
 
         The widths are read from the file, every weight in it must be used and every parameter filled, and on one
-        random image the network must agree with ONNX Runtime; without that package, a warning says that this was not
+        random image the network must agree with ONNX Runtime; without that package, a warning states that this was not
         tested. Batch norms stay batch norms (with their counters), so fine-tuning goes on as if from a checkpoint after
         ``.train()``; a file that has them folded gives a network without norm layers (``norm=False``).
 

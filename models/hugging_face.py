@@ -244,14 +244,14 @@ def own_preprocess(
     """The preprocessing that a checkpoint's image processor describes.
 
     Raises:
-        ValueError: the description lacks what is needed, or asks for what ``Preprocess`` cannot do.
+        ValueError: the description lacks what is needed, or contains what ``Preprocess`` cannot do.
     """
     processor, name = checkpoint.processor, checkpoint.name
     unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if processor.get(option)]
     resample = processor.get("resample", _CUBIC)
     if unknown or resample not in (_LINEAR, _CUBIC):
         raise ValueError(
-            f"{name}: its image processor asks for {unknown or f'resample {resample}'}, which is not supported: give a "
+            f"{name}: its image processor needs {unknown or f'resample {resample}'}, which is not supported: give a "
             "Preprocess of your own"
         )
     own = processor.get("size")

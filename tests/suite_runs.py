@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 from layouts import write_generic
 
-from ufmstar_torch.eval.engine.evaluate import RowResult
+from ufmstar_torch.eval.engine.evaluate import BROKEN, RowResult, evaluate_sequences
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.suite import suite_named
@@ -77,12 +77,26 @@ def _drawn(sequence, row):
     return RowResult(row, counts, metrics.compute(), metrics.curves(), {}, {}, {"metrics": metrics.state_dict()})
 
 
+def one_by_one(judge):
+    """``evaluate_sequences`` by a judge of one sequence, as :class:`Stub` is."""
+
+    def evaluate(tasks, how, done, *, stop):
+        for task in tasks:
+            try:
+                outcome = judge(task.sequence, task.rows, how.networks, stop=stop, progress=task.progress)
+            except BROKEN as error:
+                outcome = error
+            done(task, outcome)
+
+    return judge if judge is evaluate_sequences else evaluate
+
+
 def go(job, evaluate=None, *, resume=False, overwrite=False, **context):
     """Open the folder and go through the sequences: (came to the end, lines that were reported)."""
     lines: list[str] = []
     networks = job.load(torch.device("cpu"))
     folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
-    context = WorkerContext(report=lines.append, evaluate=evaluate or Stub(), **context)
+    context = WorkerContext(report=lines.append, evaluate=one_by_one(evaluate or Stub()), **context)
     return run_job(job, folder, networks, context), lines
 
 

@@ -59,7 +59,7 @@ def test_every_figure_is_there_and_possible(report):
     result = json.loads(json.dumps(report["anchors"]))
     tracker, step = result["tracker"], result["step"]
     assert (result["points"], result["frames"], result["threads"]) == (60, 6, 1)
-    for times in (tracker["update"], step["plain"], step["anchored"]):
+    for times in (tracker["update"], step["plain"], step["anchored"], step["posterior"]):
         assert set(times) == TIMES | {"count"}
         assert times["count"] == 6
         assert 0 < times["min_ms"] <= times["median_ms"] <= times["p90_ms"]

@@ -253,7 +253,7 @@ def test_a_network_that_predicts_all_in_one_is_not_separable(sequence):
     message = measure(rows_of(*names), networks, sequence, plan=QUICK, meter=NO_SENSOR)
     aleatoric, alone, depth_only = message["rows"]
     assert "WrappedNetwork" in aleatoric["latency"]["network_uncertainty"]["not_separable"]
-    assert alone["latency"]["network_uncertainty"] == {"none": "the method asks nothing of the network but depth"}
+    assert alone["latency"]["network_uncertainty"] == {"none": "the method needs only depth of the network"}
     assert depth_only["latency"]["multiview"]["median_ms"] > 0
     lines = {line.label: [cell.value for cell in line.cells] for line in efficiency_tables(message)[0].lines}
     assert lines["UfM*-Aleatoric"][3:6] == ["not separable"] * 3

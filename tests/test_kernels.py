@@ -21,7 +21,7 @@ from ufmstar_torch.correspond import Correspondence, correspond
 from ufmstar_torch.fuse import fuse
 from ufmstar_torch.kernels import check_cpu, correspond_cpu, fuse_cpu, posterior_cpu, regress_cpu, select, step_cpu
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
+from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.step import REFERENCE, step
 
 pytestmark = pytest.mark.numerics
@@ -95,8 +95,12 @@ def test_fuse(weighted, seed):
 
 
 def floored(cov, floor):
-    out = cov.clone()
-    fuse_cpu.floor_covariance(out.view(-1, 3, 3).numpy(), floor.expand(cov.shape[:-2]).contiguous().view(-1).numpy())
+    out, mean = torch.zeros_like(cov), torch.zeros(*cov.shape[:-2], 3, dtype=cov.dtype)
+    mean[..., 2] = floor.sqrt()  # a camera whose pixel is 1 wide at depth 1
+    given = (
+        value.reshape(-1, *value.shape[cov.dim() - 2 :]).numpy() for value in (mean, cov, torch.ones_like(mean[..., 0]))
+    )
+    fuse_cpu.floored(*given, 0.0, 1.0, 1.0, 0.0, out.view(-1, 3, 3).numpy())
     return out
 
 
@@ -157,8 +161,8 @@ def test_seam():
     compiled = select.select_step("numba", "cpu")
     assert select.select_step("auto", "cpu") is compiled is step_cpu.step
     assert select.select_check("auto", "cpu") is check_cpu.check_values
-    assert select.select_posterior("auto", "cpu").solve is posterior_cpu.solve
-    assert select.select_posterior("torch", "cpu") == select.select_posterior("auto", "cuda") == POSTERIOR_REFERENCE
+    assert select.select_posterior("auto", "cpu") is posterior_cpu.update
+    assert select.select_posterior("torch", "cpu") is select.select_posterior("auto", "cuda") is update_posterior
     for device in ("cpu", "cuda"):
         assert select.select_kernels("torch", device) is select.select_step("torch", device).keywords["kernels"]
         assert select.select_kernels("torch", device) is REFERENCE

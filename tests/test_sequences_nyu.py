@@ -7,11 +7,12 @@ import pytest
 import torch
 from layouts import truncate
 from layouts_more import write_h5, write_nyu
+from tiny_suite import evaluate
 
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.commands.run_job import job_from
-from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import SequenceError
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences import FrameError, find_sequences, open_sequence
@@ -127,12 +128,7 @@ def test_a_run_that_compares_views_refuses_it(written, tmp_path):
 def test_an_evaluation_refuses_rows_that_compare_views(written):
     rows = [Row(Method.parse(name)) for name in ("Aleatoric", "UfM*-Aleatoric")]
     with pytest.raises(SequenceError, match=r"single images without poses, on which UfM\*-Aleatoric cannot compare"):
-        evaluate_sequence(
-            open_sequence(written[0]),
-            rows,
-            {"aleatoric": None},
-            device=torch.device("cpu"),
-        )
+        evaluate(open_sequence(written[0]), rows, {"aleatoric": None})
 
 
 def test_the_check_says_so(written):

@@ -6,7 +6,7 @@ import json
 import signal
 
 import pytest
-from suite_runs import TRUTH, Stub, write_rooms
+from suite_runs import TRUTH, Stub, one_by_one, write_rooms
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.bench import measure as measurement
@@ -43,7 +43,7 @@ def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""
     stub = Stub()
     own = launch.evaluate_suite
-    monkeypatch.setattr(launch, "evaluate_suite", lambda *given, **how: own(*given, evaluate=stub, **how))
+    monkeypatch.setattr(launch, "evaluate_suite", lambda *given, **how: own(*given, evaluate=one_by_one(stub), **how))
     return stub
 
 

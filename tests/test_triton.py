@@ -359,7 +359,7 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
             plain.reset()
         launched.clear()
         out = captured(*frame)
-        assert len(launched) == len(set(launched)) == 2 + 11, launched  # the check, the step
+        assert len(launched) == len(set(launched)) == 2 + 10, launched  # the check, the step
         expected = plain(*frame)
         close(out.variance, expected.variance, 0, 0)
         assert ufm.mean is memory
@@ -368,6 +368,18 @@ def test_capture_keeps_the_state_in_place(monkeypatch):
         captured(given[0][0][:, :5], *given[0][1:])
     with pytest.raises(ValueError, match=r"a capture needs on_bad_frame='skip'.*a mixture that grows"):
         Captured(UfMStar(UfMStarConfig(backend="triton")), *given[0])
+
+
+def test_what_the_limit_leaves_without_a_slot_counts_as_dropped():
+    """The CPU counts it in its own frame; here it may have waited for the next one."""
+    dropped = {}
+    for backend, device in (("numba", "cpu"), ("triton", DEVICE)):
+        ufm = UfMStar(UfMStarConfig(segment=SPGF, backend=backend, initial_capacity=2, max_components=3))
+        outputs = [ufm(*(v.to(device) for v in frame[:3])) for frame in walks(1, 2)]
+        dropped[backend] = [int(out.statistics.dropped) for out in outputs]
+        assert int(ufm.mixture.components) == 3
+    assert dropped["triton"][0] == 0 < dropped["numba"][0], "the first frame was to wait"
+    assert sum(dropped["triton"]) == sum(dropped["numba"])
 
 
 def test_what_waits_for_a_slot_is_in_whatever_is_saved_or_copied(monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import Judge, SequenceTask, evaluate_sequences
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
@@ -64,10 +64,21 @@ def row(name, **setting):
 
 
 def evaluate(sequence, rows, networks, store=None, **options):
-    """``evaluate_sequence`` on the CPU; the results by the row's slug."""
-    results = evaluate_sequence(sequence, rows, networks, store=store, device=CPU, **options)
+    """The results of a sequence on the CPU, by the row's slug; an error of it is raised."""
+    (results,) = evaluate_all([sequence], rows, networks, store, **options)
     assert [result.row for result in results] == list(rows)
     return {result.row.slug: result for result in results}
+
+
+def evaluate_all(sequences, rows, networks, store=None, *, stop=lambda: False, **options):
+    """The results of each sequence on the CPU; the first error is raised."""
+    of_task = {name: options.pop(name) for name in ("sinks", "progress") if name in options}
+    tasks, outcomes = [SequenceTask(sequence, rows, **of_task) for sequence in sequences], {}
+    evaluate_sequences(iter(tasks), Judge(networks, CPU, store, **options), outcomes.__setitem__, stop=stop)
+    for outcome in outcomes.values():
+        if isinstance(outcome, Exception):
+            raise outcome
+    return [outcomes[task] for task in tasks]
 
 
 def same(one, other):

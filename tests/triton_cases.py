@@ -49,9 +49,11 @@ def cases() -> dict[str, Callable[[], object]]:
         state, _ = late(UfMStarState.initial(streams, chosen, torch.float32, "cpu"), frame, chosen)
         waiting = late._waiting
         assert waiting is not None
+        assert waiting.rest is not None
+        rest = waiting.rest
         append.append(
-            state.mixture, waiting.current, waiting.to_first, waiting.left, state.frames, near_plane=0.05, again=True,
-            last=True,
+            state.mixture, rest.current, rest.to_first, rest.left, state.frames, near_plane=0.05, again=True,
+            last=False,
         )  # fmt: skip
 
     given = SegmentInput.checked(depth, K, None, depth, depth > 0, depth[:, None])
@@ -77,5 +79,5 @@ def cases() -> dict[str, Callable[[], object]]:
         "device": device,
         "device_one": lambda: device(1),
         "device_relative": lambda: device(unmeasured="relative"),
-        "fit": lambda: segment.fit(SegmentInput.checked(depth, K), labels=False, floor=segment.Floor(0.05, 1e-6)),
+        "fit": lambda: segment.fit(SegmentInput.checked(depth, K), floor=segment.Floor(0.05, 1e-6)),
     }

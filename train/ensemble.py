@@ -79,7 +79,7 @@ def _first_reason(reasons: Sequence[str | None]) -> str | None:
 
 
 class _Worker:
-    """State of a worker process: the event that asks it to stop, and its number."""
+    """State of a worker process: the event at which it stops, and its number."""
 
     stop: Any = None
     slot: int = 0

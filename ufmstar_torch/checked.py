@@ -1,6 +1,6 @@
 """Frozen settings whose values are checked when they are made, and their plain form for JSON.
 
-The metadata of a field carries what a reader wants to know: ``symbol`` (the paper's letter), ``unit`` and ``range``, or
+The metadata of a field describes it: ``symbol`` (the paper's letter), ``unit`` and ``range``, or
 ``choices``. An unknown name is a ``TypeError`` as for any dataclass, an impossible value a ``ValueError`` that names
 the field.
 """
@@ -26,7 +26,7 @@ def number(
     open_high: bool = False,
 ) -> Any:
     """A numeric field with its allowed range [low, high], open at an end with ``open_low`` or ``open_high``. An
-    integer default asks for whole numbers; with the default None, None is allowed."""
+    integer default requires whole numbers; with the default None, None is allowed."""
     metadata = {"symbol": symbol, "unit": unit, "range": (low, high, open_low), "open_high": open_high}
     return field(default=default, metadata=metadata | {"optional": default is None})
 

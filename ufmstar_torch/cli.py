@@ -1,4 +1,4 @@
-"""The command line, ``ufmstar COMMAND ...``: the roof of the package, imported by nobody.
+"""The command line, ``ufmstar COMMAND ...``: the top of the package: no other module imports it.
 
 A command is a module with two functions: ``read(words)`` returns its options, and ``main(options)`` carries it out and
 returns the exit code. It is imported when it is called, so that help and errors appear at once.

@@ -1,6 +1,6 @@
 """One frame's input, checked: what UfM* is given per image, before the algorithm sees it.
 
-What a shape or dtype tells is an error at once. What only values tell (a pose that is not rigid, bad
+A wrong shape or dtype is an error at once. A fault that only values show (a pose that is not rigid, bad
 intrinsics) becomes a code per stream, so that on an accelerator nothing waits for the check; the caller
 raises or skips. What is wrong with single pixels becomes ``valid = False`` and is counted.
 """
@@ -55,7 +55,7 @@ class FrameInput:
         out_of_range: [B] further pixels of the mask with a finite positive depth that are not valid.
         fault: [B] int64 index into ``FRAME_FAULTS``, 0 = fine.
         rotation_deviation: [B] float64 max |R^T R - I| of the pose as given.
-        known_fault: ``fault`` on the CPU where pose and intrinsics were given there, which nobody waits for; else None.
+        known_fault: ``fault`` on the CPU where pose and intrinsics were given there: no wait; else None.
     """
 
     depth: Tensor
@@ -207,7 +207,7 @@ def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | No
     expected = (plain.shape[0], count, *plain.shape[1:])
     if features is None:
         if count:
-            raise ValueError(f"features must be given with shape {expected}: the config asks for {count}")
+            raise ValueError(f"features must be given with shape {expected}: config.features is {count}")
         return None
     return require_float("features", features, [expected], plain).detach().to(plain.dtype)
 

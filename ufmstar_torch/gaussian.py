@@ -305,6 +305,6 @@ def pixel_footprint(z: Tensor, focal: Tensor) -> Tensor:
     """(z/f)^2/12 [m^2]: the variance across one pixel at depth z, the floor of a segment's covariance.
 
     A segment thinner than the image resolves (a rendered wall is exactly flat) would have an infinite
-    density; below this width the depth map says nothing about its shape. Raw SPGF moments have no floor.
+    density; below this width the depth map contains nothing about its shape. Raw SPGF moments have no floor.
     """
     return (z / focal) ** 2 * PIXEL_VARIANCE

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 from torch import Tensor
 
@@ -72,7 +74,7 @@ class StepOutput:
         residual: [B, H, W, 2] or [B, n, 2] from anchors, the mean relative error r and mean square excess e expected at
             each pixel (``anchors.evidence``); None unless ``config.anchored``.
         measured: [B, H, W] or [B, n] share in [0, 1] of M that rests on surfaces seen from two views or more.
-        labels: [B, H, W] int64 the segment of every pixel, -1 = none.
+        read_labels: returns ``labels``; a GPU writes them when they are asked for.
         current_cam: C_i in the camera frame.
         statistics: of this frame.
     """
@@ -81,13 +83,18 @@ class StepOutput:
     features: Tensor
     residual: Tensor | None
     measured: Tensor
-    labels: Tensor
+    read_labels: Callable[[], Tensor]
     current_cam: GaussianMixture
     statistics: FrameStatistics
 
     def __repr__(self) -> str:
         """Shape and counts in a line."""
         return f"StepOutput({_size(self.disagreement)}, {self.statistics!r})"
+
+    @cached_property
+    def labels(self) -> Tensor:
+        """[B, H, W] int64 the segment of every pixel, -1 = none."""
+        return self.read_labels()
 
 
 @dataclass(frozen=True, repr=False)
@@ -108,7 +115,7 @@ class UfMStarOutput:
         measured: share in [0, 1] of M that rests on surfaces seen from two views or more; below one half the pixel
             counts as not measured (``config.unmeasured``). NaN where not valid.
         valid: True where the pixel was used.
-        labels: [B, H, W] the pixel's segment in ``current_cam``, -1 = none.
+        read_labels: returns ``labels``; a GPU writes them when they are asked for.
         current_cam: C_i, the segments of this frame in the camera frame, float64.
         statistics: per-stream counts of this frame.
     """
@@ -125,7 +132,7 @@ class UfMStarOutput:
     features: Tensor
     measured: Tensor
     valid: Tensor
-    labels: Tensor
+    read_labels: Callable[[], Tensor]
     current_cam: GaussianMixture
     statistics: FrameStatistics
 
@@ -138,6 +145,11 @@ class UfMStarOutput:
     def std(self) -> Tensor:
         """sqrt(variance) [m]."""
         return self.variance.sqrt()
+
+    @cached_property
+    def labels(self) -> Tensor:
+        """[B, H, W] int64 the pixel's segment in ``current_cam``, -1 = none."""
+        return self.read_labels()
 
     def posterior(self) -> tuple[Tensor, Tensor]:
         """p(depth | network, UfM*, anchors): depth [m] and its variance [m^2], NaN where not valid
@@ -191,6 +203,11 @@ class MeanUncertainty:
         """Means, errors and counts in a line."""
         counts = f"pixels={_short(self.pixels)}, measured={_short(self.measured)}"
         return f"MeanUncertainty(mean={_short(self.mean)} m^2, {counts}, {self.statistics!r})"
+
+
+def given(value: Tensor) -> Tensor:
+    """The tensor itself: ``partial(given, labels)`` is the ``read_labels`` of labels that are there already."""
+    return value
 
 
 def _size(value: Tensor) -> str:

@@ -89,7 +89,7 @@ class _Predicted:
 class NetworksInTurn(nn.Module):
     """Depth networks that take the same input: one of them per image, in turn, or all of them on every image.
 
-    Nothing is remembered between images: the caller counts them and asks :meth:`turn`. The networks stay in eval mode,
+    Nothing is stored between images: the caller counts them and calls :meth:`turn`. The networks stay in eval mode,
     whatever the caller's training flag is.
 
     Args:

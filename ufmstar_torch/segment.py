@@ -92,7 +92,7 @@ def _output(
     if reads_are_free(count.device):
         capacity = max(1, int(kept.sum(1).max()))
     else:
-        capacity = total if before_pruning else min(total, _most_kept(given))
+        capacity = total if before_pruning else min(total, most_kept(given))
     table = emitted.new_zeros(emitted.shape[0], capacity + 1, GAUSSIAN_WIDTH)
     append(table, torch.zeros_like(count), emitted, kept)
 
@@ -114,7 +114,7 @@ def _keeps(pixels: Tensor, merged: Tensor, limits: SPGFConfig) -> Tensor:
     return large | tall if limits.prune == "both" else large & tall
 
 
-def _most_kept(given: SegmentInput) -> int:
+def most_kept(given: SegmentInput) -> int:
     """Bound on the Gaussians of an image that survive pruning: each has at least so many pixels."""
     _, height, width = given.depth.shape
     limits = given.config

@@ -70,7 +70,7 @@ class Frame:
         rx = (torch.arange(width, dtype=dtype, device=z.device) - cx[:, None]) / fx[:, None]
         ry = (torch.arange(height, dtype=dtype, device=z.device) - cy[:, None]) / fy[:, None]
         lengths, edges = _depth_bins(given, 0.5 * torch.minimum(width / fx, height / fy))
-        # A camera of NaN, which nobody waits to refuse on an accelerator, must not index out of the table.
+        # An accelerator does not refuse a camera of NaN, since the check would wait: no index beyond the table then.
         bins = torch.searchsorted(edges, z.reshape(b, -1)).clamp_max(given.depth_bins - 1)
         return cls(
             given, z.reshape(-1, width), use.reshape(-1, width), s2,
@@ -226,7 +226,7 @@ class _Finished:
         self.count = torch.zeros(rows, dtype=torch.int64, device=z.device)
 
     def add(self, segment: Tensor, mask: Tensor) -> None:
-        """Output the segments [R, 15] where ``mask`` [R] says so and they are not too sparse."""
+        """Output the segments [R, 15] where ``mask`` [R] is True and they are not too sparse."""
         open_ = OpenSegment(*segment.unbind(-1))
         keep = mask & (open_.n > self.sparse)
         at = torch.where(keep, self.count, self.most)[:, None, None].expand(-1, 1, segment.shape[1])

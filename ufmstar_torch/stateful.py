@@ -6,6 +6,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import torch
@@ -14,6 +15,8 @@ from torch import Tensor, nn
 
 class Config(Protocol):
     """A frozen config with a form as plain values."""
+
+    def __hash__(self) -> int: ...
 
     def to_dict(self) -> dict[str, Any]:
         """Nested plain values."""
@@ -29,7 +32,7 @@ class StatefulModule(nn.Module):
     """A module whose state is a fixed set of buffers.
 
     Buffers are float32 or float64 whatever ``.half()`` is asked for. A saved state brings its own shapes (streams,
-    components, image size) and says with which config it was made.
+    components, image size) and contains the config with which it was made.
 
     Attributes:
         STATE: the buffers' names.
@@ -79,8 +82,8 @@ class StatefulModule(nn.Module):
         return self
 
     def get_extra_state(self) -> Tensor:
-        """The config as bytes, so that a checkpoint (safetensors too) says what it was made with."""
-        return torch.tensor(list(json.dumps(self.config.to_dict()).encode()), dtype=torch.uint8)
+        """The config as bytes, so that a checkpoint (safetensors too) contains it."""
+        return _bytes_of(self.config).clone()
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
@@ -164,6 +167,12 @@ def _fitting(name: str, saved: object, own: Tensor) -> Tensor:
     if not isinstance(saved, Tensor) or not fits:
         raise ValueError(f"{name} must be a tensor that fits {own.dtype}, got {kind}")
     return saved.detach().to(own.dtype)
+
+
+@lru_cache(maxsize=16)
+def _bytes_of(config: Config) -> Tensor:
+    """Its plain values as the bytes of JSON."""
+    return torch.tensor(list(json.dumps(config.to_dict()).encode()), dtype=torch.uint8)
 
 
 def _config_of(state: object) -> dict[str, Any]:

@@ -17,16 +17,23 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import LateStep, select_check, select_merge, select_posterior, select_step
+from ufmstar_torch.kernels.select import (
+    LateStep,
+    select_anchor_check,
+    select_check,
+    select_merge,
+    select_posterior,
+    select_step,
+)
 from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
 from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
-from ufmstar_torch.posterior.update import Posterior, update
+from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
-from ufmstar_torch.spill import Spill
+from ufmstar_torch.spill import Spill, Spilled
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import Step, StepObserver
@@ -150,7 +157,7 @@ class UfMStar(StatefulModule):
             features=out.features,
             measured=out.measured.reshape(shape),
             valid=frame.valid.reshape(shape),
-            labels=out.labels,
+            read_labels=out.read_labels,
             current_cam=out.current_cam,
             statistics=out.statistics,
         )
@@ -207,16 +214,24 @@ class UfMStar(StatefulModule):
         error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
         return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, measured, out.statistics)
 
-    def warm_up(self, size: tuple[int, int], *, streams: int = 1, anchored: bool | None = None) -> None:
+    def warm_up(
+        self,
+        size: tuple[int, int],
+        *,
+        streams: int = 1,
+        anchored: bool | None = None,
+        progress: Callable[[int, int], object] | None = None,
+    ) -> None:
         """Compile, or load from disk, all that the first frames of this size would otherwise wait for.
 
         The state stays as it is: a module of its own takes two frames of a wall. On a machine's very first call that is
-        some half a minute on the CPU, later below a second.
+        some twenty seconds on the CPU, later below a second.
 
         Args:
             size: (H, W) of the depth maps [px].
             streams: B.
             anchored: with the corners' triangulation (``LandmarkTracker``); None = as ``config.anchored``.
+            progress: is called with the stages that are done and all of them, to show that something happens.
 
         Raises:
             ValueError: a size or number of streams that is not positive.
@@ -225,7 +240,7 @@ class UfMStar(StatefulModule):
         twin = UfMStar(
             self.config.replace(anchored=anchored, spill=None), dtype=self.mean.dtype, device=self.mean.device
         )
-        warm_up(twin, size, streams)
+        warm_up(twin, size, streams, progress)
 
     def query(self, points: Tensor, frame: str = "world") -> Regression:
         """The disagreement at any 3D point, from the present mixture, without touching the state.
@@ -299,6 +314,11 @@ class UfMStar(StatefulModule):
         self._settle()
         return self._stored()
 
+    @property
+    def spilled(self) -> Spilled | None:
+        """What ``config.spill`` keeps out of memory; None without it."""
+        return None if self._spill is None else self._spill.spilled(self.state)
+
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
 
@@ -339,8 +359,8 @@ class UfMStar(StatefulModule):
             return None
         if not self.config.anchored:
             raise ValueError("anchors need UfMStarConfig(anchored=True)")
-        own = self._own(frame)
-        return check_anchors(anchors, frame, torch.stack(own).sum(0) if own else None)
+        kernel = select_anchor_check(self.config.backend, frame.depth.device.type)
+        return check_anchors(anchors, frame, self._own(frame), kernel)
 
     def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
@@ -424,8 +444,8 @@ class UfMStar(StatefulModule):
         claimed = claimed.clamp_min(self.config.variance_floor)
         if self.recalibration is not None:
             claimed = self.recalibration(claimed)
-        kernels = select_posterior(self.config.backend, frame.depth.device.type)
-        learnt, posterior = update(state.posterior, frame, anchors, claimed, kernels)
+        update = select_posterior(self.config.backend, frame.depth.device.type)
+        learnt, posterior = update(state.posterior, frame, anchors, claimed)
         posterior = replace(posterior, variance=posterior.variance.clamp_min(self.config.variance_floor))
         statistics = replace(out.statistics, calibration=posterior.calibration, unseen=posterior.unseen)
         return replace(state, posterior=learnt), replace(out, statistics=statistics), posterior
@@ -433,6 +453,8 @@ class UfMStar(StatefulModule):
     def _warn_without_segments(self, frame: FrameInput, out: StepOutput) -> None:
         """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
         if self._warned or frame.depth.device.type != "cpu":
+            return
+        if all(out.statistics.segments.tolist()):
             return
         given = out.statistics.valid_pixels + frame.beyond + frame.out_of_range
         empty = (given > 0) & (out.statistics.segments == 0)
@@ -454,7 +476,7 @@ class UfMStar(StatefulModule):
         return [value for value, counts in both if value is not None and counts]
 
     def _stored(self) -> UfMStarState:
-        return UfMStarState(**{name: getattr(self, name) for name in self.STATE})
+        return UfMStarState(**{name: self._buffers[name] for name in self.STATE})
 
     def _step(self, device_type: str) -> Step:
         """The step for a device, the same one as long as the state goes on."""

@@ -21,6 +21,7 @@ from ufmstar_torch.eval.bench.timing import TimedCalls, pinned_threads, spread_o
 from ufmstar_torch.eval.engine.clock import CallTimes
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import tour_sequence
+from ufmstar_torch.posterior.running import SIZE as POSTERIOR_SIZE
 
 # Every moment in the tracker's update belongs to one of these; "rest" is the gray image and the window's upkeep.
 PARTS = ("following", "searching", "triangulating", "rest")
@@ -132,7 +133,7 @@ def measure_tracker(frames: Sequence[Frame], points: int) -> dict[str, Any]:
 
 
 def measure_anchored_step(built: UfMStar, frames: Sequence[PosedDepth], points: int) -> dict[str, Any]:
-    """Steps with and without anchors from one state, in turn.
+    """Steps without anchors, with them and with the posterior, from one state, in turn.
 
     Args:
         built: with ``config.anchored``; not modified.
@@ -140,14 +141,17 @@ def measure_anchored_step(built: UfMStar, frames: Sequence[PosedDepth], points: 
         points: anchors of a frame, at random pixels.
 
     Returns:
-        "plain" and "anchored": times [ms]; "ratio" of the two; "used": anchors that were not rejected; "extra_bytes":
-        what the state keeps of anchors, in all and per slot of the mixture.
+        "plain", "anchored" and "posterior": times [ms]; "ratio" of the first two; "used": anchors that were not
+        rejected; "extra_bytes": what the state keeps of anchors, in all and per slot of the mixture.
     """
-    plain, anchored = copy.deepcopy(built), copy.deepcopy(built)
+    plain, anchored, posterior = (copy.deepcopy(built) for _ in range(3))
     plain.config = built.config.replace(anchored=False)
+    posterior.config = built.config.replace(posterior=True)
+    posterior.posterior = torch.zeros(len(built.mean), POSTERIOR_SIZE, dtype=torch.float64)
     calls: dict[str, Callable[[PosedDepth, Anchors], Any]] = {
         "plain": lambda frame, _: plain(*frame),
         "anchored": lambda frame, anchors: anchored(*frame, anchors=anchors),
+        "posterior": lambda frame, anchors: posterior(*frame, anchors=anchors),
     }
     timed, used, rng = TimedCalls(), [], np.random.default_rng(0)
     for frame in timed.frames(frames, warm_up=_STEP_WARM_UP):

@@ -71,7 +71,7 @@ def device_text(report: Mapping[str, Any]) -> list[str]:
 
 def touched_bytes(depth: Tensor, out: UfMStarOutput, ufm: UfMStar) -> int:
     """What a step cannot but read and write: the depth, the maps that it returns, and the state twice [bytes]."""
-    maps = (depth, out.variance, out.disagreement, out.measured, out.labels)
+    maps = (depth, out.variance, out.disagreement, out.measured)
     return sum(v.nbytes for v in maps) + 2 * sum(v.nbytes for v in ufm.state.tensors().values())
 
 

@@ -34,7 +34,7 @@ Work = Callable[[float], int]
 
 
 class SensorError(Exception):
-    """A counter could not be read; the message says why."""
+    """A counter could not be read; the message is the reason."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 EFFICIENCY = "efficiency.json"
 FORMAT = 1
 NETWORK = "network_uncertainty"
-NOT_NEEDED = "the method asks nothing of the network but depth"
+NOT_NEEDED = "the method needs only depth of the network"
 
 Energies = Mapping[tuple[str, str], PartEnergy]
 

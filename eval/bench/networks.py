@@ -27,7 +27,7 @@ DEPTH, ONCE, EVERY = "depth", "once", "every"
 
 
 class Inseparable(Exception):
-    """A network's share for depth alone cannot be separated from the rest; the message says why."""
+    """A network's share for depth alone cannot be separated from the rest; the message is the reason."""
 
 
 class TimedNetwork:

@@ -1,4 +1,4 @@
-"""The sensors that zeus knows: GPUs (NVML, AMD SMI), processors (RAPL), and systems on a chip (Jetson, Apple).
+"""The sensors that zeus reads: GPUs (NVML, AMD SMI), processors (RAPL), and systems on a chip (Jetson, Apple).
 
 zeus finds them and names what they count. Two things are done here instead, since a short measurement is disturbed
 by them: RAPL's counters are read from the files that zeus found (zeus starts a process per counter that looks out
@@ -16,7 +16,7 @@ from typing import Any
 from ufmstar_torch.eval.bench.energy import CPU, DRAM, GPU, OTHER, READING_ERRORS, Rail, SensorError, Source
 
 # [s] Refresh of the counters: NVML's of a data-centre GPU and RAPL's of a package, both generously, and the interval
-# at which zeus asks a Jetson's power monitor.
+# at which zeus reads a Jetson's power monitor.
 _NVML_PERIOD, _RAPL_PERIOD, _SOC_PERIOD = 0.1, 0.01, 0.15
 _NO_ZEUS = "zeus, which reads the sensors, is not installed: pip install 'ufmstar-torch[energy]'"
 _UNUSED = "nothing runs on a GPU"

@@ -2,7 +2,7 @@
 
 A camera walks through rendered rooms. Small depth networks that come with the package, trained on other rooms of
 the same kind, predict depth; the last room looks and measures like none of them, so there is an uncertainty to find.
-UfM and UfM* judge the same predictions, and the table says how well.
+UfM and UfM* judge the same predictions; the table shows how well.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 from statistics import median
+from threading import Event
 from time import perf_counter
 from typing import Any
 
@@ -23,10 +24,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.commands.run import Progress
+from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks, landmarks_of
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, Pointwise
 from ufmstar_torch.eval.engine.judge import RegionMetrics
 from ufmstar_torch.eval.engine.load import sha256
@@ -35,8 +38,9 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.ufm import UfMConfig
-from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, panel, write_pictures
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR, panel, write_pictures
 from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
@@ -54,6 +58,7 @@ from ufmstar_torch.ufmstar import UfMStar
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
 STYLE = "mixed"
 SHEET_ROWS = 6
+_POSTERIOR = UfMStarConfig(anchored=True, posterior=True)
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
 DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
@@ -150,12 +155,14 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
 
 
 def demo_rows(source: DepthSource, device: torch.device) -> list[RowRunner]:
-    """The rows of the table, at the start. The first three judge one prediction, of the member in turn; the last one
+    """The rows of the table, at the start. The first four judge one prediction, of the member in turn; the last one
     is all members on every image, which is what alternation saves. A single network is no ensemble."""
+    dense = AnchorSource(Setting(anchors=DENSE, posterior=True), Tracks(landmarks_of(DENSE, None)))
     rows = [
         RowRunner(NETWORK, source, Alone(), device=device),
         RowRunner(UFM, source, Pointwise(UfMConfig(), device), device=device),
         RowRunner(UFM_STAR, source, Gaussians(UfMStarConfig(), device), device=device),
+        RowRunner(POSTERIOR, source, Gaussians(_POSTERIOR, device, posterior=True), anchors=dense, device=device),
     ]
     several = [RowRunner(ENSEMBLE, source, Alone(), every=True, device=device)]
     return rows + (several if source.passes > 1 else [])
@@ -208,9 +215,9 @@ class _Walk(FrameSink):
         components = int(self._gaussians.memory()["count"])
         self._progress(Progress("frames", result.number + 1, len(self._unfamiliar), components, 0))
 
-    def median_ms(self, key: str, stage: str) -> float:
-        """Of the typical frame [ms]."""
-        return median(ms[stage] for ms in self.ms[key])
+    def median_ms(self, key: str, *stages: str) -> float:
+        """Of the typical frame, for those of the stages that the row has [ms]."""
+        return median(sum(ms.get(stage, 0.0) for stage in stages) for ms in self.ms[key])
 
 
 def _walk(
@@ -243,14 +250,20 @@ def _walk(
 def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[[Progress], None]) -> FrameSequence:
     """All frames in memory. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the very first
     run."""
+    frames, rendered = [], Event()
+
+    def compiling(done: int, total: int) -> None:
+        if rendered.is_set():
+            progress(Progress("kernels", done, total, None, 0))
+
     progress(Progress("rooms", 0, len(sequence), None, 0))
-    frames = [sequence[index] for index in range(2)]
     with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(_compile, frames, device)
-        for index in range(2, len(sequence)):
+        compiled = beside.submit(UfMStar(_POSTERIOR, device=device).warm_up, (64, 64), progress=compiling)
+        for index in range(len(sequence)):
             frames.append(sequence[index])
             progress(Progress("rooms", index + 1, len(sequence), None, 0))
         progress(Progress("kernels", 0, 1, None, 0))
+        rendered.set()
         compiled.result()
     progress(Progress("kernels", 1, 1, None, 0))
     entries = [
@@ -265,15 +278,6 @@ def _same(array: np.ndarray | None) -> np.ndarray:
     return array
 
 
-def _compile(frames: list[Frame], device: torch.device) -> None:
-    """UfM* on two frames with their true depth, whose segments match, so that every kernel is called."""
-    ufm_star = UfMStar().to(device)
-    for frame in frames:
-        depth = torch.from_numpy(frame.depth)[None].to(device)
-        pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-        ufm_star(depth, pose, K, torch.full_like(depth, 0.01))
-
-
 def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict[str, Any]:
     """The rows of the table: figures, times and memory."""
     overall = metrics.overall()
@@ -281,11 +285,17 @@ def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict
         row.key: {
             "figures": overall[row.key].compute(),
             "network_ms": walk.median_ms(row.key, "network"),
-            "uncertainty_ms": walk.median_ms(row.key, "uncertainty") if row.estimator.memory() else None,
-            "state_bytes": int(row.estimator.memory().get("bytes", 0)),
+            "uncertainty_ms": walk.median_ms(row.key, "anchors", "uncertainty") if row.estimator.memory() else None,
+            "state_bytes": _state_bytes(row),
         }
         for row in rows
     }
+
+
+def _state_bytes(row: RowRunner) -> int:
+    """What the next frame depends on, but for the map kept for smoothing."""
+    evidence = {} if row.anchors is None else row.anchors.state()
+    return int(row.estimator.memory().get("bytes", 0)) + sum(value.nbytes for value in evidence.values())
 
 
 def _network(info: TrainedInfo, digest: str, members: int) -> dict[str, Any]:

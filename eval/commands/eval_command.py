@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -29,7 +30,7 @@ class SuiteOptions:
         base: the network that a figure or ablation is about, instead of the paper's: depth_only, ...
         ufm_preset: settings of UfM* in all its rows, instead of the suite's: paper (UfMStarConfig.paper) or default
         network: BASE=MODEL:FILE[,FILE...], one for every base; rows without one are left out; repeatable
-        samples: passes of MC-Dropout where a row asks for all; default: 10
+        samples: passes of MC-Dropout of a row that needs all of them; default: 10
         runtime: auto: ONNX Runtime for weights in ONNX files, torch for the rest; or one of the two
         precision: of the networks; bf16: torch's autocast
         recalibration: file of `ufmstar recalibrate`: its row is judged under it as well, as a row of its own, on
@@ -113,6 +114,11 @@ class EvalOptions:
     Attributes:
         device: cpu or cuda; of several processes, each takes the next GPU in turn
         threads: number of CPU threads of each process; default: all cores, divided among --processes
+        streams: number of sequences that a process evaluates at the same time: each network and UfM* get their frames
+            as one batch. UfM* gives the same bits; a network may differ in its last bits from one image at a time
+            (torch and ONNX Runtime choose algorithms by the batch), and must not mix the images of a batch.
+            MC-Dropout, UfM and tracked anchors go sequence by sequence; times in records are a batch's, divided by its
+            frames
         processes: number of processes on this computer
         shard: i/n, only the i-th of n parts of the sequences, 1/n to n/n
         slurm: KEY=VALUE for submitit, as partition=gpu; jobs=N is the number of jobs; repeatable
@@ -126,6 +132,7 @@ class EvalOptions:
 
     device: str = "cpu"
     threads: int | None = None
+    streams: int = 1
     processes: int = 1
     shard: str | None = None
     slurm: tuple[str, ...] = option((), repeat=True)
@@ -144,7 +151,8 @@ class EvalOptions:
             if not values[name]:
                 raise ValueError(f"--{name} is missing; ufmstar eval --help, and --list for the suites")
         parse_slice(self.data.frames)
-        for name, least in (("processes", 1), ("examples", 0), ("threads", 1), ("seed", 0), ("samples", 2)):
+        least_of = {"processes": 1, "streams": 1, "examples": 0, "threads": 1, "seed": 0, "samples": 2}
+        for name, least in least_of.items():
             if values[name] is not None and values[name] < least:
                 raise ValueError(f"--{name} must be at least {least}, got {values[name]}")
         if not 0 < self.output.confident <= 1:
@@ -218,6 +226,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         samples=what.samples,
         runtime=what.runtime,
         precision=what.precision,
+        streams=options.streams,
     )
 
 
@@ -251,13 +260,17 @@ def launch_from(options: EvalOptions) -> LaunchOptions:
 
 
 def _evaluate(options: EvalOptions) -> int:
+    from ufmstar_torch import UfMStar
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.results.launch import evaluate_suite
 
     with Bars() as bars, stop_signals(bars.say) as stop:
         job, launch = job_from(options), launch_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
+        if any(row.method.fusion == UFM_STAR for row in job.suite.rows):
+            UfMStar().warm_up((32, 32), progress=partial(bars.frames, "kernels, compiled on the first run"))
         outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
     if outcome.reports:
         return _report(outcome, options.threads, draws=not options.output.no_report)

@@ -3,7 +3,7 @@
 ```python
 @dataclass(frozen=True, kw_only=True)
 class GreetOptions:
-    \"""Greet somebody.
+    \"""Greet a person.
 
     Attributes:
         name: of the person.
@@ -47,7 +47,7 @@ T = TypeVar("T", bound="DataclassInstance")
 
 
 class UsageError(Exception):
-    """What the user asked for cannot be done; the message is one line that says why."""
+    """A request of the user that cannot be carried out; the message is one line with the reason."""
 
 
 def positional() -> Any:

@@ -22,7 +22,7 @@ def table(outcome: EvalOutcome) -> str:
 
 
 def measure(outcome: EvalOutcome, threads: int | None = None) -> str | None:
-    """Measure what a suite about efficiency asks for, unless it is there; a line if it cannot be had.
+    """Measure what a suite about efficiency needs, unless it exists; a line if it cannot be measured.
 
     Not while sequences are still to be evaluated: other parts (``--shard``) are at them, and would be timed along.
 
@@ -47,7 +47,7 @@ def measure(outcome: EvalOutcome, threads: int | None = None) -> str | None:
 
 
 def draw(outcome: EvalOutcome) -> str:
-    """Draw tables and figures; a line that says where, or why there are none.
+    """Draw tables and figures; a line with their place, or with the reason why there are none.
 
     Raises:
         OSError: a file cannot be written.

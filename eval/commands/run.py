@@ -132,7 +132,7 @@ class Progress:
     """How far a run is.
 
     Attributes:
-        stage: "kernels" (compiling, on a machine's first run), "frames" or "pictures".
+        stage: "kernels" (compiled on a machine's first run), "frames" or "pictures".
         done: of this stage, skipped frames included.
         total: of this stage.
         components: K after this frame, None if it was skipped or nothing has been done yet.
@@ -198,9 +198,11 @@ def run(
 
 def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
-    progress(Progress("kernels", 0, 1, None, 0))
-    UfMStar(job.config, device=job.device).warm_up((32, 32))
-    progress(Progress("kernels", 1, 1, None, 0))
+
+    def compiling(done: int, total: int) -> None:
+        progress(Progress("kernels", done, total, None, 0))
+
+    UfMStar(job.config, device=job.device).warm_up((32, 32), progress=compiling)
     position = folder.checkpoint.position
     row = job.row(folder.checkpoint.module, position)
     metrics, maps = RunMetrics(UFM, folder.checkpoint.metrics), MapWriter(UFM, folder.writer)

@@ -19,6 +19,7 @@ class Bars:
     def __init__(self) -> None:
         self._bar: Any = None
         self._stage = ""
+        self._sequences: dict[str, Any] = {}
 
     def show(self, progress: Progress) -> None:
         """Bring the bar of the stage up to date."""
@@ -27,8 +28,12 @@ class Bars:
         if progress.stage != self._stage:
             self._close()
             first = progress.done if progress.components is None and progress.stage == "frames" else 0
-            self._bar = tqdm(total=progress.total, initial=first, desc=progress.stage, unit="frame", dynamic_ncols=True)
+            unit = "frame" if progress.stage == "frames" else "step"
+            self._bar = tqdm(total=progress.total, initial=first, desc=progress.stage, unit=unit, dynamic_ncols=True)
+            if progress.stage == "kernels":
+                self._bar.set_postfix_str("compiled on the first run")
             self._stage = progress.stage
+        self._bar.total = progress.total
         if progress.components is not None:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
             self._bar.set_postfix(K=progress.components, refresh=False, **skipped)
@@ -38,14 +43,13 @@ class Bars:
         """Bring the bar of a sequence's frames up to date; it goes when they are done."""
         from tqdm import tqdm
 
-        if label != self._stage:
-            self._close()
-            self._bar = tqdm(total=total, desc=label, unit="frame", dynamic_ncols=True, leave=False, disable=None)
-            self._stage = label
-        self._bar.update(done - self._bar.n)
+        if label not in self._sequences:
+            new = tqdm(total=total, desc=label, unit="frame", dynamic_ncols=True, leave=False, disable=None)
+            self._sequences[label] = new
+        bar = self._sequences[label]
+        bar.update(done - bar.n)
         if done == total:
-            self._close()
-            self._stage = ""
+            self._sequences.pop(label).close()
 
     def say(self, text: str) -> None:
         """Print a line without breaking the bar."""
@@ -60,6 +64,8 @@ class Bars:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._close()
+        for bar in self._sequences.values():
+            bar.close()
 
     def _close(self) -> None:
         if self._bar is not None:

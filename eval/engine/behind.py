@@ -14,7 +14,7 @@ from time import perf_counter
 import torch
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink, hand_over
 
 # Frames that wait for their sinks; each holds its maps and the state after it, about 3 MB at 224 x 224.
 _WAITING = 4
@@ -83,11 +83,5 @@ class Behind(FrameSink):
         if not self._intact:
             return
         self._intact = False
-        for sink in self._sinks:
-            if sink.stage is None:
-                sink.take(result)
-                continue
-            with self._timer.stage(sink.stage):
-                sink.take(result)
-            result.ms.update(self._timer.take())
+        hand_over(result, self._sinks, self._timer)
         self._intact = True

@@ -1,6 +1,6 @@
 """The pixels of which a reference method is confident, for the figure of NLL by error.
 
-The paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is confident and asks what the
+The paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is confident and shows what the
 other methods say there. Which pixels these are it leaves open; here, of every frame, the share ``confident`` of the
 reference's pixels with the smallest variance. All rows on the same frames are judged on the same pixels.
 """

@@ -1,4 +1,4 @@
-"""Many rows on one sequence in one stream: every network sees a frame once, and every row sees the same frames.
+"""Many rows on a sequence in one stream: every network sees a frame once, and every row sees the same frames.
 
 A frame that one row cannot use (its file is broken, its pose is no pose, a network has nothing to predict from) is
 left out by all rows, whose tables could not be compared otherwise. Pixels are each row's own: those with ground truth
@@ -8,7 +8,8 @@ where it predicts something. How many it leaves out is among its figures (``left
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
@@ -20,11 +21,11 @@ from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.confident import references
-from ufmstar_torch.eval.engine.estimators import make_estimator
+from ufmstar_torch.eval.engine.estimators import Estimator, Gaussians, make_estimator
 from ufmstar_torch.eval.engine.judge import RowMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink, drive_together
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
@@ -44,6 +45,10 @@ class SequenceError(Exception):
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason
+
+
+# Errors of a sequence that cannot be used. Any other error is a mistake in this program, and ends it.
+BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -66,80 +71,176 @@ class RowResult:
     sums: dict[str, dict[str, Tensor]]
 
 
-def evaluate_sequence(
-    sequence: FrameSequence,
-    rows: Sequence[Row],
-    networks: Mapping[str, DepthSource],
-    *,
-    device: torch.device,
-    store: PredictionStore | None = None,
-    limit: slice = slice(None),
-    sinks: Sequence[Sink] = (),
-    confident: float = 0.5,
-    bins: str = "ours",
-    stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[RowResult]:
-    """Judge every row on the frames of a sequence.
+@dataclass(frozen=True, eq=False)
+class SequenceTask:
+    """What is judged of a sequence.
 
-    Args:
+    Attributes:
         sequence: posed frames with ground truth.
         rows: different ones.
+        sinks: take the frames after the metrics; a row's key is its slug.
+        progress: called with the frames that are done and all of them, at the start and after every one.
+    """
+
+    sequence: FrameSequence
+    rows: Sequence[Row]
+    sinks: Sequence[Sink] = ()
+    progress: Callable[[int, int], None] = lambda done, total: None
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """How sequences are judged.
+
+    Attributes:
         networks: by base.
         device: where UfM and UfM* run.
         store: of predictions; None = all are computed.
         limit: which frames, before a setting's skip.
-        sinks: take the frames after the metrics; a row's key is its slug.
         confident: of the pixels of a frame, the share of which a reference method counts as confident.
         bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
-        stop: asked before every frame.
-        progress: called with the frames that are done and all of them, at the start and after every one.
-
-    Returns:
-        One result for each row, in their order.
+        streams: sequences that are judged at the same time: networks and UfM* get their frames as one batch. UfM* gives
+            the same bits as for one sequence after the other; a network may not (``NetworkSource.several``).
 
     Raises:
-        SequenceError: the sequence cannot be used.
-        Stopped: ``stop`` returned True; nothing of the sequence counts.
-        ValueError: no row, one of them twice, a base without a network, an override that UfM* does not know, or
-            preprocessing of maps that exist already.
+        ValueError: a share of confident pixels out of range, or less than one stream.
     """
-    _check_arguments(rows, networks, confident)
-    indices = range(len(sequence))[limit]
-    _check_sequence(sequence, rows, indices)
-    expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
-    sources = {(base, how): networks[base].prepared(how) for base, how in expected}
-    used = list(sources.values())
-    tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
 
-    def check(frame: Frame) -> None:
-        """Raises FrameError unless all networks and UfM* can use the frame."""
-        if frame.image is None and (tracked or any(source.needs_image for source in used)):
+    networks: Mapping[str, DepthSource]
+    device: torch.device
+    store: PredictionStore | None = None
+    limit: slice = field(default_factory=lambda: slice(None))
+    confident: float = 0.5
+    bins: str = "ours"
+    streams: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 < self.confident <= 1:
+            raise ValueError(f"confident must lie in (0, 1], got {self.confident}")
+        if self.streams < 1:
+            raise ValueError(f"streams must be at least 1, got {self.streams}")
+
+
+Done = Callable[[SequenceTask, list[RowResult] | Exception], None]
+
+
+def evaluate_sequences(
+    tasks: Iterable[SequenceTask], judge: Judge, done: Done, *, stop: Callable[[], bool] = lambda: False
+) -> None:
+    """Judge every row on the frames of every sequence.
+
+    Args:
+        tasks: the next one is asked for when there is room for it.
+        judge: how.
+        done: called with every task and its results, one for each row in their order, or with the error (``BROKEN``)
+            for which the sequence cannot be used. The errors are SequenceError, ValueError for no row, one of them
+            twice, a base without a network, an override that UfM* does not know, or preprocessing of maps that exist
+            already, and what readers and networks raise.
+        stop: asked before every frame.
+
+    Raises:
+        Stopped: ``stop`` returned True; nothing of the sequences in hand counts.
+    """
+    estimators = _Estimators(judge.device, judge.streams)
+    running: dict[FrameStream, _Evaluation] = {}
+
+    def begun() -> Iterator[tuple[FrameStream, Sequence[Sink]]]:
+        for task in tasks:
+            slot = min(set(range(judge.streams)) - {one.slot for one in running.values()})
+            try:
+                evaluation = _Evaluation(task, judge, estimators, slot)
+            except BROKEN as error:
+                done(task, error)
+                continue
+            running[evaluation.stream] = evaluation
+            yield evaluation.stream, evaluation.sinks
+
+    with closing(drive_together(begun(), at_once=judge.streams, stop=stop, broken=BROKEN)) as ended:
+        for stream, error in ended:
+            evaluation = running.pop(stream)
+            done(evaluation.task, error or evaluation.outcome())
+
+
+class _Estimators:
+    """The estimators of sequences that are judged at the same time: those of a row of UfM* are streams of one module.
+
+    Args:
+        device: where they run.
+        streams: number of sequences.
+    """
+
+    def __init__(self, device: torch.device, streams: int) -> None:
+        self._device, self._streams = device, streams
+        self._shared: dict[Row, Gaussians] = {}
+
+    def of(self, row: Row, max_depth: float | None, slot: int) -> Estimator:
+        """The estimator of a row for stream ``slot``, in its initial state; errors as :func:`make_estimator`."""
+        shared = self._shared.get(row)
+        if shared is None:
+            estimator = make_estimator(row, self._device, max_depth, streams=self._streams)
+            if not isinstance(estimator, Gaussians) or estimator.streams == 1:
+                return estimator
+            shared = self._shared[row] = estimator
+        return shared.stream(slot)
+
+
+class _Evaluation:
+    """A sequence while it is judged.
+
+    Raises:
+        SequenceError, ValueError: as :func:`evaluate_sequences` states.
+    """
+
+    def __init__(self, task: SequenceTask, judge: Judge, estimators: _Estimators, slot: int) -> None:
+        self.task, self.slot = task, slot
+        sequence, rows = task.sequence, task.rows
+        _check_rows(rows, judge.networks)
+        indices = range(len(sequence))[judge.limit]
+        _check_sequence(sequence, rows, indices)
+        expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
+        sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
+        anchors = anchor_sources(rows, sequence.folder)
+        named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
+        self._metrics, self._accounts = RowMetrics(named, judge.confident, judge.bins), _Accounts()
+        self.sinks: Sequence[Sink] = [self._metrics, self._accounts, *task.sinks, ProgressSink(task.progress)]
+        runners = []
+        for row in rows:
+            source = sources[row.method.base, row.setting.preprocess]
+            estimator = estimators.of(row, source.max_depth, slot)
+            how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting}
+            runners.append(RowRunner(row.slug, source, estimator, **how, anchors=anchors.get(row), device=judge.device))
+        check = _FrameCheck(list(sources.values()), any(row.setting.anchors in (TRACKED, DENSE) for row in rows))
+        self.stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
+
+    def outcome(self) -> list[RowResult] | Exception:
+        """After the last frame: a result for each row, or why there is none."""
+        rows = self._accounts.rows
+        try:
+            return [_result(row, rows[row.slug], self._metrics, self.task.sequence) for row in self.task.rows]
+        except BROKEN as error:
+            return error
+
+
+@dataclass(frozen=True)
+class _FrameCheck:
+    """Raises FrameError unless all networks and UfM* can use a frame.
+
+    Attributes:
+        sources: of depth.
+        tracked: whether anchors are looked for in the image.
+    """
+
+    sources: Sequence[DepthSource]
+    tracked: bool
+
+    def __call__(self, frame: Frame) -> None:
+        if frame.image is None and (self.tracked or any(source.needs_image for source in self.sources)):
             raise FrameError(frame.name, "no image")
-        if frame.depth is None and not all(source.needs_image for source in used):
+        if frame.depth is None and not all(source.needs_image for source in self.sources):
             raise FrameError(frame.name, "no depth map")
         fault = frame_fault(frame)
         if fault is not None:
             raise FrameError(frame.name, fault)
-
-    anchors = anchor_sources(rows, sequence.folder)
-    runners = [
-        RowRunner(
-            row.slug,
-            sources[row.method.base, row.setting.preprocess],
-            make_estimator(row, device, sources[row.method.base, row.setting.preprocess].max_depth),
-            every=row.method.every_member,
-            setting=row.setting,
-            anchors=anchors.get(row),
-            device=device,
-        )
-        for row in rows
-    ]
-    named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
-    metrics, accounts = RowMetrics(named, confident, bins), _Accounts()
-    stream = FrameStream(sequence, indices, runners, store=store, device=device, check=check)
-    stream.drive([metrics, accounts, *sinks, ProgressSink(progress)], stop=stop)
-    return [_result(row, accounts.rows[row.slug], metrics, sequence) for row in rows]
 
 
 class ProgressSink(FrameSink):
@@ -215,15 +316,13 @@ class _Accounts(FrameSink):
             self.rows[key].add(row.ms, self._runners[key].estimator.memory())
 
 
-def _check_arguments(rows: Sequence[Row], networks: Mapping[str, DepthSource], confident: float) -> None:
-    """Raises ValueError for what ``evaluate_sequence`` cannot do, whatever the sequence."""
+def _check_rows(rows: Sequence[Row], networks: Mapping[str, DepthSource]) -> None:
+    """Raises ValueError for rows that cannot be judged, whatever the sequence."""
     if not rows or len({row.slug for row in rows}) < len(rows):
         raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
     missing = sorted({row.method.base for row in rows} - networks.keys())
     if missing:
         raise ValueError(f"networks must hold one for each base of the rows, {', '.join(missing)} is missing")
-    if not 0 < confident <= 1:
-        raise ValueError(f"confident must be a share in (0, 1], got {confident}")
 
 
 def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range) -> None:

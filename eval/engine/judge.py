@@ -45,7 +45,7 @@ class Figures(Generic[Key]):
 
     def state(self) -> dict[Key, dict[str, Tensor]]:
         """The sums, by key and name. They are exchanged by updates, never changed in place."""
-        return {key: dict(metrics.state_dict()) for key, metrics in self._metrics.items()}
+        return {key: metrics.sums() for key, metrics in self._metrics.items()}
 
     def load_state(self, state: Mapping[Key, Mapping[str, Tensor]]) -> None:
         """Add up further where ``state`` was taken."""

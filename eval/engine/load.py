@@ -35,7 +35,7 @@ class NetworkChoice:
 
     Attributes:
         base: a key of ``method.BASES``.
-        model: a name that ``load_network`` knows, or "ground-truth" (of "depth_only": the sequence's own depth, which
+        model: a name that ``load_network`` accepts, or "ground-truth" (of "depth_only": the sequence's own depth, which
             shows what a method makes of perfect depth).
         files: its weights, one or several files, in the order of the members. Of "trained", "FILE#2" is member 2 of
             the file alone. A file .json is the spec that goes with the weights. Of "ground-truth" nothing, or "HxW".
@@ -108,7 +108,7 @@ class NetworkChoice:
 
         Args:
             device: where networks run.
-            samples: MC-Dropout's, on every image where a row asks for all.
+            samples: MC-Dropout's, on every image of a row that needs all of them.
             inference: runtime and precision.
 
         Raises:
@@ -173,7 +173,7 @@ def network_source(
     """One network, or the members of an ensemble, from files, as ``ufmstar run`` runs them.
 
     Args:
-        model: a name that ``load_network`` knows.
+        model: a name that ``load_network`` accepts.
         weights: one file for each member (a directory for networks of ``transformers``); those of "trained" may hold
             several.
         spec: declares what an ONNX file or saved program does not say.

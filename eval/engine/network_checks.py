@@ -36,7 +36,7 @@ def check_members(base: str, members: Sequence[DepthNetwork], device: torch.devi
     ============== =====================================================================
 
     Raises:
-        ValueError: they do not deliver that; says what they do deliver.
+        ValueError: they do not deliver that; the message names what they do deliver.
     """
     shared = [member for member in members if isinstance(member, BatchEnsembleMember)]
     if base == "batch_ensemble":
@@ -73,7 +73,7 @@ def _check_variances(base: str, prediction: DepthPrediction) -> None:
 
 
 def _tried(member: DepthNetwork, device: torch.device) -> DepthPrediction:
-    """What it says of a grey image."""
+    """What it predicts for a grey image."""
     height, width = _PROBE
     K = torch.tensor([[[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]]], dtype=torch.float64)
     with torch.no_grad():

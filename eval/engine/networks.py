@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, cast
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
@@ -61,8 +62,11 @@ class NetworkSource:
         self.identity, self.label, self.digest = dict(identity), label, digest
         self._timer = StageTimer(device)
         self._generator = torch.Generator(device)
-        self._input: tuple[Frame, Tensor, Tensor] | None = None
-        for network in stochastic(networks.networks) if seeding is not None else ():
+        self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()
+        self._seeded: Frame | None = None
+        sampling = stochastic(networks.networks) if seeding is not None else []
+        self._draws = bool(sampling)
+        for network in sampling:
             set_sampling(network, True, self._generator)
 
     @property
@@ -101,7 +105,7 @@ class NetworkSource:
             return self
         other = copy.copy(self)
         other._turns = NetworksInTurn(self._members, samples=self._turns.samples, preprocess=changed)
-        other._input, other._timer = None, StageTimer(self._device)
+        other._inputs, other._seeded, other._timer = WeakKeyDictionary(), None, StageTimer(self._device)
         other.identity = {**self.identity, "preprocess": how}
         other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
         return other
@@ -115,34 +119,67 @@ class NetworkSource:
         """The member for the image that a row uses after ``position`` others."""
         return self._turns.turn(position)
 
+    @property
+    def batches(self) -> bool:
+        """Whether :meth:`several` may be used: networks that draw samples draw them frame by frame."""
+        return not self._draws
+
     def one(self, frame: Frame, n: int) -> Prediction:
         """One inference, of member (or sample) n.
 
         Raises:
             FrameError: the frame has no image.
         """
-        with torch.no_grad():
-            x, K = self._prepared(frame)
-            if self._seeding == "sample":
-                self._generator.manual_seed(frame.index + _SAMPLE_STRIDE * n)
-            reduced = self._precision == BF16
-            with (
-                self._timer.stage("network"),
-                torch.autocast(self._device.type, torch.bfloat16, enabled=reduced),
-            ):
-                prediction = self._turns.member(x, K, n)
-            made = Prediction.of(prediction, K[0], self._timer.take()["network"])
-            return made.to(torch.float32) if reduced else made
+        return self.several([frame], n)[0]
 
-    def _prepared(self, frame: Frame) -> tuple[Tensor, Tensor]:
-        """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3]; once for all members."""
-        if self._input is None or self._input[0] is not frame:
+    def several(self, frames: Sequence[Frame], n: int) -> list[Prediction]:
+        """The inferences of member n for several frames, as one batch if the network's inputs are of one size.
+
+        A prediction may differ in its last bits from that of :meth:`one`: torch and ONNX Runtime choose their
+        algorithms by the size of a batch. Of the time, each frame gets an equal share.
+
+        Raises:
+            FrameError: a frame has no image.
+        """
+        with torch.no_grad():
+            inputs = self._prepared(frames)
+            if len({x.shape for x, _ in inputs}) > 1:
+                return [self._inference([given], n)[0] for given in inputs]
+            if self._seeding == "sample":
+                self._generator.manual_seed(frames[0].index + _SAMPLE_STRIDE * n)
+            return self._inference(inputs, n)
+
+    def _inference(self, inputs: Sequence[tuple[Tensor, Tensor]], n: int) -> list[Prediction]:
+        """Of inputs of one size."""
+        x, K = (torch.cat(values) if len(values) > 1 else values[0] for values in zip(*inputs, strict=True))
+        reduced = self._precision == BF16
+        with (
+            self._timer.stage("network"),
+            torch.autocast(self._device.type, torch.bfloat16, enabled=reduced),
+        ):
+            prediction = self._turns.member(x, K, n)
+        made = Prediction.each(prediction, K, self._timer.take()["network"])
+        return [one.to(torch.float32) for one in made] if reduced else made
+
+    def prepare(self, frame: Frame) -> None:
+        """See ``DepthSource``; on the processor."""
+        if self._device.type == "cpu" and frame.image is not None:
+            self._input(frame)
+
+    def _prepared(self, frames: Sequence[Frame]) -> list[tuple[Tensor, Tensor]]:
+        """The networks' inputs [1, 3, h, w] and their intrinsics [1, 3, 3]; a frame seeds once for all members."""
+        if self._seeding == "frame" and self._seeded is not frames[-1]:
+            self._generator.manual_seed(frames[-1].index)
+            self._seeded = frames[-1]
+        return [self._input(frame) for frame in frames]
+
+    def _input(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Computed once, as long as the frame is used."""
+        if frame not in self._inputs:
             image, K = image_tensor(frame).to(self._device), torch.from_numpy(frame.intrinsics)[None]
-            x, K = self._turns.prepare(image, K)
-            if self._seeding == "frame":
-                self._generator.manual_seed(frame.index)
-            self._input = (frame, x, K)
-        return self._input[1], self._input[2]
+            with torch.no_grad():
+                self._inputs[frame] = self._turns.prepare(image, K)
+        return self._inputs[frame]
 
 
 def prepared_as(own: Preprocess, how: str) -> Preprocess:

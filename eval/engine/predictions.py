@@ -65,9 +65,19 @@ class Prediction:
     @classmethod
     def of(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> Prediction:
         """What a network returned for one image, [1, h, w]; ``intrinsics`` [3, 3]."""
+        return cls.each(prediction, intrinsics[None], ms)[0]
+
+    @classmethod
+    def each(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> list[Prediction]:
+        """What a network returned for B images, [B, h, w]; ``intrinsics`` [B, 3, 3], ``ms`` of all together."""
+        share = None if ms is None else ms / len(intrinsics)
+
+        def of(value: Tensor | None, i: int) -> Tensor | None:
+            return None if value is None else value[i].detach()
+
         a, e = prediction.aleatoric_variance, prediction.epistemic_variance
-        a, e = (None if value is None else value[0].detach() for value in (a, e))
-        return cls(prediction.depth[0].detach(), a, e, intrinsics.cpu().double(), ms)
+        cameras = intrinsics.cpu().double()
+        return [cls(prediction.depth[i].detach(), of(a, i), of(e, i), K, share) for i, K in enumerate(cameras.unbind())]
 
 
 def combined(predictions: Sequence[Prediction]) -> Prediction:
@@ -123,7 +133,7 @@ class DepthSource(Protocol):
     def runtime(self) -> Mapping[str, Any] | None: ...
 
     def prepared(self, how: str) -> DepthSource:
-        """The same source with its images prepared as ``Setting.preprocess`` says; itself where that is no change.
+        """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change.
 
         Raises:
             ValueError: there are no images to prepare.
@@ -132,6 +142,10 @@ class DepthSource(Protocol):
 
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""
+        ...
+
+    def prepare(self, frame: Frame) -> None:
+        """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
         ...
 
     def one(self, frame: Frame, n: int) -> Prediction:
@@ -190,7 +204,7 @@ class FramePredictions:
     """
 
     def __init__(self, frame: Frame, device: torch.device, store: PredictionStore | None, sequence: str) -> None:
-        self._frame, self._device, self._store, self._sequence = frame, device, store, sequence
+        self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
         self._content = "" if store is None else frame_digest(frame)
         self._known: dict[tuple[object, str], Prediction] = {}
 
@@ -200,35 +214,63 @@ class FramePredictions:
         Raises:
             FrameError: the frame has nothing to predict from.
         """
-        n = None if every and source.passes > 1 else source.turn(position)
-        member = _ALL if n is None else str(n)
-        known = (source.digest or source, member)
-        if known not in self._known:
-            self._known[known] = self._loaded(source, n, member)
-        return self._known[known]
+        n = _pass(source, position, every)
+        known = self._looked_up(source, n)
+        if known is None:
+            # Members that other rows use alone are not run again; the store keeps only what a row asked for.
+            passes = range(source.passes) if n is None else [n]
+            made = [self._inference(source, i) for i in passes]
+            known = self._known[_key(source, n)] = combined(made) if n is None else made[0]
+            if self._store is not None and source.cacheable:
+                self._store.store(self._stored_as(source, n), known)
+        return known
 
-    def _loaded(self, source: DepthSource, n: int | None, member: str) -> Prediction:
-        if self._store is None or not source.cacheable:
-            return self._computed(source, n)
-        key = PredictionKey(source.digest, self._sequence, self._frame.name, member, self._content)
-        stored = self._store.load(key, self._device)
-        if stored is None:
-            stored = self._computed(source, n)
-            self._store.store(key, stored)
-        return stored
+    def missing(self, source: DepthSource, position: int, every: bool) -> list[int]:
+        """The inferences that :meth:`of` has to make; arguments as there."""
+        n = _pass(source, position, every)
+        if self._looked_up(source, n) is not None:
+            return []
+        passes = range(source.passes) if n is None else [n]
+        return [i for i in passes if _inference_key(source, i) not in self._known]
 
-    def _computed(self, source: DepthSource, n: int | None) -> Prediction:
-        # Members that other rows use alone are not run again; the store keeps only what a row asked for.
-        if n is None:
-            return combined([self._inference(source, i) for i in range(source.passes)])
-        return self._inference(source, n)
+    def add(self, source: DepthSource, n: int, made: Prediction) -> Prediction:
+        """Use an inference of member (or sample) n; the prediction as it is used."""
+        made = made.to(self._device)
+        used = self._known[_inference_key(source, n)] = made.to(torch.float32) if source.cacheable else made
+        return used
+
+    def _looked_up(self, source: DepthSource, n: int | None) -> Prediction | None:
+        """In memory, then in the store."""
+        key = _key(source, n)
+        if key not in self._known and self._store is not None and source.cacheable:
+            stored = self._store.load(self._stored_as(source, n), self._device)
+            if stored is not None:
+                self._known[key] = stored
+        return self._known.get(key)
 
     def _inference(self, source: DepthSource, n: int) -> Prediction:
-        known = (source.digest or source, f"inference {n}")
-        if known not in self._known:
-            made = source.one(self._frame, n).to(self._device)
-            self._known[known] = made.to(torch.float32) if source.cacheable else made
-        return self._known[known]
+        known = self._known.get(_inference_key(source, n))
+        return self.add(source, n, source.one(self.frame, n)) if known is None else known
+
+    def _stored_as(self, source: DepthSource, n: int | None) -> PredictionKey:
+        return PredictionKey(source.digest, self._sequence, self.frame.name, _member(n), self._content)
+
+
+def _pass(source: DepthSource, position: int, every: bool) -> int | None:
+    """The member (or sample) in turn; None = all combined."""
+    return None if every and source.passes > 1 else source.turn(position)
+
+
+def _member(n: int | None) -> str:
+    return _ALL if n is None else str(n)
+
+
+def _key(source: DepthSource, n: int | None) -> tuple[object, str]:
+    return source.digest or source, _member(n)
+
+
+def _inference_key(source: DepthSource, n: int) -> tuple[object, str]:
+    return source.digest or source, f"inference {n}"
 
 
 def sequence_digest(sequence: FrameSequence) -> str:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.engine.anchors import AnchorSource, FrameAnchors
-from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.estimators import Estimate, Estimator
+from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput
 from ufmstar_torch.eval.engine.predictions import DepthSource, FramePredictions, Prediction
 from ufmstar_torch.eval.methods.perturb import Drift, perturbed, selects
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
@@ -44,6 +43,22 @@ class RowFrame:
     member: int | None
     anchors: FrameAnchors | None
     ms: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class RowInput:
+    """A frame on its way into a row; attributes as of :class:`RowFrame`."""
+
+    prediction: Prediction
+    truth: NDArray[np.float32] | None
+    T_world_cam: NDArray[np.float64]
+    member: int | None
+    anchors: FrameAnchors | None
+
+    def of_estimator(self) -> EstimatorInput:
+        """What the row's estimator gets."""
+        anchors = None if self.anchors is None else self.anchors.anchors
+        return EstimatorInput(self.prediction, torch.from_numpy(self.T_world_cam), anchors)
 
 
 class RowRunner:
@@ -79,8 +94,8 @@ class RowRunner:
         self.key, self.source, self.estimator, self.every, self.setting = key, source, estimator, every, setting
         self.anchors, self._skips_faults = anchors, skips_faults
         self.images = 0
+        self.device = device or torch.device("cpu")
         self._drift = Drift(setting)
-        self._timer = StageTimer(device or torch.device("cpu"))
 
     def selects(self, number: int) -> bool:
         """Whether the row uses image ``number`` of those that the stream selects."""
@@ -94,31 +109,35 @@ class RowRunner:
         """
         return predictions.of(self.source, self.images, self.every)
 
-    def take(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowFrame:
-        """Take in the next frame; its ground truth is for anchors of it alone.
+    def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowInput:
+        """The next frame as the row sees it; its ground truth is for anchors of it alone."""
+        T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
+        anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
+        single = self.source.networks and not self.every
+        member = self.source.turn(self.images) if single else None
+        return RowInput(prediction, truth, T, member, anchors)
+
+    def finish(self, frame: Frame, given: RowInput, estimate: Estimate, ms: float) -> RowFrame:
+        """Take in the next frame.
+
+        Args:
+            frame: the next one.
+            given: what :meth:`begin` returned for it.
+            estimate: the estimator's.
+            ms: that the estimator took [ms].
 
         Raises:
             FrameError: the estimator refuses the pose or the intrinsics, and the row skips such frames.
         """
-        T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
-        anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
-        with self._timer.stage("uncertainty"):
-            estimate = self.estimator.update(
-                prediction, torch.from_numpy(T), None if anchors is None else anchors.anchors
-            )
-        single = self.source.networks and not self.every
-        member = self.source.turn(self.images) if single else None
         self.images += 1
-        ms = self._timer.take()
         if self._skips_faults and estimate.statistics is not None and int(estimate.statistics.fault[0]):
             if self.anchors is not None:
                 self.anchors.undo()
             raise FrameError(frame.name, FRAME_FAULTS[int(estimate.statistics.fault[0])])
-        if prediction.ms is not None:
-            ms["network"] = prediction.ms
-        if anchors is not None and anchors.ms is not None:
-            ms["anchors"] = anchors.ms
-        return RowFrame(prediction, estimate, truth, T, member, anchors, ms)
+        tracking = None if given.anchors is None else given.anchors.ms
+        times = {"uncertainty": ms, "network": given.prediction.ms, "anchors": tracking}
+        known = {stage: time for stage, time in times.items() if time is not None}
+        return RowFrame(given.prediction, estimate, given.truth, given.T_world_cam, given.member, given.anchors, known)
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""

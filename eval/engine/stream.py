@@ -1,12 +1,14 @@
 """The loop over frames: every frame of a sequence through all rows, and what came of it to the sinks.
 
 ``ufmstar run`` is one row with writers, ``ufmstar demo`` four rows on a rendered tour, ``ufmstar eval`` the rows of a
-suite with metrics, and the benchmark no row, or one, with a clock.
+suite with metrics, and the benchmark no row, or one, with a clock. Several sequences may go through it at the same
+time: networks and UfM* then get batches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,6 +21,7 @@ from ufmstar_torch.eval.engine.ahead import FramesAhead
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
+from ufmstar_torch.eval.engine.together import Inference, Update, infer_together, update_together
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 
@@ -38,8 +41,8 @@ class FrameResult:
         frame: as it was read; None where no row selects it, or it cannot be used.
         rows: by key, of the rows that have taken it in.
         skipped: by key, why a row that selects the frame cannot use it.
-        ms: "read" (what was left to wait for: frames are read ahead), "predict" and "truth", and the stages of the
-            sinks that came before [ms].
+        ms: "read" (what was left to wait for: frames are read ahead), "predict" (without the batches of several
+            streams) and "truth", and the stages of the sinks that came before [ms].
         state: the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
     """
 
@@ -104,6 +107,7 @@ class FrameStream:
 
     Attributes:
         position: frames that are done, skipped ones included.
+        timer: of the stages of a frame.
     """
 
     def __init__(
@@ -123,7 +127,7 @@ class FrameStream:
         self._store, self._device, self._check = store, device or torch.device("cpu"), check
         self._names = sequence.names
         self._digest = "" if store is None else sequence_digest(sequence)
-        self._timer = StageTimer(self._device)
+        self.timer = StageTimer(self._device)
         self.position = start
 
     def drive(self, sinks: Sequence[Sink], *, stop: Callable[[], bool] = lambda: False) -> None:
@@ -137,22 +141,8 @@ class FrameStream:
             Stopped: ``stop`` returned True.
             FrameError: without rows, a frame cannot be read.
         """
-        for sink in sinks:
-            sink.begin(self)
-        with FramesAhead(self.sequence, self._needed()) as frames:
-            while self.position < len(self.indices):
-                if stop():
-                    raise Stopped
-                result = self._next(frames)
-                for sink in sinks:
-                    if sink.stage is None:
-                        sink.take(result)
-                        continue
-                    with self._timer.stage(sink.stage):
-                        sink.take(result)
-                    result.ms.update(self._timer.take())
-        for sink in sinks:
-            sink.end()
+        for _ in drive_together(iter([(self, sinks)]), stop=stop):
+            pass
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, by row: "KEY/NAME"."""
@@ -168,52 +158,185 @@ class FrameStream:
             prefix = f"{row.key}/"
             row.load_state({name[len(prefix) :]: v for name, v in state.items() if name.startswith(prefix)})
 
-    def _needed(self) -> list[int]:
+    def needed(self) -> list[int]:
         """Of the frames that are left, those that a row selects; without rows all."""
         left = range(self.position, len(self.indices))
         return [self.indices[n] for n in left if not self.rows or any(row.selects(n) for row in self.rows)]
 
-    def _next(self, frames: FramesAhead) -> FrameResult:
+    def prepare(self, frame: Frame) -> None:
+        """The networks' input, unless a store may have all predictions."""
+        if self._store is None:
+            for row in self.rows:
+                row.source.prepare(frame)
+
+    def next(self, frames: FramesAhead) -> _Frame:
+        """The way of the next frame; it stops where a network is needed, and where the rows' estimators are.
+
+        Yields:
+            The inferences, which may be made meanwhile; then the updates, which must be answered.
+
+        Returns:
+            What came of the frame.
+
+        Raises:
+            FrameError: without rows, the frame cannot be read.
+        """
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if row.selects(number)]
-        self._timer.take()
+        self.timer.take()
         self.position += 1
         if self.rows and not active:
             return FrameResult(number, index, name)
         try:
-            frame, predictions, truths = self._inputs(frames, active)
+            with self.timer.stage("read"):
+                frame = frames.next()
+                if self._check is not None:
+                    self._check(frame)
+            known = FramePredictions(frame, self._device, self._store, self._digest)
+            yield [Inference(known, row.source, row.images, row.every) for row in active]
+            with self.timer.stage("predict"):
+                predictions = {row.key: row.predict(known) for row in active}
+            with self.timer.stage("truth"):
+                truths = _truths(frame, predictions)
         except FrameError as error:
             if not self.rows:
                 raise
             return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
-        ms = self._timer.take()
+        ms = self.timer.take()
+        updates = [Update(row, row.begin(frame, predictions[row.key], truths[row.key])) for row in active]
+        yield updates
         taken: dict[str, RowFrame] = {}
         skipped: dict[str, str] = {}
-        for row in active:
+        for one in updates:
             try:
-                taken[row.key] = row.take(frame, predictions[row.key], truths[row.key])
+                taken[one.row.key] = one.row.finish(frame, one.given, one.answered(), one.ms)
             except FrameError as error:
-                skipped[row.key] = error.reason
+                skipped[one.row.key] = error.reason
         return FrameResult(number, index, name, frame, taken, skipped, ms)
 
-    def _inputs(
-        self, frames: FramesAhead, active: Sequence[RowRunner]
-    ) -> tuple[Frame, dict[str, Prediction], dict[str, NDArray[np.float32] | None]]:
-        """The frame, and by row what is predicted for it and its ground truth.
 
-        Raises:
-            FrameError: the frame cannot be used.
-        """
-        with self._timer.stage("read"):
-            frame = frames.next()
-            if self._check is not None:
-                self._check(frame)
-        with self._timer.stage("predict"):
-            known = FramePredictions(frame, self._device, self._store, self._digest)
-            predictions = {row.key: row.predict(known) for row in active}
-        with self._timer.stage("truth"):
-            return frame, predictions, _truths(frame, predictions)
+_Frame = Generator[Sequence[Inference | Update], None, FrameResult]
+
+
+def drive_together(
+    streams: Iterator[tuple[FrameStream, Sequence[Sink]]],
+    *,
+    at_once: int = 1,
+    stop: Callable[[], bool] = lambda: False,
+    broken: tuple[type[Exception], ...] = (),
+) -> Generator[tuple[FrameStream, Exception | None], None, None]:
+    """Go through the frames of several streams at the same time: one frame of each, then the next of each.
+
+    Args:
+        streams: each with its sinks; the next one is taken when one has ended.
+        at_once: number of streams.
+        stop: asked before every frame.
+        broken: errors that end the stream whose frame raises them, and no other; any other error ends all.
+
+    Yields:
+        A stream that has ended, and the error that ended it before its last frame, or None.
+
+    Raises:
+        Stopped: ``stop`` returned True.
+    """
+    lanes: list[_Lane] = []
+    try:
+        while True:
+            while len(lanes) < at_once and (entry := next(streams, None)) is not None:
+                lanes.append(_Lane(*entry, broken))
+            if not lanes:
+                return
+            if not any(lane.over for lane in lanes):
+                if stop():
+                    raise Stopped
+                _one_frame_of_each(lanes)
+            for lane in [lane for lane in lanes if lane.over]:
+                lanes.remove(lane)
+                lane.end()
+                yield lane.stream, lane.error
+    finally:
+        for lane in lanes:
+            lane.close()
+
+
+class _Lane:
+    """A stream on its way, its sinks, and what keeps an error of its own from other streams."""
+
+    def __init__(self, stream: FrameStream, sinks: Sequence[Sink], broken: tuple[type[Exception], ...]) -> None:
+        self.stream, self._sinks, self._broken = stream, sinks, broken
+        self.error: Exception | None = None
+        self._frame: _Frame | None = None
+        self._open = ExitStack()
+        self._frames = self._open.enter_context(FramesAhead(stream.sequence, stream.needed(), stream.prepare))
+        with self._own_errors():
+            for sink in sinks:
+                sink.begin(stream)
+
+    @property
+    def over(self) -> bool:
+        """Whether no frame is left, or an error has ended it."""
+        done = self._frame is None and self.stream.position >= len(self.stream.indices)
+        return done or self.error is not None
+
+    def advance(self) -> Sequence[Inference | Update]:
+        """Bring the frame in hand, or the next one, to its next stop: what it needs there. At its end the sinks get
+        what came of it."""
+        if self.over:
+            return []
+        with self._own_errors():
+            if self._frame is None:
+                self._frame = self.stream.next(self._frames)
+            try:
+                return next(self._frame)
+            except StopIteration as ended:
+                self._frame = None
+                hand_over(ended.value, self._sinks, self.stream.timer)
+        return []
+
+    @property
+    def waits(self) -> bool:
+        """Whether a frame is in hand."""
+        return self._frame is not None and self.error is None
+
+    def end(self) -> None:
+        """After the last frame, or an error."""
+        self.close()
+        if self.error is None:
+            with self._own_errors():
+                for sink in self._sinks:
+                    sink.end()
+
+    def close(self) -> None:
+        """Read no further frame."""
+        self._open.close()
+
+    @contextmanager
+    def _own_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except self._broken as error:
+            self.error = error
+
+
+def _one_frame_of_each(lanes: Sequence[_Lane]) -> None:
+    """All frames to their first stop, there the inferences; to their second stop, there the updates; to their end."""
+    wanted = [one for lane in lanes for one in lane.advance()]
+    while any(lane.waits for lane in lanes):
+        infer_together([one for one in wanted if isinstance(one, Inference)])
+        update_together([one for one in wanted if isinstance(one, Update)])
+        wanted = [one for lane in lanes if lane.waits for one in lane.advance()]
+
+
+def hand_over(result: FrameResult, sinks: Sequence[Sink], timer: StageTimer) -> None:
+    """Give a result to sinks, in their order; the times of their stages are added to it."""
+    for sink in sinks:
+        if sink.stage is None:
+            sink.take(result)
+            continue
+        with timer.stage(sink.stage):
+            sink.take(result)
+        result.ms.update(timer.take())
 
 
 def _truths(frame: Frame, predictions: Mapping[str, Prediction]) -> dict[str, NDArray[np.float32] | None]:

@@ -33,6 +33,11 @@ class SumMetric(Metric):
         """True: sums that were loaded or merged are as good as updated ones, and no frame gives NaN."""
         return True
 
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(self._defaults)
+
     def add_count(self, name: str, *shape: int) -> None:
         """Add an int64 state of zeros."""
         self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum", persistent=True)
@@ -41,11 +46,11 @@ class SumMetric(Metric):
         """Add a float64 state of zeros."""
         self.add_state(name, torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum", persistent=True)
 
-    def add(self, **sums: Tensor) -> None:
+    def add(self, **sums: Tensor | float) -> None:
         """Add to the states by name; the states are exchanged, never changed in place."""
         for name, value in sums.items():
             state: Tensor = getattr(self, name)
-            setattr(self, name, state + value.to(state.device))
+            setattr(self, name, state + (value.to(state.device) if isinstance(value, Tensor) else value))
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
         """Add another metric's sums to this one's.

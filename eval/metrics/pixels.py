@@ -53,10 +53,9 @@ def select_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid:
     usable = truth & torch.isfinite(depth)
     if variance is not None:
         usable = usable & torch.isfinite(variance) & (variance >= 0)
-    everywhere = bool(usable.all())  # as when SequenceMetrics has chosen already: nothing to copy
 
     def chosen(value: Tensor) -> Tensor:
-        return (value.detach().flatten() if everywhere else value.detach()[usable]).double()
+        return value.detach()[usable].double()
 
     d = chosen(depth)
     return Pixels(d, d.new_zeros(0) if variance is None else chosen(variance), chosen(target), truth.sum())

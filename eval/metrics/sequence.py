@@ -12,7 +12,8 @@ from ufmstar_torch.eval.metrics.accuracy import RMSE, AbsRel, Delta1
 from ufmstar_torch.eval.metrics.base import SumMetric
 from ufmstar_torch.eval.metrics.calibration import ECEDelta, ECEQuantile
 from ufmstar_torch.eval.metrics.likelihood import NLL, EntropyHistogram
-from ufmstar_torch.eval.metrics.pixels import check_maps, truth_mask
+from ufmstar_torch.eval.metrics.one_pass import add_in_one_pass
+from ufmstar_torch.eval.metrics.pixels import check_maps
 from ufmstar_torch.eval.metrics.ranking import Sparsification, SpearmanCorrelation
 
 OURS, AUTHORS = "ours", "authors"
@@ -65,15 +66,12 @@ class SequenceMetrics(nn.Module):
             ValueError: shapes or types disagree, or a needed variance is missing.
         """
         check_maps(depth, variance, target, valid)
-        truth = truth_mask(target, valid)
-        # Once for all metrics; float64 here saves each of them its own conversion.
-        d, g = depth[truth].double(), target[truth].double()
-        v = None if variance is None else variance[truth].double()
-        for metric in self._all():
-            if isinstance(metric, EntropyHistogram):
+        on_cpu = all(value.is_cpu for value in (depth, variance, target, valid) if value is not None)
+        if on_cpu and all(metric.device.type == "cpu" for metric in self._all()):
+            add_in_one_pass(dict(self.metrics.items()), depth, variance, target, valid)
+        else:
+            for metric in self._all():
                 metric.update(depth, variance, target, valid)
-            else:
-                metric.update(d, v, g)
 
     def compute(self) -> dict[str, float]:
         """The scalar figures by name: delta1, delta1_ratio, abs_rel, rmse [m], nll, ece_delta, ece_q, ...
@@ -85,6 +83,11 @@ class SequenceMetrics(nn.Module):
     def curves(self) -> dict[str, list[float]]:
         """The curves and histograms by name, for plots and JSON."""
         return {name: value.tolist() for name, value in self._results().items() if value.dim() > 0}
+
+    def sums(self) -> dict[str, Tensor]:
+        """``state_dict`` without copies: updates exchange the sums, they change none in place."""
+        named = ((kind, metric) for kind, metric in self.metrics.items() if isinstance(metric, SumMetric))
+        return {f"metrics.{kind}.{name}": getattr(metric, name) for kind, metric in named for name in metric.states}
 
     def merge_state(self, other: SequenceMetrics) -> None:
         """Add the sums of another part of the same sequence.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.results.files import write_atomic
 
-# Depth and uncertainty get different maps, so that nobody takes one picture for the other.
+# Depth and uncertainty get different maps, so that the two pictures cannot be confused.
 DEPTH_MAP = "viridis"
 ERROR_MAP = "magma"
 INK, FAINT = "#1a1a1a", "#6b6b6b"  # of words

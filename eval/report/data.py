@@ -232,7 +232,7 @@ def _check(out: Path, about: Mapping[str, Any], paths: Sequence[Path], records: 
     seen: dict[tuple[str, str, Row], Path] = {}
     for path, record in zip(paths, records, strict=True):
         if record.suite != about["suite"]:
-            raise ResultsError(f"{path} is of the suite {record.suite!r}, not of {about['suite']!r} as eval.json says")
+            raise ResultsError(f"{path} is of the suite {record.suite!r}, not of {about['suite']!r} as eval.json")
         base = Method.parse(record.method).base
         network, first = networks.setdefault(base, (record.network, path))
         if network != record.network:

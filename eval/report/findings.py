@@ -24,7 +24,7 @@ from ufmstar_torch.eval.report.names import DELTA1, DIFFERENCES, ECE_DELTA, ECE_
 from ufmstar_torch.eval.report.table import number
 
 BETTER, WORSE, OPEN, UNDECIDED = "better", "worse", "open", "no verdict"
-# Where accuracy is below it, calibration says little (the paper's own caveat) [share of pixels].
+# Where accuracy is below it, calibration means little (the paper's own caveat) [share of pixels].
 POOR_ACCURACY = 0.5
 # Where more pixels than that have no NLL, its mean is no longer that of the method [share].
 MANY_LEFT_OUT = 0.01
@@ -130,7 +130,7 @@ def caveats(results: Results) -> list[str]:
         if accuracy < POOR_ACCURACY:
             notes.append(
                 f"On {dataset} only {100 * accuracy:.0f} % of the pixels lie within 25 % of the truth (δ₁). Where "
-                "accuracy is that poor, calibration says little, as the paper notes; look at the entropy there."
+                "accuracy is that poor, calibration means little, as the paper notes; look at the entropy there."
             )
     notes += _left_out(results)
     missing = results.about.get("missing_bases") or []
@@ -165,7 +165,7 @@ def _tally(name: str, made: Sequence[PairedComparison]) -> str:
         on = "a single sequence" if fewest == 1 else f"{fewest} sequences"
         return f"{about}: the better value in {lower}, on {on}, which decides nothing."
     counts = f"better in {verdicts.count(BETTER)}, worse in {verdicts.count(WORSE)}"
-    # A mean over networks, for a reader who wants one number.
+    # A mean over networks, as one number.
     changes = [_mean_change(of_figure) for q in QUALITY if (of_figure := [c for c in judged if c.quantity is q])]
     return f"{about}: {counts}, undecided in {verdicts.count(OPEN)}. On average {join(changes)}."
 

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.report.names import LOWER, Quantity
 from ufmstar_torch.eval.results.record import Record
 
 # With fewer sequences there is neither an interval nor a verdict: Student's interval of two to four values claims a
-# normal distribution that nobody has checked.
+# normal distribution, which was not checked.
 MIN_SEQUENCES = 5
 
 

@@ -255,7 +255,7 @@ def _nll_note(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quan
     if not shown or max((nll for nll in values if nll is not None), default=0.0) < NLL_OF_FEW:
         return ""
     return (
-        f"An NLL above {NLL_OF_FEW:.0f} tells of a few pixels with almost no variance and of nothing else; those with "
+        f"An NLL above {NLL_OF_FEW:.0f} is the effect of a few pixels with almost no variance; those with "
         "none at all have no NLL (their share stands among the further figures)."
     )
 

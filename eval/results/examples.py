@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.engine.estimators import Gaussians
@@ -58,7 +57,7 @@ class Examples:
 
 
 class ExampleWriter(FrameSink):
-    """A sink that writes what ``Examples`` asks for."""
+    """A sink that writes what ``Examples`` selects."""
 
     def __init__(self, examples: Examples) -> None:
         self._examples = examples
@@ -140,8 +139,7 @@ class _Schedule:
 
 def _room(estimator: Gaussians) -> dict[str, NDArray]:
     """UfM*'s mixture in the world's frame."""
-    T = estimator.ufm.T_world_first.double()
-    world = estimator.ufm.mixture.to(torch.float64).rigid(T[:, :3, :3], T[:, :3, 3])
+    world = estimator.mixture_world()
     named = {
         "mean_world": world.mean,
         "covariance_world": world.covariance,

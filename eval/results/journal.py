@@ -102,6 +102,10 @@ class Journal(FrameSink):
         self._folder.commit(self._record(result), checkpoint)
         self._saving = 1000 * (perf_counter() - before)
 
+    def end(self) -> None:
+        """Store the last state, before pictures are drawn."""
+        self._folder.store()
+
     def _record(self, result: FrameResult) -> dict[str, Any]:
         """The frame's line of frames.jsonl."""
         about = {"index": result.index, "name": result.name}
@@ -173,7 +177,7 @@ def _anchor_figures(row: RowFrame) -> dict[str, Any]:
     """Of a run with anchors: what became of the frame's corners, and the means of B [m^2] and of r.
 
     ``tracked`` were followed from the frame before, of which ``found`` were triangulated; ``usable`` lie on a pixel
-    with a depth, and ``used`` agree with others. Without any used, ``without`` says why. Of a map of landmarks,
+    with a depth, and ``used`` agree with others. Without any used, ``without`` is the reason. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
     anchors, estimate = row.anchors, row.estimate

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.machine import available_cores
 from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerContext, failures, run_job
@@ -150,7 +150,7 @@ def evaluate_suite(
     stop: Stop,
     report: Report,
     progress: Callable[[str, int, int], None],
-    evaluate: Evaluate = evaluate_sequence,
+    evaluate: Evaluate = evaluate_sequences,
 ) -> EvalOutcome:
     """Evaluate a job.
 
@@ -160,7 +160,7 @@ def evaluate_suite(
         stop: asked before every frame.
         report: receives a line when a sequence is finished.
         progress: see ``WorkerContext``; of this process's own work.
-        evaluate: of this process's own work; see ``evaluate_sequence``.
+        evaluate: of this process's own work; see ``evaluate_sequences``.
 
     Raises:
         FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
@@ -308,7 +308,7 @@ class _Process:
 
 @dataclass
 class _ClusterJob:
-    """A job of submitit, which nobody waits for once it is cancelled."""
+    """A job of submitit; once it is cancelled, its end is not awaited."""
 
     job: Any
     cancelled: bool = False

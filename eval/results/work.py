@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 
 from ufmstar_torch.eval.engine.anchors import landmark_digests
 from ufmstar_torch.eval.engine.confident import references
-from ufmstar_torch.eval.engine.evaluate import RowResult, SequenceError, evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowResult, SequenceTask, evaluate_sequences
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.stream import Stopped
@@ -21,19 +22,16 @@ from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.results.cache import PredictionCache
+from ufmstar_torch.eval.results.claim import Claim
 from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
 from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
 from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
-from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import read_recalibration
 
-Evaluate = Callable[..., list[RowResult]]
-# Errors of a sequence that cannot be used, raised when it is opened or evaluated. Any other error is a mistake in this
-# program, and ends it.
-_BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
+Evaluate = Callable[..., None]
 _POLL_SECONDS = 0.2
 DIED = "the process that evaluated it was killed (for want of memory?)"
 # Of a sequence of single images.
@@ -59,6 +57,7 @@ class EvalJob:
         examples: of each data set, sequences of which a few frames are stored for pictures.
         samples: passes of MC-Dropout.
         runtime, precision: of the networks (``Inference``).
+        streams: sequences that a process evaluates at the same time.
     """
 
     suite: Suite
@@ -75,6 +74,7 @@ class EvalJob:
     samples: int | None = None
     runtime: str = "auto"
     precision: str = "float32"
+    streams: int = 1
 
     @property
     def unused(self) -> tuple[str, ...]:
@@ -118,8 +118,8 @@ class EvalJob:
 
     def to_dict(self) -> dict[str, Any]:
         """The job as plain values, for another process."""
-        plain = ("missing_bases", "device", "confident", "bins", "examples", "samples", "runtime", "precision")
-        own = {name: getattr(self, name) for name in plain}
+        plain = "missing_bases device confident bins examples samples runtime precision streams"
+        own = {name: getattr(self, name) for name in plain.split()}
         return own | {
             "suite": self.suite.to_dict(),
             "networks": [asdict(choice) for choice in self.networks.values()],
@@ -158,7 +158,7 @@ class WorkerContext:
         stop: asked before every frame.
         report: receives a line when a sequence is finished.
         progress: called with a sequence's label, its number of finished frames, and the number of all of them.
-        evaluate: computes rows on a sequence; see ``evaluate_sequence``.
+        evaluate: computes rows on sequences; see ``evaluate_sequences``.
     """
 
     shard: Shard = field(default_factory=Shard)
@@ -168,7 +168,7 @@ class WorkerContext:
     stop: Callable[[], bool] = lambda: False
     report: Callable[[str], None] = lambda line: None
     progress: Callable[[str, int, int], None] = lambda label, done, total: None
-    evaluate: Evaluate = evaluate_sequence
+    evaluate: Evaluate = evaluate_sequences
 
 
 def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext) -> bool:
@@ -188,104 +188,153 @@ def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource
         CacheError, OSError: nothing can be written.
     """
     context = replace(context, launch=context.launch or f"{os.getpid()} {time.time_ns()}")
-    worker = _Worker(job, folder, networks, context, PredictionCache(job.cache or job.out / CACHE))
+    worker = _Worker(job, folder, networks, context)
+    cache = PredictionCache(job.cache or job.out / CACHE)
+    judge = Judge(networks, torch.device(job.device), cache, job.frames, job.confident, job.bins, job.streams)
     own = context.shard.of(job.items)
     queue = [*own, *(item for item in job.items if context.helps and item not in own)]
-    while queue:
-        taken: list[WorkItem] = []
-        for item in queue:
-            if context.stop():
-                return False
-            claim = folder.claim(item, context.launch)
-            if claim is None:
-                taken.append(item)
-                continue
-            with claim:
-                try:
-                    worker.finish(item, died=claim.died)
-                except Stopped:
-                    return False
-        queue = taken if context.waits else []
-        if queue:
-            time.sleep(_POLL_SECONDS)
-        elif taken and not context.helps:
-            context.report(f"left to another process that is at it: {', '.join(item.label for item in taken)}")
+    try:
+        while queue:
+            taken: list[WorkItem] = []
+            context.evaluate(worker.tasks(queue, taken), judge, worker.finish, stop=context.stop)
+            queue = taken if context.waits else []
+            if queue:
+                time.sleep(_POLL_SECONDS)
+            elif taken and not context.helps:
+                context.report(f"left to another process that is at it: {', '.join(item.label for item in taken)}")
+    except Stopped:
+        return False
+    finally:
+        worker.release()
     return True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class _InHand:
+    """A sequence that is evaluated.
+
+    Attributes:
+        item, claim: which, and the claim to it.
+        digest, landmarks: what its rows are computed from.
+        missing: rows to store.
+        left_out: those of them that cannot be had of this sequence, and why.
+        started: [s] ``time.monotonic``.
+    """
+
+    item: WorkItem
+    claim: Claim
+    digest: str
+    landmarks: Mapping[str, str]
+    missing: Sequence[Row]
+    left_out: Sequence[Row]
+    why: str
+    started: float
+
+
 class _Worker:
     """One process at its work; see ``run_job``."""
 
-    job: EvalJob
-    folder: EvalFolder
-    networks: Mapping[str, DepthSource]
-    context: WorkerContext
-    cache: PredictionCache
+    def __init__(
+        self, job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext
+    ) -> None:
+        self.job, self.folder, self.networks, self.context = job, folder, networks, context
+        self._in_hand: dict[SequenceTask, _InHand] = {}
 
-    def finish(self, item: WorkItem, *, died: bool) -> None:
-        """Compute and store the missing rows of a sequence, or the reason why they cannot be had."""
+    def tasks(self, queue: Iterable[WorkItem], taken: list[WorkItem]) -> Iterator[SequenceTask]:
+        """Claim one sequence of the queue after another; those with rows to compute are opened.
+
+        Args:
+            queue: in this order.
+            taken: gets the sequences that another process has.
+
+        Raises:
+            Stopped: the caller asked to stop.
+            FolderError: as :func:`run_job`.
+        """
+        for item in queue:
+            if self.context.stop():
+                raise Stopped
+            claim = self.folder.claim(item, self.context.launch)
+            if claim is None:
+                taken.append(item)
+                continue
+            task = None
+            try:
+                task = self._begin(item, claim)
+            finally:
+                if task is None:
+                    claim.release()
+            if task is not None:
+                yield task
+
+    def release(self) -> None:
+        """Give up the sequences in hand."""
+        for one in self._in_hand.values():
+            one.claim.release()
+
+    def _begin(self, item: WorkItem, claim: Claim) -> SequenceTask | None:
+        """Open a sequence; None: nothing is to be computed of it."""
         failure = self.folder.failure(item)
         if failure is not None and failure.get("launch") == self.context.launch:
-            return  # of another process of this launch
+            return None  # of another process of this launch
         missing = self.folder.missing(item, self.job.suite.rows)
-        if died and missing:
+        if claim.died and missing:
             self._fail(item, DIED, missing)
-            return
+            return None
         try:
             sequence = item.open()
             digest = content_digest(sequence)
             landmarks = landmark_digests(self.job.suite.rows, sequence.folder)
-        except (*_BROKEN, OSError) as error:
+        except (*BROKEN, OSError) as error:
             self._fail(item, error, missing)
-            return
+            return None
         self.folder.require_same_sequence(item, digest, landmarks)
         posed = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
         possible = [row for row in posed if not _fitted_to(row, digest)]
         left_out = [row for row in missing if row not in possible]
-        started = time.monotonic()
-        try:
-            results = self._compute(item, sequence, missing, possible) if missing else []
-        except _BROKEN as error:
-            self._fail(item, error, missing)
-            return
-        self._store(item, digest, landmarks, [result for result in results if result.row in missing])
-        if missing:
-            frames = results[0].frames.get("done", 0) if results else 0
-            rows, seconds = len(missing) - len(left_out), time.monotonic() - started
-            self.context.report(f"{item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
-        if left_out:
-            self._fail(item, (_FITTED if sequence.posed else _NO_POSES).format(len(left_out)), left_out)
-        else:
-            self.folder.succeeded(item)
+        why = (_FITTED if sequence.posed else _NO_POSES).format(len(left_out))
+        one = _InHand(item, claim, digest, landmarks, missing, left_out, why, time.monotonic())
+        if not missing:
+            self._settle(one)
+            return None
+        todo = [row for row in missing if row in possible]
+        rows = with_references(todo, possible) if todo else missing
+        sinks = [ExampleWriter(Examples(self.folder.place(item)))] if self.job.keeps_examples(item) else []
+        task = SequenceTask(sequence, rows, sinks, partial(self.context.progress, item.label))
+        self._in_hand[task] = one
+        return task
 
-    def _compute(
-        self, item: WorkItem, sequence: FrameSequence, missing: Sequence[Row], possible: Sequence[Row]
-    ) -> list[RowResult]:
-        """Those missing rows that are possible (others need poses), and what they are judged by."""
-        job, todo = self.job, [row for row in missing if row in possible]
-        return self.context.evaluate(
-            sequence,
-            with_references(todo, possible) if todo else missing,
-            self.networks,
-            store=self.cache,
-            device=torch.device(job.device),
-            limit=job.frames,
-            sinks=[ExampleWriter(Examples(self.folder.place(item)))] if job.keeps_examples(item) else [],
-            confident=job.confident,
-            bins=job.bins,
-            stop=self.context.stop,
-            progress=lambda done, total: self.context.progress(item.label, done, total),
-        )
+    def finish(self, task: SequenceTask, outcome: list[RowResult] | Exception) -> None:
+        """Store the missing rows of a sequence, or the reason why they cannot be had."""
+        one = self._in_hand[task]
+        if isinstance(outcome, Exception):
+            self._fail(one.item, outcome, one.missing)
+        else:
+            self._store(one, [result for result in outcome if result.row in one.missing])
+            frames = outcome[0].frames.get("done", 0) if outcome else 0
+            rows, seconds = len(one.missing) - len(one.left_out), time.monotonic() - one.started
+            self.context.report(f"{one.item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
+            self._settle(one)
+        del self._in_hand[task]
+        one.claim.release()
+
+    def _settle(self, one: _InHand) -> None:
+        """All possible rows are stored."""
+        if one.left_out:
+            self._fail(one.item, one.why, one.left_out)
+        else:
+            self.folder.succeeded(one.item)
 
     def _fail(self, item: WorkItem, error: Exception | str, rows: Sequence[Row]) -> None:
         reason = " ".join(str(error).split()) or type(error).__name__
         self.folder.fail(item, reason, rows, self.context.launch)
         self.context.report(f"{item.label}: failed: {reason}")
 
-    def _store(self, item: WorkItem, digest: str, landmarks: Mapping[str, str], results: Iterable[RowResult]) -> None:
+    def _store(self, one: _InHand, results: Iterable[RowResult]) -> None:
         """Store rows with what they were computed from."""
-        common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": digest}
+        item, landmarks = one.item, one.landmarks
+        common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": one.digest}
+        many: dict[str, Any] = {"streams": self.job.streams} if self.job.streams > 1 else {}
         for result in results:
             row, network = result.row, self.networks[result.row.method.base]
             own = {"landmarks": landmarks[row.slug]} if row.slug in landmarks else {}
@@ -303,6 +352,7 @@ class _Worker:
                 ms=result.ms,
                 provenance={
                     **common,
+                    **many,
                     "network": network.digest,
                     "runtime": network.runtime,
                     "threads": torch.get_num_threads(),

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerContext, run_job
@@ -58,7 +58,7 @@ def work(
     stop: Callable[[], bool],
     report: Callable[[str], None],
     waits: bool = False,
-    evaluate: Evaluate = evaluate_sequence,
+    evaluate: Evaluate = evaluate_sequences,
 ) -> bool:
     """Take part; True when nothing is left to do.
 

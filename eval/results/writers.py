@@ -28,8 +28,10 @@ from ufmstar_torch.eval.results.files import write_atomic, write_json_atomic, wr
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
 DEPTH_UNITS = (0.001, 1 / 256, 0.01, 0.1)
 FULL = 65535
-# The PNGs compress at level 1: 4 ms at 224x224, 13 ms at 640x480. Level 6 takes 3-5 times as long for 10 % less.
+# zlib's level of the PNGs. Level 6 takes 3-5 times as long for 10 % less. One filter for all rows, the difference to
+# the row above, takes six tenths of the time of a choice for every row, and the files are as large.
 PNG_LEVEL = 1
+_AFTER_HEADER = 33  # bytes: signature and IHDR
 
 
 @dataclass(frozen=True)
@@ -203,19 +205,24 @@ def encode_length_png(
     Returns:
         (the file's content, the number of saturated pixels).
     """
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
+    import cv2
+    from PIL.PngImagePlugin import PngInfo, putchunk
 
-    usable = valid & np.isfinite(values) & (values >= 0)
+    usable = valid & (values >= 0) & (values < np.inf)
     counts = np.rint(np.where(usable, values, 0).astype(np.float64) / unit)
-    saturated = int((counts > FULL).sum())
+    saturated = int(np.count_nonzero(counts > FULL))
     # Clipped in float64: a cast of larger values to 16 bits would wrap around.
     coded = np.where(usable, np.clip(counts, 1, FULL), 0).astype(np.uint16)
+    how = (cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP)
+    pixels = cv2.imencode(".png", coded, how)[1].tobytes()
     text, content = PngInfo(), io.BytesIO()
     entries = {"depth_scale": repr(float(unit)), "unit": "metres per count", "quantity": quantity}
     for key, value in {**entries, "invalid": "0", "saturated": str(saturated)}.items():
         text.add_text(key, value)
-    Image.fromarray(coded).save(content, format="PNG", pnginfo=text, compress_level=PNG_LEVEL)
+    content.write(pixels[:_AFTER_HEADER])
+    for chunk in text.chunks:
+        putchunk(content, *chunk[:2])
+    content.write(pixels[_AFTER_HEADER:])
     return content.getvalue(), saturated
 
 
@@ -275,4 +282,4 @@ def _float_map(value: Any, name: str) -> NDArray[np.float32]:
     array = _array(value)
     if array.ndim != 2 or not np.issubdtype(array.dtype, np.floating):
         raise ValueError(f"{name} must be a floating-point map [H, W], got {array.dtype} {array.shape}")
-    return array.astype(np.float32)
+    return array.astype(np.float32, copy=False)

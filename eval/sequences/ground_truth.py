@@ -9,6 +9,8 @@ cameras out as well). A depth along the optical axis keeps its value from one su
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,14 +36,31 @@ def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size
     Returns:
         [h, w, ...] of the same type; 0 (False) where the first camera does not look.
     """
-    mapping = K_from @ np.linalg.inv(K_to)
-    v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64)
-    column = np.floor(mapping[0, 0] * u + mapping[0, 1] * v + mapping[0, 2] + 0.5 + _BORDER).astype(np.intp)
-    row = np.floor(mapping[1, 1] * v + mapping[1, 2] + 0.5 + _BORDER).astype(np.intp)
-    height, width = values.shape[:2]
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-    result = values[row.clip(0, height - 1), column.clip(0, width - 1)]
+    mapping = np.asarray(K_from @ np.linalg.inv(K_to), np.float64)
+    source, inside = _source(mapping.tobytes(), values.shape[:2], size)
+    result = values.reshape(-1, *values.shape[2:])[source]
+    if inside is None:
+        return result
     return np.where(inside.reshape(*size, *[1] * (values.ndim - 2)), result, np.zeros((), values.dtype))
+
+
+@lru_cache(maxsize=16)
+def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.intp], NDArray[np.bool_] | None]:
+    """Of every pixel [h, w] of the second camera the pixel of the first one, counted along its rows, and whether there
+    is one; None = everywhere. The same for all frames of a sequence.
+
+    Args:
+        mapping: [3, 3] float64 from pixels of the second camera to those of the first one.
+        size_from: (H, W) of the first camera.
+        size: (h, w) of the second one.
+    """
+    M = np.frombuffer(mapping).reshape(3, 3)
+    v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64)
+    column = np.floor(M[0, 0] * u + M[0, 1] * v + M[0, 2] + 0.5 + _BORDER).astype(np.intp)
+    row = np.floor(M[1, 1] * v + M[1, 2] + 0.5 + _BORDER).astype(np.intp)
+    height, width = size_from
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    return row.clip(0, height - 1) * width + column.clip(0, width - 1), None if inside.all() else inside
 
 
 def scaled_to_map(K: NDArray, image_size: Size | None, map_size: Size) -> NDArray:

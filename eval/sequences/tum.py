@@ -106,6 +106,6 @@ def _default_intrinsics(path: Path, size: Size | None) -> np.ndarray:
         if found:
             return scale_intrinsics(pinhole(*_INTRINSICS[found[1]]), _NATIVE_SIZE, size or _NATIVE_SIZE)
     raise ValueError(
-        f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt says which camera it is "
+        f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt names the camera "
         "(freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"
     )

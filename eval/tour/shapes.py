@@ -110,7 +110,7 @@ def part(
     taper: float = 1.0,
     label: str = "",
 ) -> Part:
-    """A primitive in the frame in which the caller thinks."""
+    """A primitive in the caller's frame."""
     R = np.eye(3) if rotation is None else rotation
     return Part(kind, np.asarray(centre, np.float64), np.asarray(half, np.float64), finish, R, taper, label=label)
 

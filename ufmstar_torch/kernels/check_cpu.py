@@ -7,17 +7,14 @@ rounds them.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from ufmstar_torch.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, POLAR_STEPS, FrameInput, FrameMaps
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.threads_cpu import each
-
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 
 
 def check_values(
@@ -51,7 +48,7 @@ def check_values(
     )  # fmt: skip
 
 
-@compiled
+@kernel
 def _maps(depth, mask, aleatoric, epistemic, features, fine, limits, safe, use):
     """One stream: depth where valid and else 0, which pixels are valid, and how many are beyond or out of range."""
     beyond = out_of_range = 0
@@ -82,7 +79,7 @@ def _maps(depth, mask, aleatoric, epistemic, features, fine, limits, safe, use):
     return beyond, out_of_range
 
 
-@compiled
+@kernel
 def _cameras(pose, intrinsics, height, width, tolerance, farthest, focal, steps, T, K, fault, deviation):
     """Of every stream: the pose with its nearest rotation, the intrinsics, the code of the first fault, and how far the
     rotation given is from one. An identity and a unit camera where there is a fault."""
@@ -105,13 +102,13 @@ def _cameras(pose, intrinsics, height, width, tolerance, farthest, focal, steps,
         _nearest_rotation(T[b], steps)
 
 
-@compiled
+@part
 def _gram(R, i, j):
     """Entry (i, j) of R^T R."""
     return R[0, i] * R[0, j] + R[1, i] * R[1, j] + R[2, i] * R[2, j]
 
 
-@compiled
+@part
 def _deviation(R):
     """max |R^T R - I|, NaN where an entry is."""
     most = 0.0
@@ -124,7 +121,7 @@ def _deviation(R):
     return most
 
 
-@compiled
+@part
 def _nearest_rotation(T, steps):
     """R <- R (3 I - R^T R)/2 in place, as ``camera.nearest_rotation``."""
     Q, R = np.empty((3, 3)), np.empty((3, 3))
@@ -138,7 +135,7 @@ def _nearest_rotation(T, steps):
                 T[i, j] = R[i, 0] * Q[0, j] + R[i, 1] * Q[1, j] + R[i, 2] * Q[2, j]
 
 
-@compiled
+@part
 def _pose_fault(T, deviation, tolerance, farthest):
     """Code 1 to 4 or 7, 0 for none."""
     off = far = 0.0
@@ -161,7 +158,7 @@ def _pose_fault(T, deviation, tolerance, farthest):
     return 7 if far > farthest else 0
 
 
-@compiled
+@part
 def _intrinsics_fault(K, height, width, focal):
     """Code 5, 6, 8 or 9, 0 for none."""
     for i in range(3):

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
 
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 
-@compiled
+@kernel
 def matches(mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening):
     """The matched pairs of one stream, as :func:`ufmstar_torch.correspond.correspond` states them.
 
@@ -44,13 +42,13 @@ def matches(mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, 
     return c[:pairs], k[:pairs], beta[:pairs]
 
 
-@compiled
+@part
 def _limit(eta):
     """Of the squared distance from which on the overlap is certainly below eta, with room for rounding."""
     return -8 * math.log(eta) * (1 + 1e-9) + 1e-9
 
 
-@compiled
+@part
 def _longer(values):
     out = np.empty(2 * values.size, values.dtype)
     for i in range(values.size):
@@ -58,7 +56,7 @@ def _longer(values):
     return out
 
 
-@compiled
+@part
 def _hidden(image, members, n, a, eta_occl, limit):
     """Whether a nearer member covers member ``a``."""
     far = image[members[a]]
@@ -69,7 +67,7 @@ def _hidden(image, members, n, a, eta_occl, limit):
     return False
 
 
-@compiled
+@part
 def _project(mean, covariance, weight, K, height, width, near, widening):
     """Indices of the candidates, and per candidate u, v, the covariance's xx, xy, yy, and the depth."""
     index = np.empty(weight.size, np.int64)
@@ -94,14 +92,14 @@ def _project(mean, covariance, weight, K, height, width, near, widening):
     return index[:n], image[:n]
 
 
-@compiled
+@part
 def _far(p, q, limit):
     """Whether two projected Gaussians are too far apart: d^T S^-1 d >= d_x^2 / S_xx, S their mean covariance."""
     dx, dy = p[0] - q[0], p[1] - q[1]
     return dx * dx > limit * 0.5 * (p[2] + q[2]) or dy * dy > limit * 0.5 * (p[4] + q[4])
 
 
-@compiled
+@part
 def _bhattacharyya(p, q):
     """Overlap of two projected Gaussians."""
     xx, xy, yy = 0.5 * (p[2] + q[2]), 0.5 * (p[3] + q[3]), 0.5 * (p[4] + q[4])

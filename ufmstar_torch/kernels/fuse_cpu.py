@@ -7,18 +7,16 @@ function notices edits in its own file only.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
 
-compiled: Any = njit(cache=True, nogil=True)
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
 
 
-@compiled
+@part
 def cholesky3(S, L):
     """Lower Cholesky factor of positive semidefinite S, written to L (upper part zero)."""
     negligible = _NEGLIGIBLE * max(S[0, 0], S[1, 1], S[2, 2])
@@ -38,7 +36,7 @@ def cholesky3(S, L):
             L[r, j] = value / root
 
 
-@compiled
+@part
 def _angle(alpha, beta, gamma):
     """Cosine and sine of the smaller rotation that annihilates gamma in [[alpha, gamma], [gamma, beta]]."""
     zeta = (beta - alpha) / (2 * gamma)
@@ -47,7 +45,7 @@ def _angle(alpha, beta, gamma):
     return c, c * t
 
 
-@compiled
+@part
 def right_singular(M, V, s):
     """Singular values s and right singular vectors V of M by one-sided Jacobi; M is overwritten with U diag(s)."""
     V[:] = 0.0
@@ -73,7 +71,7 @@ def right_singular(M, V, s):
         s[j] = math.sqrt(M[0, j] ** 2 + M[1, j] ** 2 + M[2, j] ** 2)
 
 
-@compiled
+@part
 def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
     """Move (mean_a, cov_a) by ``lam`` towards b in place; return W2^2 between the two as they were.
 
@@ -114,7 +112,7 @@ def geodesic(mean_a, cov_a, mean_b, cov_b, lam, work):
     return distance
 
 
-@compiled
+@part
 def _exceeds(S, floor):
     """Whether every eigenvalue of S is certainly above ``floor``: S - floor I has a Cholesky factor.
 
@@ -132,7 +130,7 @@ def _exceeds(S, floor):
     return S[2, 2] - floor - least - l20 * S[2, 0] - c * c / b > least
 
 
-@compiled
+@part
 def floor_covariance(covariance, floor):
     """Lift the eigenvalues of every positive semidefinite covariance [N, 3, 3] to floor [N], in place."""
     M, V, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -155,7 +153,7 @@ def floor_covariance(covariance, floor):
                 S[j, i] = value
 
 
-@compiled
+@kernel
 def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance_out):
     """Write the covariances of occupied slots with the floor that a segment needs (``step``): the variance across one
     pixel, and ``epsilon`` times the trace for storage."""
@@ -172,7 +170,7 @@ def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance
         floor_covariance(covariance_out[n : n + 1], least)
 
 
-@compiled
+@kernel
 def fuse_pairs(
     mean, covariance, weight, disagreement, count, features,
     mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon, changed,
@@ -210,7 +208,7 @@ def fuse_pairs(
         count[k] += 1
 
 
-@compiled
+@kernel
 def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_c, weight_c, features_c, new, occupied):
     """Add the components c where ``new`` [C] from slot ``occupied`` on, in place; return how many found no free one."""
     slot = occupied

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.mixture import GaussianMixture
-
-compiled: Any = njit(cache=True, nogil=True)
 
 _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -50,7 +47,7 @@ def _arrays(mixture: GaussianMixture) -> list[np.ndarray]:
     return [v.detach().double().contiguous().numpy() for v in (mixture.mean, mixture.covariance, mixture.weight)]
 
 
-@compiled
+@part
 def _log_det(S):
     p0 = S[0, 0]
     u, v = S[1, 0] / p0, S[2, 0] / p0
@@ -59,7 +56,7 @@ def _log_det(S):
     return math.log(p0 * p1 * (S[2, 2] - v * S[2, 0] - w * w / p1))
 
 
-@compiled
+@part
 def _joint(a, b, mean_a, mean_b, cov_a, cov_b, S):
     """Common covariance of two components with the shares a and b."""
     for r in range(3):
@@ -68,7 +65,7 @@ def _joint(a, b, mean_a, mean_b, cov_a, cov_b, S):
             S[r, c] = a * cov_a[r, c] + b * cov_b[r, c] + between
 
 
-@compiled
+@part
 def _loss(i, j, mean, covariance, weight, compared, log_det, reach, S):
     """l(i, j) [nat]; infinite where it exceeds every limit of interest, or where the two may not join.
 
@@ -88,7 +85,7 @@ def _loss(i, j, mean, covariance, weight, compared, log_det, reach, S):
     return 0.5 * (_log_det(S) - a * log_det[i] - b * log_det[j]) / min(a, b)
 
 
-@compiled
+@kernel
 def _partition(mean, covariance, weight, compared, limit):
     """The slot that each component joins. Kept is a list of the pairs whose loss is within the limit."""
     n = weight.size
@@ -145,7 +142,7 @@ def _partition(mean, covariance, weight, compared, limit):
     return into
 
 
-@compiled
+@kernel
 def _own_shares(mean, covariance, weight, prior_weight):
     """s_k of occupied components."""
     n = weight.size

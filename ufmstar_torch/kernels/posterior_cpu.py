@@ -1,184 +1,303 @@
-"""The posterior's field, distances and maps on the CPU (numba), float64, one stream after the other.
+"""The posterior on the CPU: the reference's update, one stream after the other, float64, without torch.
 
-The precision of a field on C columns has a band of C + 1: its Cholesky factor fills it, and the inverse within the band
-follows from the factor alone (Takahashi's equations), so that all marginal variances cost what the factor does.
+What takes time is compiled (``field_cpu``, ``cells_cpu``); what is left are a few operations on the anchors.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.posterior.field import Solved
-from ufmstar_torch.posterior.read import ALIKE, LARGEST_LOG
+from ufmstar_torch.anchors.given import AnchorInput
+from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.kernels.cells_cpu import cell_means, features, ranges, read
+from ufmstar_torch.kernels.field_cpu import Field, Floats, Observed, Prior, at, distance, given
+from ufmstar_torch.kernels.threads_cpu import each
+from ufmstar_torch.posterior.model import FEATURES, GLOBALS, MODEL
+from ufmstar_torch.posterior.running import RATIOS
+from ufmstar_torch.posterior.update import Posterior
 
-compiled: Any = njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-# Distances are compared with infinity, which fast arithmetic leaves undefined.
-exactly: Any = njit(cache=True, nogil=True, error_model="numpy")
-
-
-def solve(diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: int) -> Solved:
-    """As :func:`ufmstar_torch.posterior.field.solve`, for CPU tensors."""
-    solved, variance = columns.clone(memory_format=torch.contiguous_format), torch.empty_like(diagonal)
-    maps = (x.contiguous().numpy() for x in (diagonal, right, down))
-    for d, r, b, x, v in zip(*maps, solved.numpy(), variance.numpy(), strict=True):
-        factor = np.zeros((len(d), cols + 1))
-        _factorise(d, r, b, cols, factor)
-        _substitute(factor, x)
-        _invert(factor, v)
-    return Solved(solved, variance)
+_VALUE, _WEIGHT, _LEAST, _LARGEST = np.array(list(RATIOS.values())).T
+_NAMES = {name: i for i, name in enumerate(RATIOS)}
 
 
-@compiled
-def _factorise(diagonal, right, down, cols, L):
-    """L[j, k] is the factor's entry in column j and row j + k."""
-    n = len(diagonal)
-    for i in range(n):
-        L[i, 0] += diagonal[i]
-        if (i + 1) % cols:
-            L[i, 0] += right[i]
-            L[i + 1, 0] += right[i]
-            L[i, 1] -= right[i]
-        if i + cols < n:
-            L[i, 0] += down[i]
-            L[i + cols, 0] += down[i]
-            L[i, cols] -= down[i]
-    for j in range(n):
-        pivot, last = 1 / np.sqrt(L[j, 0]), min(cols, n - 1 - j)
-        for k in range(last + 1):
-            L[j, k] *= pivot
-        for k in range(1, last + 1):
-            factor, row = L[j, k], L[j + k]
-            for m in range(k, last + 1):
-                row[m - k] -= L[j, m] * factor
+def update(
+    packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor
+) -> tuple[Tensor, Posterior]:  # fmt: skip
+    """As :func:`ufmstar_torch.posterior.update.update`, for CPU tensors."""
+    maps = [x.detach().contiguous().numpy() for x in (packed.double(), frame.depth, frame.valid, claimed)]
+    streams = zip(*maps, _anchors(anchors, len(packed)), strict=True)
+    results = each(_of_stream, list(streams))
+    kept, depth, variance = (np.stack([result[i] for result in results]) for i in range(3))
+    sums = [_Running.of(row) for row in kept]
+    calibration = [r.ratios["calibration"] if r.below[_NAMES["calibration"]] > 0 else np.nan for r in sums]
+    unseen = [r.growth for r in sums]
+    outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen))]
+    return torch.from_numpy(kept).to(packed.dtype), Posterior(*outputs)
 
 
-@compiled
-def _substitute(L, X):
-    """X [n, q] becomes A^-1 X."""
-    n, q = X.shape
-    cols = L.shape[1] - 1
-    for j in range(n):
-        x, pivot = X[j], 1 / L[j, 0]
-        for c in range(q):
-            x[c] *= pivot
-        for k in range(1, min(cols, n - 1 - j) + 1):
-            factor, y = L[j, k], X[j + k]
-            for c in range(q):
-                y[c] -= factor * x[c]
-    for j in range(n - 1, -1, -1):
-        x, pivot = X[j], 1 / L[j, 0]
-        for k in range(1, min(cols, n - 1 - j) + 1):
-            factor, y = L[j, k], X[j + k]
-            for c in range(q):
-                x[c] -= factor * y[c]
-        for c in range(q):
-            x[c] *= pivot
+class _Anchors(NamedTuple):
+    """The valid ones of one stream."""
+
+    pixel: Floats
+    at_pixel: NDArray[np.int64]
+    predicted: Floats
+    depth: Floats
+    variance: Floats
 
 
-@compiled
-def _invert(L, variance):
-    """Diagonal of A^-1. S[j, k] is the inverse's entry (j, j + k)."""
-    n, band = L.shape
-    S, scaled, out = np.zeros((n, band)), np.empty(band), np.empty(band)
-    for j in range(n - 1, -1, -1):
-        pivot, last = 1 / L[j, 0], min(band - 1, n - 1 - j)
-        for k in range(1, last + 1):
-            scaled[k] = L[j, k] * pivot
-            out[k] = 0.0
-        for m in range(1, last + 1):
-            row, factor = S[j + m], scaled[m]
-            along = row[0] * factor
-            for k in range(m + 1, last + 1):
-                out[k] += row[k - m] * factor
-                along += row[k - m] * scaled[k]
-            out[m] += along
-        own = pivot * pivot
-        for k in range(1, last + 1):
-            S[j, k] = -out[k]
-            own += out[k] * scaled[k]
-        S[j, 0] = own
-        variance[j] = own
+_NONE = _Anchors(np.empty((0, 2)), np.empty(0, np.int64), *(np.empty(0) for _ in range(3)))
 
 
-def distance(source: Tensor, right: Tensor, down: Tensor, cols: int, limit: float) -> Tensor:
-    """As :func:`ufmstar_torch.posterior.distance.distance`, for CPU tensors."""
-    way = torch.where(source, 0.0, right.new_tensor(limit))
-    for w, r, d in zip(way.numpy(), right.contiguous().numpy(), down.contiguous().numpy(), strict=True):
-        _sweep(w, r, d, cols)
-    return way
+def _anchors(anchors: AnchorInput | None, streams: int) -> list[_Anchors | None]:
+    if anchors is None:
+        return [None] * streams
+    fields = (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)
+    used = anchors.valid.numpy()
+    return [_Anchors(*(x[b].numpy()[used[b]] for x in fields)) for b in range(streams)]
 
 
-@exactly
-def _sweep(way, right, down, cols):
-    """Sweeps forth and back until nothing gets shorter."""
-    n, shorter = len(way), True
-    while shorter:
-        shorter = False
-        for i in range(n):
-            best = way[i]
-            if i % cols and way[i - 1] + right[i - 1] < best:
-                best = way[i - 1] + right[i - 1]
-            if i >= cols and way[i - cols] + down[i - cols] < best:
-                best = way[i - cols] + down[i - cols]
-            shorter = shorter or best < way[i]
-            way[i] = best
-        for i in range(n - 1, -1, -1):
-            best = way[i]
-            if (i + 1) % cols and way[i + 1] + right[i] < best:
-                best = way[i + 1] + right[i]
-            if i + cols < n and way[i + cols] + down[i] < best:
-                best = way[i + cols] + down[i]
-            shorter = shorter or best < way[i]
-            way[i] = best
+class _Running(NamedTuple):
+    """One stream's :class:`ufmstar_torch.posterior.running.Running`."""
+
+    frames: float
+    mean: float
+    above: Floats
+    below: Floats
+    coefficients: Floats
+    covariance: Floats
+    ratios: dict[str, float]
+
+    @classmethod
+    def of(cls, packed: Floats) -> _Running:
+        n = len(RATIOS)
+        above, below = packed[2 : 2 + n], packed[2 + n : 2 + 2 * n]
+        b, covariance = packed[2 + 2 * n :][:GLOBALS], packed[2 + 2 * n + GLOBALS :].reshape(GLOBALS, GLOBALS)
+        if packed[0] == 0:
+            above, below, covariance = _VALUE * _WEIGHT, _WEIGHT, np.diag(MODEL.prior) ** 2
+        ratios = np.where(below > 0, above / np.maximum(below, 1e-12), _VALUE).clip(_LEAST, _LARGEST)
+        return cls(packed[0], packed[1], above, below, b, covariance, dict(zip(RATIOS, ratios.tolist(), strict=True)))
+
+    @property
+    def growth(self) -> float:
+        return MODEL.growth + self.ratios["unseen"]
+
+    def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
+        above, below = np.array([sums[name] for name in RATIOS]).T
+        n = MODEL.memory * self.below + (1 - MODEL.memory) * _WEIGHT + below
+        total = MODEL.memory * self.above + (1 - MODEL.memory) * _WEIGHT * _VALUE + above
+        return np.minimum(np.maximum(total, _LEAST * n), _LARGEST * n), n
+
+    def expected(self, mean: float) -> tuple[Floats, Floats]:
+        T = np.eye(GLOBALS)
+        T[0, 1] = mean - self.mean if self.frames else 0.0
+        walked, prior = T @ self.covariance @ T.T, np.square(MODEL.prior)
+        if self.frames:
+            walked = walked + np.diag(np.square(MODEL.drift) * (1 - walked.diagonal() / prior).clip(0, 1))
+        return T @ self.coefficients, walked
 
 
-def read(
-    depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
-    size: tuple[int, int],
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """As :func:`ufmstar_torch.posterior.read.read`, for CPU tensors."""
-    logs = torch.where(valid, depth, torch.ones_like(depth)).log()
-    y, spread = torch.empty_like(logs), torch.empty_like(logs)
-    maps = (x.detach().contiguous().numpy() for x in (depth, logs, claimed, nodes, coefficients))
-    for d, g, c, at, b, m, out, var in zip(*maps, mean.tolist(), y.numpy(), spread.numpy(), strict=True):
-        _pixels(d, g, c, at, b, m, *size, ALIKE, LARGEST_LOG, out, var)
-    corrected = depth * y.exp()
-    corrected, variance = (torch.where(valid, x, torch.nan) for x in (corrected, corrected.square() * spread))
-    return corrected, variance
+class _Grid(NamedTuple):
+    """One stream's :class:`ufmstar_torch.posterior.grid.Grid`."""
+
+    rows: int
+    cols: int
+    log_depth: Floats
+    mean: float
+    right: Floats
+    down: Floats
+    far_right: Floats
+    far_down: Floats
+
+    @classmethod
+    def of(cls, log_depth: Floats, rows: int, cols: int) -> _Grid:
+        across, along = np.full((2, rows, cols), np.inf)
+        across[:, :-1] = np.abs(np.diff(log_depth.reshape(rows, cols), axis=1))
+        along[:-1] = np.abs(np.diff(log_depth.reshape(rows, cols), axis=0))
+        edges = across.ravel(), along.ravel()
+        right, down = (MODEL.flat + MODEL.edge * x**2 for x in edges)
+        climbs = (MODEL.climb * np.maximum(x - MODEL.smooth, 0) for x in edges)
+        far = (1 / n + climb for n, climb in zip((cols, rows), climbs, strict=True))
+        return cls(rows, cols, log_depth, float(log_depth.mean()), right, down, *far)
 
 
-@compiled
-def _pixels(depth, logs, claimed, nodes, b, mean, rows, cols, alike, largest, y, spread):
-    """y [H, W] and its variance, at every pixel."""
-    height, width = depth.shape
-    over = 1 / (alike * alike)
-    for i in range(height):
-        v = (i + 0.5) / height
-        at = min(max(v * rows - 0.5, 0.0), rows - 1.0)
-        top = min(int(at), max(rows - 2, 0))
-        below, low = at - top, min(top + 1, rows - 1)
-        for j in range(width):
-            u = (j + 0.5) / width
-            at = min(max(u * cols - 0.5, 0.0), cols - 1.0)
-            left = min(int(at), max(cols - 2, 0))
-            beside, far = at - left, min(left + 1, cols - 1)
-            g, total, offset, variance, unseen = logs[i, j], 0.0, 0.0, 0.0, 0.0
-            for corner in range(4):
-                row = low if corner > 1 else top
-                column = far if corner % 2 else left
-                share = (below if corner > 1 else 1 - below) * (beside if corner % 2 else 1 - beside)
-                node = nodes[row * cols + column]
-                apart = g - node[0]
-                weight = share / (1 + apart * apart * over)
-                total += weight
-                offset += weight * node[1]
-                variance += weight * node[2]
-                unseen += weight * node[3]
-            value = b[0] + b[1] * (g - mean) + b[2] * (2 * u - 1) + b[3] * (2 * v - 1) + offset / total
-            y[i, j] = min(max(value, -largest), largest)
-            spread[i, j] = (variance + unseen * claimed[i, j] / (depth[i, j] * depth[i, j])) / total
+class _Scene(NamedTuple):
+    """The reference's ``_Scene`` of one stream, without padding."""
+
+    grid: _Grid
+    prior: Prior
+    observed: Observed
+    stated: Floats
+    other: Floats
+
+    def counted(self, values: Floats) -> Floats:
+        node = self.observed.node
+        summed: Floats = np.bincount(node, values, len(self.grid.log_depth)).astype(np.float64)
+        return summed[node]
+
+    def believed(self, near: _Near) -> Floats:
+        return 1 / (1 + near.noise / MODEL.weak**2)
+
+
+class _Near(NamedTuple):
+    """The reference's ``_Near`` of one stream."""
+
+    noise: Floats
+    left_out: Floats
+    total: Floats
+
+
+def _of_stream(
+    packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any], given_: _Anchors | None
+) -> tuple[Floats, NDArray[Any], NDArray[Any]]:
+    """What is known after the frame; depth and variance."""
+    running, anchors = _Running.of(packed), _NONE if given_ is None else given_
+    some = len(anchors.depth) > 0
+    if given_ is None and not running.frames:
+        return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed
+    with np.errstate(all="ignore"):  # what is not valid is not read
+        logs = np.log(depth)
+    rows, cols = (min(MODEL.side, n) for n in depth.shape)
+    grid = _Grid.of(cell_means(logs, valid, rows, cols), rows, cols)
+    scene = _scene(grid, depth, valid, anchors, running)
+    field, weight, near = _fitted(scene)
+    away = _away(scene, weight * MODEL.evidence**2 >= 1)
+    kept = _learnt(scene, field, weight, near, _relative(claimed, anchors), running) if some else packed
+    node = np.arange(rows * cols)
+    x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows, MODEL.hats)
+    mean, variance = at(field, node, x)
+    b = field.coefficients[:GLOBALS]
+    variance = MODEL.inflation * _local(scene, near) * (variance + running.ratios["roughness"])
+    variance, share = variance + MODEL.common + away * running.growth, np.minimum(away / MODEL.far, 1)
+    nodes = np.stack([grid.log_depth, mean - (x[:, :GLOBALS] * b).sum(1), variance, share], 1)
+    return kept, *read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), MODEL)
+
+
+def _scene(
+    grid: _Grid, depth: NDArray[Any], valid: NDArray[np.bool_], anchors: _Anchors, running: _Running
+) -> _Scene:  # fmt: skip
+    (u, v), log_depth = ((anchors.pixel + 0.5) / depth.shape[::-1]).T.copy(), np.log(anchors.predicted)
+    column, row = ((x * n).astype(np.int64).clip(0, n - 1) for x, n in ((u, grid.cols), (v, grid.rows)))
+    x = features(log_depth - grid.mean, u, v, MODEL.hats)
+    observed = Observed(row * grid.cols + column, x, np.log(anchors.depth) - log_depth)
+    stated = running.ratios["noise"] * anchors.variance / anchors.depth**2
+    other = running.ratios["roughness"] + (ranges(depth, valid, anchors.at_pixel) / 2) ** 2
+    return _Scene(grid, _prior(grid, running), observed, stated, other)
+
+
+def _prior(grid: _Grid, running: _Running) -> Prior:
+    amplitude = running.ratios["amplitude"]
+    mean, (coefficients, covariance) = np.zeros(FEATURES), running.expected(grid.mean)
+    mean[:GLOBALS] = coefficients
+    P = np.diag(np.full(FEATURES, 1 / (MODEL.hat * amplitude)))
+    P[:GLOBALS, :GLOBALS] = np.linalg.inv(covariance)
+    diagonal = np.full(len(grid.log_depth), MODEL.kappa / amplitude)
+    right, down = 1 / (grid.right * amplitude), 1 / (grid.down * amplitude)
+    return Prior(diagonal, right, down, mean, P, grid.cols)
+
+
+def _fitted(scene: _Scene) -> tuple[Field, Floats, _Near]:
+    weight = 1 / (scene.stated + scene.other)
+    for round_ in range(MODEL.rounds + 1):
+        field = given(scene.prior, scene.observed, weight)
+        mean, variance = at(field, scene.observed.node, scene.observed.features)
+        left = np.maximum(1 - weight * variance, MODEL.least_left)
+        residual, variance = (scene.observed.value - mean) / left, variance / left
+        noise = scene.other + scene.stated / _pull(-residual)
+        near = _Near(noise, residual, variance + noise)
+        if round_ < MODEL.rounds:
+            weight = (MODEL.student + 1) / (MODEL.student + residual**2 / near.total) / noise
+    return field, weight, near
+
+
+def _pull(t: Floats) -> Floats:
+    t = t.clip(MODEL.nearer, MODEL.farther)
+    small = np.abs(t) < 1e-3
+    safe = np.where(small, 1.0, t)
+    return np.where(small, 1 - 1.5 * t, -np.expm1(-safe) * np.exp(-safe) / safe)
+
+
+def _local(scene: _Scene, near: _Near) -> Floats:
+    each = scene.believed(near) / scene.counted(np.ones(len(near.noise)))
+    z2 = np.minimum(near.left_out**2 / near.total, MODEL.clip)
+    grid, reach = scene.grid, MODEL.near
+    around = np.zeros((2, grid.rows + 2 * reach, grid.cols + 2 * reach))
+    for sums, values in zip(around, (each * z2, each), strict=True):
+        nodes = np.bincount(scene.observed.node, values, grid.rows * grid.cols)
+        sums[reach:-reach, reach:-reach] = nodes.reshape(grid.rows, grid.cols)
+    around = sum(around[:, i : i + grid.rows] for i in range(2 * reach + 1))
+    around = sum(around[:, :, i : i + grid.cols] for i in range(2 * reach + 1))
+    z2, weight = around.reshape(2, -1) + MODEL.alone
+    return z2 / weight
+
+
+def _away(scene: _Scene, evidence: NDArray[np.bool_]) -> Floats:
+    grid = scene.grid
+    source = np.zeros(len(grid.log_depth), np.bool_)
+    source[scene.observed.node[evidence]] = True
+    return distance(source, grid.far_right, grid.far_down, grid.cols, MODEL.limit)
+
+
+def _relative(claimed: NDArray[Any], anchors: _Anchors) -> Floats:
+    V = claimed.ravel()[anchors.at_pixel].astype(np.float64)
+    return MODEL.claimed * np.where(np.isnan(V), 0.0, V) / anchors.predicted**2
+
+
+def _learnt(
+    scene: _Scene, field: Field, weight: Floats, near: _Near, claimed: Floats, running: _Running
+) -> Floats:  # fmt: skip
+    """Packed."""
+    above, below = running.added(
+        _of_neighbours(scene, near, running) | _of_discs(scene, weight, near, claimed, running)
+    )
+    b, covariance = field.coefficients[:GLOBALS], field.covariance[:GLOBALS, :GLOBALS]
+    return np.concatenate([[running.frames + 1, scene.grid.mean], above, below, b, covariance.ravel()])
+
+
+def _of_neighbours(scene: _Scene, near: _Near, running: _Running) -> dict[str, tuple[float, float]]:
+    square = np.minimum(near.left_out**2, MODEL.clip * near.total) / MODEL.clipped
+    excess, once = square - near.total, 1 / scene.counted(np.ones(len(square)))
+    roughness = np.full(len(square), running.ratios["roughness"])
+    sums = {}
+    for name, part in (("roughness", roughness), ("noise", scene.stated)):
+        w = once * (part / near.total) ** 2
+        unit = running.ratios[name] / np.maximum(part, 1e-12)
+        sums[name] = float((w * (part + excess) * unit).sum()), float(w.sum())
+    return sums
+
+
+def _of_discs(
+    scene: _Scene, weight: Floats, near: _Near, claimed: Floats, running: _Running
+) -> dict[str, tuple[float, float]]:
+    held = _discs(scene, running.frames)
+    rest = ~held
+    held = held & (np.count_nonzero(rest) >= MODEL.left)
+    field = given(scene.prior, scene.observed, weight * rest)
+    mean, variance = at(field, scene.observed.node[held], scene.observed.features[held])
+    away, noise = _away(scene, rest)[scene.observed.node[held]], near.noise[held]
+    tot, error = variance + noise, (scene.observed.value[held] - mean) ** 2
+    square = np.minimum(error, MODEL.clip * tot) / MODEL.clipped
+    believed = np.where(held, scene.believed(near), 0.0)
+    area, claimed = (believed / np.maximum(scene.counted(believed), 1e-12))[held], claimed[held]
+    final = MODEL.inflation * variance + noise + MODEL.common + away * running.growth
+    final = final + np.minimum(away / MODEL.far, 1) * claimed
+    sums = {
+        "amplitude": (area * (square - noise) / tot, area * variance / tot / running.ratios["amplitude"]),
+        "unseen": (area * (np.minimum(error, MODEL.square) - tot), area * away),
+        "calibration": (area * error / final, area),
+    }
+    return {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}
+
+
+def _discs(scene: _Scene, frames: float) -> NDArray[np.bool_]:
+    at_ = (scene.observed.features[:, 2:4] + 1) / 2
+    inside = np.zeros(len(at_), np.bool_)
+    for disc in range(MODEL.discs):
+        number = frames * MODEL.discs + disc + 1
+        centre = np.array([(number * step) % 1 for step in (MODEL.step_u, MODEL.step_v)])
+        inside |= ((at_ - centre) ** 2).sum(1) < MODEL.radius**2
+    return inside

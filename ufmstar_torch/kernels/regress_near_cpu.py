@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.regress_points_cpu import compiled, prepare
+from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.regress_points_cpu import prepare
 
 
-@compiled
+@kernel
 def near_image(
-    depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
+    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
     first, shares,
 ):  # fmt: skip
     """One stream, depth [H, W] into out [H, W] and out_f [F, H, W]; of the rows every ``shares``-th, from ``first``."""
@@ -19,7 +20,7 @@ def near_image(
     gaps, kept, sums = np.empty(index.size), np.empty(index.size, np.int64), np.empty(features.shape[1])
     for v in range(first, depth.shape[0], shares):
         for u in range(depth.shape[1]):
-            if valid[v, u]:
+            if depth[v, u] > 0:
                 z = np.float64(depth[v, u])
                 x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
                 out[v, u] = _point(
@@ -29,10 +30,10 @@ def near_image(
             else:
                 out[v, u] = np.nan
             for g in range(sums.size):
-                out_f[g, v, u] = sums[g] if valid[v, u] else np.nan
+                out_f[g, v, u] = sums[g] if depth[v, u] > 0 else np.nan
 
 
-@compiled
+@kernel
 def near_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f):
     """At points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not finite."""
     index, log_peak, local, extent = _components(mean, covariance, weight, sigmas)
@@ -49,7 +50,7 @@ def near_points(points, mean, covariance, weight, m, features, prior_weight, pri
             out_f[g, p] = sums[g] if finite else np.nan
 
 
-@compiled
+@part
 def _components(mean, covariance, weight, sigmas):
     """Occupied components: index, log peak density, mean and whitening [K, 9], and half the sides of their boxes."""
     index, whitening, log_peak = prepare(mean, covariance, weight)
@@ -63,7 +64,7 @@ def _components(mean, covariance, weight, sigmas):
     return index, log_peak, local, extent
 
 
-@compiled
+@part
 def _point(x, y, z, index, log_peak, local, extent, m, features, prior_weight, prior_mean, near, far, gaps, kept, sums):
     """The regression at one point; its features are left in ``sums`` [F]."""
     count, least = 0, np.inf

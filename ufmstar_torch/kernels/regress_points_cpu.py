@@ -8,21 +8,19 @@ looks only at the components whose boxes meet its own.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
 
-compiled: Any = njit(cache=True, nogil=True)
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 _LEAF = 16  # points; below that choosing components costs more than it saves
 _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 
 
-@compiled
+@part
 def prepare(mean, covariance, weight):
     """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
-    index = np.flatnonzero(weight > 0)
+    index = _occupied(weight)
     whitening = np.empty((index.size, 6))
     log_peak = np.empty(index.size)
     for i in range(index.size):
@@ -41,18 +39,17 @@ def prepare(mean, covariance, weight):
     return index, whitening, log_peak
 
 
-@compiled
-def unprojected(depth, valid, K, pixels, points):
-    """Points [P, 3] of pixels [P] in the dtype of depth [H, W] (``camera.unproject_at``); NaN where not valid."""
-    real = depth.dtype.type
-    fx, fy, cx, cy = real(K[0, 0]), real(K[1, 1]), real(K[0, 2]), real(K[1, 2])
-    for i in range(pixels.size):
-        v, u = pixels[i] // depth.shape[1], pixels[i] % depth.shape[1]
-        z = depth[v, u] if valid[v, u] else real(np.nan)
-        points[i, 0], points[i, 1], points[i, 2] = (real(u) - cx) / fx * z, (real(v) - cy) / fy * z, z
+@part
+def _occupied(weight):
+    """Indices of positive weights; ``np.flatnonzero`` takes longer to compile."""
+    index, n = np.empty(weight.size, np.int64), 0
+    for k in range(weight.size):
+        index[n] = k
+        n += weight[k] > 0
+    return index[:n]
 
 
-@compiled
+@kernel
 def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
     """Regress m [K] and features [K, F] at points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not
     finite."""
@@ -87,41 +84,7 @@ def at_points(points, mean, covariance, weight, m, features, prior_weight, prior
                 out_f[g, p] = sums[g] / evidence if known - known == 0 else np.nan
 
 
-@compiled
-def distribute_points(points, values, mean, covariance, weight, prior_weight, epsilon, out):
-    """Add values [P, C] at points [P, 3] to the components [K, C] that explain them, by their shares; in the order of
-    the points."""
-    index, whitening, log_peak = prepare(mean, covariance, weight)
-    limit = math.log(epsilon * prior_weight / max(index.size, 1))
-    boxes = _boxes(mean, covariance, index, log_peak, limit)
-    everyone = np.arange(points.shape[0])
-    near = _touched(points, everyone, np.arange(index.size), boxes)
-    order, leaf = _by_place(points, everyone, near.size)
-    density, listed = np.empty((points.shape[0], near.size)), np.empty((points.shape[0], near.size), np.int32)
-    count, evidence = np.zeros(points.shape[0], np.int64), np.empty(points.shape[0])
-    for first in range(0, order.size, leaf):
-        kept = _touched(points, order[first : first + leaf], near, boxes)
-        for p in order[first : first + leaf]:
-            x, y, z = points[p, 0], points[p, 1], points[p, 2]
-            total, n = prior_weight, 0
-            for j in kept:
-                k, W = index[j], whitening[j]
-                dx, dy, dz = x - mean[k, 0], y - mean[k, 1], z - mean[k, 2]
-                y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
-                exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
-                if exponent < limit:
-                    continue
-                density[p, n], listed[p, n] = math.exp(exponent), k
-                total += density[p, n]
-                n += 1
-            count[p], evidence[p] = n, total
-    for p in range(points.shape[0]):
-        for j in range(count[p]):
-            for c in range(values.shape[1]):
-                out[listed[p, j], c] += density[p, j] / evidence[p] * values[p, c]
-
-
-@compiled
+@part
 def _boxes(mean, covariance, index, log_peak, limit):
     """Per component the box [2, 3] (least and greatest corner) outside of which it adds less than ``limit``.
 
@@ -139,7 +102,7 @@ def _boxes(mean, covariance, index, log_peak, limit):
     return boxes
 
 
-@compiled
+@part
 def _touched(points, chosen, candidates, boxes):
     """Those candidates, in their order, whose box meets the bounding box of the chosen points."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -159,7 +122,7 @@ def _touched(points, chosen, candidates, boxes):
     return kept[:n]
 
 
-@compiled
+@part
 def _by_place(points, everyone, components):
     """Points in the order of a k-d tree, and how many of them, next to each other, make a leaf.
 
@@ -171,19 +134,45 @@ def _by_place(points, everyone, components):
     while levels > 0 and leaf > _LEAF:
         levels -= 1
         for first in range(0, order.size, leaf):
-            part = order[first : first + leaf].copy()
             widest, axis = -1.0, 0
             for i in range(3):
                 low, high = np.inf, -np.inf
-                for p in part:
+                for p in order[first : first + leaf]:
                     value = np.float64(points[p, i])
                     if value - value == 0:
                         low, high = min(low, value), max(high, value)
                 if high - low > widest:
                     widest, axis = high - low, i
-            keys = np.empty(part.size)
-            for n in range(part.size):
-                keys[n] = points[part[n], axis]
-            order[first : first + leaf] = part[np.argsort(keys)]
+            _sort_along(points, axis, order[first : first + leaf])
         leaf = (leaf + 1) // 2
     return order, leaf
+
+
+@part
+def _sort_along(points, axis, order):
+    """Sort numbers of points by a coordinate, NaN last, in place (heapsort): ``np.argsort``, and a slice assignment,
+    take seconds to compile."""
+    n = order.size
+    for first in range(n // 2 - 1, -1, -1):
+        _sift(points, axis, order, first, n)
+    for last in range(n - 1, 0, -1):
+        order[0], order[last] = order[last], order[0]
+        _sift(points, axis, order, 0, last)
+
+
+@part
+def _sift(points, axis, order, root, n):
+    """Let the root of a heap of n numbers sink to its place."""
+    while 2 * root + 1 < n:
+        child = 2 * root + 1
+        if child + 1 < n and _before(points[order[child], axis], points[order[child + 1], axis]):
+            child += 1
+        if not _before(points[order[root], axis], points[order[child], axis]):
+            return
+        order[root], order[child] = order[child], order[root]
+        root = child
+
+
+@part
+def _before(a, b):
+    return a < b or (b != b and a == a)

@@ -10,13 +10,15 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.given import CheckKernel as AnchorCheckKernel
+from ufmstar_torch.anchors.given import check_values as check_anchor_values
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
 from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.posterior.update import REFERENCE as POSTERIOR_REFERENCE
-from ufmstar_torch.posterior.update import PosteriorKernels
+from ufmstar_torch.posterior.update import PosteriorUpdate
+from ufmstar_torch.posterior.update import update as update_posterior
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
@@ -73,6 +75,15 @@ def select_check(name: str, device_type: str) -> CheckKernel:
     return check_values
 
 
+def select_anchor_check(name: str, device_type: str) -> AnchorCheckKernel:
+    """The check of a frame's anchors; arguments and errors as :func:`select_step`."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import anchors_cpu
+
+        return anchors_cpu.check_values
+    return check_anchor_values
+
+
 def select_merge(name: str, device_type: str) -> MergeKernels:
     """The parts of merging; arguments and errors as :func:`select_step`."""
     if _compiled(name, device_type):
@@ -115,14 +126,14 @@ def _on_gpu(name: str, device_type: str) -> bool:
     return name == "auto" and device_type in _TRITON_DEVICES and _has_triton(device_type)
 
 
-def select_posterior(name: str, device_type: str) -> PosteriorKernels:
-    """The posterior's kernels for a device; arguments and errors as :func:`select_step`. An accelerator takes the
+def select_posterior(name: str, device_type: str) -> PosteriorUpdate:
+    """The posterior's update for a device; arguments and errors as :func:`select_step`. An accelerator takes the
     reference."""
     if not _compiled(name, device_type):
-        return POSTERIOR_REFERENCE
+        return update_posterior
     from ufmstar_torch.kernels import posterior_cpu
 
-    return PosteriorKernels(solve=posterior_cpu.solve, distance=posterior_cpu.distance, read=posterior_cpu.read)
+    return posterior_cpu.update
 
 
 @functools.cache

@@ -8,8 +8,8 @@ only the map of the frame before was regressed without it. Growth starts before 
 rare.
 
 What the paper's step does not have (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
-``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels, which reads one number a
-frame where the mixture may grow.
+``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels. It grows one frame ahead
+instead: to slots for all that a frame can segment, so that it reads nothing but the count of the frame before.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from ufmstar_torch.kernels.triton.regress import regress_frame
 from ufmstar_torch.kernels.triton.segment import Floor, fit
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import FrameStatistics, StepOutput
+from ufmstar_torch.segment import most_kept
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import Kernels, StepObserver, step
@@ -38,33 +39,44 @@ _ROOM = 4 / 3  # slots for each that is needed, below which the mixture grows ah
 
 
 @dataclass(frozen=True)
-class Waiting:
-    """A frame whose counts the host has not read yet.
+class Rest:
+    """Gaussians of a frame for which the mixture had no slot.
 
     Attributes:
         current: C_i in the camera frame, [B, C].
         to_first: R and t into the mixture's frame.
-        left: [B, C] bool, what found no slot.
-        needed: [B] int32 on the host, slots that would hold everything, once ``copied``.
-        copied: the end of the copy; None on the CPU.
+        left: [B, C] bool, which of them.
     """
 
     current: GaussianMixture
     to_first: tuple[Tensor, Tensor]
     left: Tensor
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame whose counts the host has not read yet.
+
+    Attributes:
+        needed: [B] integers on the host, slots that would hold everything, once ``copied``.
+        copied: the end of the copy; None on the CPU.
+        rest: what found no slot; None where everything did.
+    """
+
     needed: Tensor
     copied: torch.cuda.Event | None
+    rest: Rest | None
 
     @classmethod
-    def after(cls, current: GaussianMixture, to_first: tuple[Tensor, Tensor], left: Tensor, needed: Tensor) -> Waiting:
-        """Queue the copy of the counts."""
+    def after(cls, needed: Tensor, rest: Rest | None = None) -> Waiting:
+        """Queue the copy of the counts [B]."""
         if needed.device.type != "cuda":
-            return cls(current, to_first, left, needed.cpu(), None)
+            return cls(needed.cpu(), None, rest)
         on_host = torch.empty(needed.shape, dtype=needed.dtype, pin_memory=True)
         on_host.copy_(needed, non_blocking=True)
         copied = torch.cuda.Event()
         copied.record(torch.cuda.current_stream(needed.device))
-        return cls(current, to_first, left, on_host, copied)
+        return cls(on_host, copied, rest)
 
     def slots(self) -> int:
         """The slots that the fullest stream needs; waits until they are known."""
@@ -87,6 +99,7 @@ class DeviceStep:
         self._kernels = kernels
         self._waiting: Waiting | None = None
         self._of: Tensor | None = None
+        self._lost: Tensor | None = None
 
     def __call__(
         self,
@@ -101,38 +114,57 @@ class DeviceStep:
     ) -> tuple[UfMStarState, StepOutput]:
         plain = config.disagreement == "w2" and config.regression == "exact"
         if config.anchored or config.overlap_weighted or not plain or pixels is not None or observer is not None:
-            stepped = step(
-                self._with_room(state, config, 1.0), frame, config, pixels=pixels, smooth=smooth, anchors=anchors,
-                observer=observer, kernels=self._kernels,
+            state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
+            fixed = replace(config, max_components=state.mixture.capacity)
+            updated, out = step(
+                state, frame, fixed, pixels=pixels, smooth=smooth, anchors=anchors, observer=observer,
+                kernels=self._kernels,
             )  # fmt: skip
-            self._waiting = None
-            return stepped
-        state = self._with_room(state, config, _ROOM)
-        updated, out, self._waiting = device_step(state, frame, config, smooth=smooth)
-        self._of = updated.mean
+            waiting = None if _full(state.mixture.capacity, config) else Waiting.after(out.statistics.components)
+        else:
+            state = self._with_room(state, config)
+            updated, out, waiting = device_step(state, frame, config, smooth=smooth)
+        if self._lost is not None:
+            dropped = out.statistics.dropped + self._lost
+            out = replace(out, statistics=replace(out.statistics, dropped=dropped))
+        self._waiting, self._of, self._lost = waiting, updated.mean, None
         return updated, out
 
     def settled(self, state: UfMStarState, config: UfMStarConfig) -> UfMStarState:
         """The state with everything appended that was waiting; waits for the device."""
-        state = self._with_room(state, config, 1.0)
-        self._waiting = None
+        state = self._with_room(state, config, ahead=0)
+        self._waiting, self._of = None, state.mean
         return state
 
-    def _with_room(self, state: UfMStarState, config: UfMStarConfig, room: float) -> UfMStarState:
-        """The state with ``room`` slots for each that the frame before needed, and with what was waiting for one.
+    def _with_room(self, state: UfMStarState, config: UfMStarConfig, ahead: int | None = None) -> UfMStarState:
+        """The state with what was waiting for a slot, and with slots for the next frame.
 
-        It is still waiting afterwards: a step that raises loses nothing.
+        It is still waiting afterwards: a step that raises loses nothing. What finds no slot even so, because of
+        ``config.max_components``, counts as dropped by the next frame.
+
+        Args:
+            state: the step's argument.
+            config: of UfM*.
+            ahead: slots that are free afterwards, as far as the limit allows; None = a third of those in use.
         """
-        waiting = self._waiting
-        if waiting is None or state.mean is not self._of:
-            return state
-        mixture, needed = state.mixture, waiting.slots()
-        grown = mixture.grown(int(needed * room), config.max_components)
-        if needed > mixture.capacity:
-            append(
-                grown, waiting.current, waiting.to_first, waiting.left, state.frames, near_plane=config.near_plane,
-                again=True, last=True,
+        if state.mean is not self._of:
+            self._waiting = self._lost = None
+        mixture, waiting = state.mixture, self._waiting
+        if waiting is None:
+            if not ahead or _full(mixture.capacity, config):
+                return state
+            needed = int(mixture.components.max())  # a state from elsewhere: the one read
+        else:
+            needed = waiting.slots()
+        room = int(needed * _ROOM) if ahead is None else needed + ahead
+        grown = mixture.grown(room, config.max_components)
+        if waiting is not None and waiting.rest is not None and needed > mixture.capacity:
+            rest = waiting.rest
+            lost, _ = append(
+                grown, rest.current, rest.to_first, rest.left, state.frames, near_plane=config.near_plane, again=True,
+                last=False,
             )  # fmt: skip
+            self._lost = lost.sum(1)
         return replace(state, **grown.tensors())
 
 
@@ -148,8 +180,7 @@ def device_step(
     stored = state.covariance.dtype
     eps = 8 * torch.finfo(stored).eps
     given = SegmentInput.of_frame(frame, config)
-    current, labels = fit(given, labels=True, floor=Floor(config.near_plane, eps))
-    assert labels is not None
+    current, read_labels = fit(given, floor=Floor(config.near_plane, eps))
     here = cameras(state, frame)
     camera = frame.intrinsics.contiguous()
     previous, new = candidates(state.mixture, here.to_camera, current, camera, frame.size, config)
@@ -160,7 +191,7 @@ def device_step(
     left, needed = append(
         mixture, current, here.to_first, matched, counts, near_plane=config.near_plane, again=False, last=full
     )
-    waiting = None if full else Waiting.after(current, here.to_first, left, needed)
+    waiting = None if full else Waiting.after(needed, Rest(current, here.to_first, left))
     result = regress_frame(mixture, here.to_camera, frame, state.smoothed, config, counts, smooth=smooth)
     statistics = FrameStatistics(
         components=counts[ends.COMPONENTS],
@@ -187,7 +218,7 @@ def device_step(
         skipped=here.skipped,
         smoothed=result.memory,
     )
-    out = StepOutput(result.disagreement, result.features, None, result.measured, labels.long(), current, statistics)
+    out = StepOutput(result.disagreement, result.features, None, result.measured, read_labels, current, statistics)
     return updated, out, waiting
 
 

@@ -8,23 +8,22 @@ Cov X = sigma^2 (J^T J)^-1. ``tests/oracle_triangulate.py`` is the same in NumPy
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 # From the rays' nearest point the reprojection error converges quadratically; three steps reach rounding on all but the
 # worst geometry, which the tests of parallax refuse anyway.
 STEPS = 3
 # Added to the normal matrix's diagonal, relative to its trace, so that rays without parallax stay solvable; their huge
-# variance then tells.
+# variance then shows.
 DAMPING = 1e-12
 
 
 # NumPy's error model: no test for zero before every division, and hopeless geometry gives no exception but a covariance
 # that is not finite.
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ def triangulate(
     return Triangulated(point + origin, covariance, error, ahead)
 
 
-@compiled
+@kernel
 def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance, error, ahead):
     """Pixels [N, W, 2] are counted from the principal point. ``into`` [W, 3, 3] takes an offset from a camera to
     (u z, v z, z) in its image, ``out_of`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
@@ -87,7 +86,7 @@ def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance
         _inverse(normal, damping, covariance[n])
 
 
-@compiled
+@part
 def _nearest(pixel, seen, out_of, centre, normal, right):
     """Normal equations (upper triangle) of the point nearest to all rays."""
     n00 = n01 = n02 = n11 = n12 = n22 = r0 = r1 = r2 = 0.0
@@ -110,7 +109,7 @@ def _nearest(pixel, seen, out_of, centre, normal, right):
     right[0], right[1], right[2] = r0, r1, r2
 
 
-@compiled
+@part
 def _linearised(X, pixel, seen, into, centre, normal, right):
     """Normal equations (upper triangle) of a Gauss-Newton step from X; the sum of squared residuals [px^2], how many
     views saw the point, and whether it lies in front of all of them."""
@@ -139,7 +138,7 @@ def _linearised(X, pixel, seen, into, centre, normal, right):
     return squares, count, front
 
 
-@compiled
+@part
 def _inverse(S, damping, out):
     """Of a symmetric positive definite 3x3 (its upper triangle), damped, by cofactors."""
     more = damping * max(S[0, 0] + S[1, 1] + S[2, 2], 2.2250738585072014e-308)

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 
-class DistanceKernel(Protocol):
-    """See :func:`distance`."""
-
-    def __call__(self, source: Tensor, right: Tensor, down: Tensor, cols: int, limit: float, /) -> Tensor: ...
-
-
 def distance(source: Tensor, right: Tensor, down: Tensor, cols: int, limit: float) -> Tensor:
-    """The reference: every node takes the shortest way by a neighbour, until nothing gets shorter.
+    """Every node takes the shortest way by a neighbour, until nothing gets shorter.
 
     Args:
         source: [B, n] bool.

@@ -10,16 +10,9 @@ only large system is that of the nodes, whose band is as wide as a row of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
-
-
-class SolveKernel(Protocol):
-    """A^-1 columns and the diagonal of A^-1, for A = the diagonal and the links of a grid (:func:`solve`)."""
-
-    def __call__(self, diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: int, /) -> Solved: ...
 
 
 @dataclass(frozen=True)
@@ -36,7 +29,7 @@ class Solved:
 
 
 def solve(diagonal: Tensor, right: Tensor, down: Tensor, columns: Tensor, cols: int) -> Solved:
-    """The reference: dense.
+    """A^-1 columns and the diagonal of A^-1, for A = the diagonal and the links of a grid; dense.
 
     Args:
         diagonal: [B, n] without the links, positive.
@@ -108,14 +101,14 @@ class Field:
     variance: Tensor
 
     @classmethod
-    def given(cls, prior: Prior, observed: Observed, weight: Tensor, kernel: SolveKernel) -> Field:
+    def given(cls, prior: Prior, observed: Observed, weight: Tensor) -> Field:
         """Condition the prior on the observations with the precisions ``weight`` [B, N]."""
         weighted = weight[..., None] * observed.features
         left = observed.value - (observed.features * prior.mean[:, None]).sum(-1)
         rows = torch.cat([weighted, (weight * left)[..., None], weight[..., None]], -1)
         nodes = torch.zeros(*prior.diagonal.shape, rows.shape[-1], dtype=rows.dtype, device=rows.device)
         nodes = nodes.scatter_add(1, observed.node[..., None].expand_as(rows), rows)
-        solved = kernel(prior.diagonal + nodes[..., -1], prior.right, prior.down, nodes[..., :-1], prior.cols)
+        solved = solve(prior.diagonal + nodes[..., -1], prior.right, prior.down, nodes[..., :-1], prior.cols)
         response, offset = solved.columns[..., :-1], solved.columns[..., -1]
         to_features = nodes[..., :-2].mT
         precision = prior.precision + weighted.mT @ observed.features - to_features @ response

@@ -13,18 +13,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, pad
 
 from ufmstar_torch.frame import FrameInput
-
-SIDE = 28
-# Variance of the difference of y = log(g/d) between neighbouring nodes, _FLAT + _EDGE D^2, with D their difference of
-# log d: on rendered tours the variogram of y over one cell is .003 to .005 where D < .05, and grows as D^2.
-_FLAT, _EDGE = 0.004, 2.0
-# Length of a link, in widths of the image: a cell, and _CLIMB times the depth edge beyond _SMOOTH, by which log d
-# changes on a slanted surface. On tours the error grows with both by about 1 to 2.
-_CLIMB, _SMOOTH = 2.0, 0.03
-# Columns and rows of the coarse hats among the features.
-_HATS = 3
-GLOBALS = 4
-FEATURES = GLOBALS + _HATS * _HATS
+from ufmstar_torch.posterior.model import MODEL
 
 
 @dataclass(frozen=True)
@@ -51,7 +40,7 @@ class Grid:
     @classmethod
     def of(cls, frame: FrameInput) -> Grid:
         """The nodes of a frame, float64."""
-        rows, cols = (min(SIDE, n) for n in frame.size)
+        rows, cols = (min(MODEL.side, n) for n in frame.size)
         valid = frame.valid.double()[:, None]
         logs = torch.where(frame.valid, frame.depth, torch.ones_like(frame.depth)).log().double()[:, None] * valid
         covered = adaptive_avg_pool2d(valid, (rows, cols)).flatten(1)
@@ -64,9 +53,9 @@ class Grid:
         along = pad(shaped[:, 1:] - shaped[:, :-1], (0, 0, 0, 1), value=torch.inf).flatten(1)
         return cls(
             (rows, cols), log_depth, log_depth.mean(1),
-            _FLAT + _EDGE * across.square(), _FLAT + _EDGE * along.square(),
-            1 / cols + _CLIMB * (across.abs() - _SMOOTH).clamp_min(0),
-            1 / rows + _CLIMB * (along.abs() - _SMOOTH).clamp_min(0),
+            MODEL.flat + MODEL.edge * across.square(), MODEL.flat + MODEL.edge * along.square(),
+            1 / cols + MODEL.climb * (across.abs() - MODEL.smooth).clamp_min(0),
+            1 / rows + MODEL.climb * (along.abs() - MODEL.smooth).clamp_min(0),
         )  # fmt: skip
 
     def node(self, pixel: Tensor, size: tuple[int, int]) -> Tensor:
@@ -100,9 +89,9 @@ def _relative(pixel: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 def _features(log_depth: Tensor, u: Tensor, v: Tensor) -> Tensor:
     ones = torch.ones_like(log_depth)
-    hats = [_hat(u, i) * _hat(v, j) for j in range(_HATS) for i in range(_HATS)]
+    hats = [_hat(u, i) * _hat(v, j) for j in range(MODEL.hats) for i in range(MODEL.hats)]
     return torch.stack([ones, log_depth, 2 * u - 1, 2 * v - 1, *hats], -1)
 
 
 def _hat(x: Tensor, i: int) -> Tensor:
-    return (1 - (x * (_HATS - 1) - i).abs()).clamp_min(0)
+    return (1 - (x * (MODEL.hats - 1) - i).abs()).clamp_min(0)

@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
-from ufmstar_torch.posterior.grid import GLOBALS
-
-# Difference of log d at which a node counts half at a pixel.
-ALIKE = 0.1
-# No correction by more than this factor's logarithm: anchors off by more are not valid.
-LARGEST_LOG = 4.605170185988092
-
-
-class ReadKernel(Protocol):
-    """See :func:`read`."""
-
-    def __call__(
-        self, depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
-        size: tuple[int, int], /,
-    ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
+from ufmstar_torch.posterior.model import GLOBALS, MODEL
 
 
 def read(
     depth: Tensor, valid: Tensor, claimed: Tensor, nodes: Tensor, coefficients: Tensor, mean: Tensor,
     size: tuple[int, int],
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """The reference.
+    """Depth and variance at every pixel.
 
-    The four nodes around a pixel count by their bilinear weights and by 1/(1 + (D/.1)^2), with D the difference between
-    the pixel's log d and the node's.
+    The four nodes around it count by their bilinear weights and by 1/(1 + (D/.1)^2), with D the difference between the
+    pixel's log d and the node's.
 
     Args:
         depth, valid: [B, H, W].
@@ -56,14 +40,14 @@ def read(
     for row, by_row in ((top, 1 - below), ((top + 1).clamp_max(rows - 1), below)):
         for column, by_column in ((left, 1 - beside), ((left + 1).clamp_max(cols - 1), beside)):
             at = nodes[:, (row[:, None] * cols + column).flatten()].view(b, height, width, 4)
-            alike = 1 / (1 + ((logs - at[..., 0]) / ALIKE).square())
+            alike = 1 / (1 + ((logs - at[..., 0]) / MODEL.alike).square())
             weight = by_row[:, None] * by_column * alike
             total = total + weight
             sums = sums + weight * at[..., 1:].permute(3, 0, 1, 2)
     offset, variance, unseen = sums / total
     c = coefficients[:, None, None].expand(b, height, width, GLOBALS).unbind(-1)
     y = c[0] + c[1] * (logs - mean[:, None, None]) + c[2] * (2 * u - 1) + c[3] * (2 * v - 1)[:, None] + offset
-    corrected = d * y.clamp(-LARGEST_LOG, LARGEST_LOG).exp()
+    corrected = d * y.clamp(-MODEL.largest, MODEL.largest).exp()
     spread = corrected.square() * (variance + unseen * claimed.double() / d.square())
     corrected, spread = (torch.where(valid, x, torch.nan).to(depth.dtype) for x in (corrected, spread))
     return corrected, spread

@@ -2,8 +2,9 @@
 
 Everything here is learnt from anchors alone, in frames that have some: how far the network's error varies (amplitude),
 how much anchors and network differ from one pixel to the next (roughness), by what factor the anchors' variances are
-stated too small (noise), how far surfaces without evidence are off (unseen), and how well held-out anchors were
-predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do not decide.
+stated too small (noise), how fast the error grows with the distance from evidence (unseen), and how well held-out
+anchors were predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do
+not decide.
 """
 
 from __future__ import annotations
@@ -13,23 +14,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ufmstar_torch.posterior.grid import GLOBALS
+from ufmstar_torch.posterior.model import GLOBALS, MODEL
 
-# Half-life of a sum [frames].
-_HALF_LIFE = 20.0
-MEMORY = 0.5 ** (1 / _HALF_LIFE)
-# (prior value, its weight in anchors, least, largest): amplitude 1, roughness (.05)^2, noise 1 and unseen as variances
-# of y relative to, or added to, those of the model; calibration as mean z^2, of which nothing is known before.
+# (prior value, its weight in anchors, least, largest). Amplitude and noise are factors of the model's variances;
+# roughness and unseen are variances of y, at a pixel and over a width of the image. Calibration is a mean z^2, of
+# which nothing is known before.
 RATIOS = {
     "amplitude": (1.0, 20.0, 0.1, 100.0),
     "roughness": (0.05**2, 60.0, 0.01**2, 0.2**2),
     "noise": (1.0, 60.0, 0.25, 16.0),
-    "unseen": (0.15, 1000.0, 0.0, 4.0),
+    "unseen": (0.05, 30.0, 0.0, 16.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-# Standard deviation of the coefficients of 1, log d, u and v before the first anchor, and of their change from frame to
-# frame: those of the true error on rendered tours.
-_PRIOR, _DRIFT = (0.5, 0.45, 0.2, 0.2), (0.12, 0.12, 0.08, 0.06)
 _MATRIX = GLOBALS * GLOBALS
 SIZE = 2 + 2 * len(RATIOS) + GLOBALS + _MATRIX
 
@@ -61,7 +57,7 @@ class Running:
         new = frames == 0
         start = sums.new_tensor([r[0] * r[1] for r in RATIOS.values()] + [r[1] for r in RATIOS.values()])
         above, below = torch.where(new, start, sums).split(len(RATIOS), 1)
-        P = torch.diag(packed.new_tensor(_PRIOR).square())
+        P = torch.diag(packed.new_tensor(MODEL.prior).square())
         return cls(
             frames[:, 0], mean[:, 0], dict(zip(RATIOS, above.unbind(1), strict=True)),
             dict(zip(RATIOS, below.unbind(1), strict=True)), coefficients,
@@ -80,11 +76,15 @@ class Running:
         ratio = torch.where(below > 0, self.above[name] / below.clamp_min(1e-12), torch.full_like(below, value))
         return ratio.clamp(least, largest)
 
+    def growth(self) -> Tensor:
+        """[B] variance of y a width of the image from evidence."""
+        return MODEL.growth + self.ratio("unseen")
+
     def added(self, name: str, above: Tensor, below: Tensor) -> tuple[Tensor, Tensor]:
         """The two sums of a ratio [B] after a frame with these [B]."""
         value, weight, least, largest = RATIOS[name]
-        n = MEMORY * self.below[name] + (1 - MEMORY) * weight + below
-        total = MEMORY * self.above[name] + (1 - MEMORY) * weight * value + above
+        n = MODEL.memory * self.below[name] + (1 - MODEL.memory) * weight + below
+        total = MODEL.memory * self.above[name] + (1 - MODEL.memory) * weight * value + above
         return torch.minimum(torch.maximum(total, least * n), largest * n), n
 
     def expected(self, mean: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,7 +93,7 @@ class Running:
         T = torch.eye(GLOBALS, dtype=mean.dtype, device=mean.device).repeat(len(mean), 1, 1)
         T[:, 0, 1] = torch.where(self.frames > 0, mean - self.mean, torch.zeros_like(mean))
         walked = T @ self.covariance @ T.mT
-        prior, drift = (mean.new_tensor(x).square() for x in (_PRIOR, _DRIFT))
+        prior, drift = (mean.new_tensor(x).square() for x in (MODEL.prior, MODEL.drift))
         grown = drift * (1 - walked.diagonal(dim1=1, dim2=2) / prior).clamp(0, 1)
         started = (self.frames > 0).to(mean)[:, None]
         return (T @ self.coefficients[..., None])[..., 0], walked + torch.diag_embed(grown * started)

@@ -16,61 +16,47 @@ prediction beyond the anchor, its part of n is divided by (1 - e^-t) e^-t / t, s
 near, and hardly what is too far. Two rounds of Student-t weights (5/(4 + z^2), z from the leave-one-out residual) take
 outliers out.
 
-Variance of y at a node: the field's, the roughness, a common .03^2 of the poses' scale, and where evidence is far
+Variance of y at a node:
 
-    share (unseen + V/(2 d^2)),     share = min(1, distance/.6),
+    local 1.7 (the field's + roughness) + .03^2 + distance (.06 + unseen) + min(1, distance/.6) V/(4 d^2).
 
-with V = M + A + E: a surface without evidence is as uncertain as held-out anchors show, and more where UfM* says so.
-The distance is geodesic, in widths of the image, and depth edges lengthen it. All amplitudes are learnt (``running``)
-from anchors of three discs that move over the image: the field is fitted without them, and they count by area and not
-by number, since corners cluster on what is well textured.
+``local`` is the mean z^2 of the leave-one-out residuals of the anchors in the cells around: the error is rougher on one
+surface than on another. The distance from evidence is geodesic, in widths of the image, and depth edges lengthen it: on
+tours the variance of the error grows in proportion to it. All amplitudes are learnt (``running``) from anchors of three
+discs that move over the image: the field is fitted without them, and they count by area and not by number, since
+corners cluster on what is well textured. ``unseen`` is what their squared error is beyond the rest, over their
+distance. V = M + A + E counts where evidence is far. .03^2 is the common scale of the poses.
+
+A stream that is given anchors of which none was valid so far has that variance without evidence, about the network's
+depth: nothing was measured, and nothing reads as certain. A stream without anchors is UfM*'s.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from ufmstar_torch.anchors.given import AnchorInput
 from ufmstar_torch.fixed_order import total
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.posterior.distance import DistanceKernel, distance
-from ufmstar_torch.posterior.field import Field, Observed, Prior, SolveKernel, solve
-from ufmstar_torch.posterior.grid import FEATURES, GLOBALS, Grid
-from ufmstar_torch.posterior.read import ReadKernel, read
+from ufmstar_torch.posterior.distance import distance
+from ufmstar_torch.posterior.field import Field, Observed, Prior
+from ufmstar_torch.posterior.grid import Grid
+from ufmstar_torch.posterior.model import FEATURES, GLOBALS, MODEL
+from ufmstar_torch.posterior.read import read
 from ufmstar_torch.posterior.running import RATIOS, Running
 
-# kappa of f, and variance of a hat, both times the amplitude.
-_KAPPA, _HAT = 2.0, 0.1**2
-_ROUNDS, _STUDENT = 2, 4.0
-# Range of t, within which the weight of a weak anchor is evaluated, and the share of its weight that always stays.
-_NEARER, _FARTHER = -0.7, 2.0
-# Largest z^2 of an anchor in what is learnt, and the mean of min(z^2, 9) for normal z.
-_CLIP, _CLIPPED = 9.0, 0.9950
-_COMMON = 0.03**2
-# Share of the variance that UfM* claims in that of a surface far from all evidence.
-_CLAIMED = 0.5
-# Discs of held-out anchors: how many, and their radius in widths of the image; the frame's number moves them along a
-# sequence of low discrepancy. Fewer anchors than _LEFT beside them: nothing is held out.
-_DISCS, _RADIUS, _STEPS, _LEFT = 3, 5 / 28, (0.7548776662466927, 0.5698402909980532), 5
-# Distance from which on a surface counts as unseen [widths of the image].
-_FAR = 0.6
-# An anchor whose noise has this standard deviation counts half by area, and is evidence only if it is no larger.
-_WEAK, _EVIDENCE = 0.2, 0.3
 
+class PosteriorUpdate(Protocol):
+    """See :func:`update`; ``kernels/posterior_cpu`` is the compiled one."""
 
-@dataclass(frozen=True)
-class PosteriorKernels:
-    """The replaceable parts."""
-
-    solve: SolveKernel
-    distance: DistanceKernel
-    read: ReadKernel
-
-
-REFERENCE = PosteriorKernels(solve, distance, read)
+    def __call__(
+        self, packed: Tensor, frame: FrameInput, anchors: AnchorInput | None, claimed: Tensor, /
+    ) -> tuple[Tensor, Posterior]: ...
 
 
 @dataclass(frozen=True)
@@ -79,9 +65,9 @@ class Posterior:
 
     Attributes:
         depth: [B, H, W] [m]; as predicted before the first anchor. NaN where not valid.
-        variance: [B, H, W] [m^2]; UfM*'s before the first anchor.
+        variance: [B, H, W] [m^2]; UfM*'s where no anchors were ever given.
         calibration: [B] mean z^2 of held-out anchors lately: 1 = as predicted, more = too certain; NaN before any.
-        unseen: [B] variance of y that held-out anchors show where evidence is far.
+        unseen: [B] variance of y a width of the image from evidence.
     """
 
     depth: Tensor
@@ -128,6 +114,10 @@ class _Scene:
         nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, kept)
         return torch.gather(nodes, 1, self.observed.node)
 
+    def believed(self, near: _Near) -> Tensor:
+        """[B, N] by how much an anchor counts for what is learnt: less the noisier it is, 0 where not valid."""
+        return torch.where(self.valid, 1 / (1 + near.noise / MODEL.weak**2), torch.zeros_like(near.noise))
+
 
 @dataclass(frozen=True)
 class _Near:
@@ -149,7 +139,6 @@ def update(
     frame: FrameInput,
     anchors: AnchorInput | None,
     claimed: Tensor,
-    kernels: PosteriorKernels = REFERENCE,
 ) -> tuple[Tensor, Posterior]:
     """Take in a frame.
 
@@ -158,31 +147,33 @@ def update(
         frame: checked.
         anchors: of the frame, or None.
         claimed: [B, H, W] V of UfM* without B [m^2], NaN where not valid.
-        kernels: which implementation.
 
     Returns:
         What is known after the frame, and the posterior. A stream without a usable anchor keeps what it knew.
     """
+    given = anchors is not None
     anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
-    running, grid, claimed_share = Running.of(packed), Grid.of(frame), _CLAIMED * claimed.nan_to_num()
+    running, grid, claimed_share = Running.of(packed), Grid.of(frame), MODEL.claimed * claimed.nan_to_num()
     scene = _Scene.of(grid, frame, anchors, running)
-    field, weight, near = _fitted(scene, kernels)
-    share = _share(scene, anchors.valid & (weight * _EVIDENCE**2 >= 1), kernels)
-    after = _learnt(scene, field, weight, near, _relative(claimed_share, frame, anchors), running, kernels)
+    field, weight, near = _fitted(scene)
+    away = _away(scene, anchors.valid & (weight * MODEL.evidence**2 >= 1))
+    share = (away / MODEL.far).clamp_max(1)
+    after = _learnt(scene, field, weight, near, _relative(claimed_share, frame, anchors), running)
     features, b = grid.features(), field.coefficients
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(share), features)
     offset = mean - (features[..., :GLOBALS] * b[:, None, :GLOBALS]).sum(-1)
-    variance = variance + running.ratio("roughness")[:, None] + _COMMON + share * running.ratio("unseen")[:, None]
+    variance = MODEL.inflation * _local(scene, near) * (variance + running.ratio("roughness")[:, None])
+    variance = variance + MODEL.common + away * running.growth()[:, None]
     nodes = torch.stack([grid.log_depth, offset, variance, share], -1)
-    depth, spread = kernels.read(frame.depth, frame.valid, claimed_share, nodes, b[:, :GLOBALS], grid.mean, grid.size)
+    depth, spread = read(frame.depth, frame.valid, claimed_share, nodes, b[:, :GLOBALS], grid.mean, grid.size)
     some = anchors.valid.any(1)
-    known = (some | (running.frames > 0))[:, None, None]
+    known = (some | (running.frames > 0) | given)[:, None, None]
     plain = torch.where(frame.valid, frame.depth, torch.nan)
     kept = torch.where(some[:, None], after.packed().to(packed.dtype), packed)
     now = Running.of(kept)
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
     return kept, Posterior(
-        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen")
+        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.growth()
     )
 
 
@@ -201,9 +192,9 @@ def _prior(grid: Grid, running: Running) -> Prior:
     b, hats = len(mean), FEATURES - GLOBALS
     P = covariance.new_zeros(b, FEATURES, FEATURES)
     P[:, :GLOBALS, :GLOBALS] = torch.linalg.inv_ex(covariance).inverse
-    P[:, GLOBALS:, GLOBALS:] = torch.diag_embed((1 / (_HAT * amplitude)).expand(b, hats))
+    P[:, GLOBALS:, GLOBALS:] = torch.diag_embed((1 / (MODEL.hat * amplitude)).expand(b, hats))
     return Prior(
-        (_KAPPA / amplitude).expand_as(grid.log_depth), 1 / (grid.right * amplitude), 1 / (grid.down * amplitude),
+        (MODEL.kappa / amplitude).expand_as(grid.log_depth), 1 / (grid.right * amplitude), 1 / (grid.down * amplitude),
         torch.nn.functional.pad(mean, (0, hats)), P, grid.size[1],
     )  # fmt: skip
 
@@ -223,36 +214,47 @@ def _range(frame: FrameInput, anchors: AnchorInput) -> Tensor:
     return high - low
 
 
-def _fitted(scene: _Scene, kernels: PosteriorKernels) -> tuple[Field, Tensor, _Near]:
+def _fitted(scene: _Scene) -> tuple[Field, Tensor, _Near]:
     """The field, the anchors' weights in it, and what they say of each other."""
     zero = torch.zeros_like(scene.stated)
     weight = torch.where(scene.valid, 1 / (scene.stated + scene.other), zero)
-    for round_ in range(_ROUNDS + 1):
-        field = Field.given(scene.prior, scene.observed, weight, kernels.solve)
+    for round_ in range(MODEL.rounds + 1):
+        field = Field.given(scene.prior, scene.observed, weight)
         mean, variance = field.at(scene.observed.node, scene.observed.features)
-        left = (1 - weight * variance).clamp_min(0.05)
+        left = (1 - weight * variance).clamp_min(MODEL.least_left)
         residual, variance = (scene.observed.value - mean) / left, variance / left
         noise = scene.other + scene.stated / _pull(-residual)
         near = _Near(noise, residual, variance + noise)
-        if round_ < _ROUNDS:
-            student = (_STUDENT + 1) / (_STUDENT + residual.square() / near.total)
+        if round_ < MODEL.rounds:
+            student = (MODEL.student + 1) / (MODEL.student + residual.square() / near.total)
             weight = torch.where(scene.valid, student / noise, zero)
     return field, weight, near
 
 
 def _pull(t: Tensor) -> Tensor:
     """(1 - e^-t) e^-t / t, the weight of an anchor from which the prediction is t beyond in log depth."""
-    t = t.clamp(_NEARER, _FARTHER)
+    t = t.clamp(MODEL.nearer, MODEL.farther)
     small = t.abs() < 1e-3
     safe = torch.where(small, torch.ones_like(t), t)
     return torch.where(small, 1 - 1.5 * t, -torch.expm1(-safe) * torch.exp(-safe) / safe)
 
 
-def _share(scene: _Scene, evidence: Tensor, kernels: PosteriorKernels) -> Tensor:
-    """[B, n] how far every node is from the anchors of the mask [B, N], 0 to 1."""
+def _local(scene: _Scene, near: _Near) -> Tensor:
+    """[B, n] mean z^2 of the leave-one-out residuals around every node."""
+    each = scene.believed(near) / scene.counted(torch.ones_like(near.noise)).clamp_min(1)
+    z2 = (near.left_out.square() / near.total).clamp_max(MODEL.clip)
+    nodes = torch.zeros(2, *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
+    nodes = nodes.scatter_add(2, scene.observed.node.expand(2, -1, -1), torch.stack([each * z2, each]))
+    side = 2 * MODEL.near + 1
+    around = avg_pool2d(nodes.unflatten(2, scene.grid.size), side, 1, MODEL.near, divisor_override=1).flatten(2)
+    return (around[0] + MODEL.alone) / (around[1] + MODEL.alone)
+
+
+def _away(scene: _Scene, evidence: Tensor) -> Tensor:
+    """[B, n] how far every node is from the anchors of the mask [B, N], in widths of the image."""
     grid = scene.grid
     source = torch.zeros_like(grid.log_depth).scatter_add(1, scene.observed.node, evidence.to(grid.log_depth)) > 0
-    return kernels.distance(source, grid.far_right, grid.far_down, grid.size[1], _FAR) / _FAR
+    return distance(source, grid.far_right, grid.far_down, grid.size[1], MODEL.limit)
 
 
 def _relative(claimed: Tensor, frame: FrameInput, anchors: AnchorInput) -> Tensor:
@@ -263,10 +265,9 @@ def _relative(claimed: Tensor, frame: FrameInput, anchors: AnchorInput) -> Tenso
 
 def _learnt(
     scene: _Scene, field: Field, weight: Tensor, near: _Near, claimed: Tensor, running: Running,
-    kernels: PosteriorKernels,
 ) -> Running:  # fmt: skip
     """What is known after the frame."""
-    sums = _of_neighbours(scene, near, running) | _of_discs(scene, weight, near, claimed, running, kernels)
+    sums = _of_neighbours(scene, near, running) | _of_discs(scene, weight, near, claimed, running)
     added = {name: running.added(name, *sums[name]) for name in RATIOS}
     return Running(
         running.frames + 1, scene.grid.mean,
@@ -278,7 +279,7 @@ def _learnt(
 def _of_neighbours(scene: _Scene, near: _Near, running: Running) -> dict[str, tuple[Tensor, Tensor]]:
     """Sums for roughness and noise from leave-one-out residuals: what they are beyond the rest of their variance, each
     weighted by the squared share that the quantity has in it."""
-    square = torch.minimum(near.left_out.square(), _CLIP * near.total) / _CLIPPED
+    square = torch.minimum(near.left_out.square(), MODEL.clip * near.total) / MODEL.clipped
     excess, once = square - near.total, torch.where(scene.valid, 1 / scene.counted(torch.ones_like(square)), 0.0)
     sums = {}
     for name, part in (("roughness", running.ratio("roughness")[:, None]), ("noise", scene.stated)):
@@ -289,27 +290,28 @@ def _of_neighbours(scene: _Scene, near: _Near, running: Running) -> dict[str, tu
 
 
 def _of_discs(
-    scene: _Scene, weight: Tensor, near: _Near, claimed: Tensor, running: Running, kernels: PosteriorKernels
+    scene: _Scene, weight: Tensor, near: _Near, claimed: Tensor, running: Running
 ) -> dict[str, tuple[Tensor, Tensor]]:
     """Sums for amplitude, unseen and calibration from anchors whose whole region is left out."""
     held = _discs(scene, running.frames) & scene.valid
     rest = scene.valid & ~held
-    held = held & (rest.sum(1, keepdim=True) >= _LEFT)
-    field = Field.given(scene.prior, scene.observed, weight * rest, kernels.solve)
+    held = held & (rest.sum(1, keepdim=True) >= MODEL.left)
+    field = Field.given(scene.prior, scene.observed, weight * rest)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
-    share = torch.gather(_share(scene, rest, kernels), 1, scene.observed.node)
+    away = torch.gather(_away(scene, rest), 1, scene.observed.node)
     tot = variance + near.noise
     error = (scene.observed.value - mean).square()
-    square = torch.minimum(error, _CLIP * tot) / _CLIPPED
-    believed = torch.where(held, 1 / (1 + near.noise / _WEAK**2), 0.0)
+    square = torch.minimum(error, MODEL.clip * tot) / MODEL.clipped
+    believed = torch.where(held, scene.believed(near), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
-    final = tot + _COMMON + share * (running.ratio("unseen")[:, None] + claimed)
+    final = MODEL.inflation * variance + near.noise + MODEL.common + away * running.growth()[:, None]
+    final = final + (away / MODEL.far).clamp_max(1) * claimed
     return {
         "amplitude": (
             total(area * (square - near.noise) / tot, 1),
             total(area * variance / tot, 1) / running.ratio("amplitude"),
         ),
-        "unseen": (total(area * (square - tot - share * claimed) * share / tot, 1), total(area * share**2 / tot, 1)),
+        "unseen": (total(area * (error.clamp_max(MODEL.square) - tot), 1), total(area * away, 1)),
         "calibration": (total(area * error / final, 1), total(area, 1)),
     }
 
@@ -318,7 +320,9 @@ def _discs(scene: _Scene, frames: Tensor) -> Tensor:
     """[B, N] whether an anchor lies in one of the frame's discs."""
     at = (scene.observed.features[..., 2:4] + 1) / 2
     inside = torch.zeros_like(scene.valid)
-    for disc in range(_DISCS):
-        centre = torch.stack([((frames * _DISCS + disc + 1) * step) % 1 for step in _STEPS], -1)
-        inside = inside | ((at - centre[:, None]).square().sum(-1) < _RADIUS**2)
+    for disc in range(MODEL.discs):
+        centre = torch.stack(
+            [((frames * MODEL.discs + disc + 1) * step) % 1 for step in (MODEL.step_u, MODEL.step_v)], -1
+        )
+        inside = inside | ((at - centre[:, None]).square().sum(-1) < MODEL.radius**2)
     return inside

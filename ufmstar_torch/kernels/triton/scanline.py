@@ -29,8 +29,8 @@ class Rows:
         moments: [B H, M, 7] float64.
         whole: [B H, M, 4] int32.
         count: [B H] int32.
-        owner: [B H, W] int32, which of the row's starts a pixel belongs to, -1 = none; None without labels.
-        place: [B H, W] int32, the finished segment of every start, -1 = too sparse; None likewise.
+        owner: [B H, W] int32, which of the row's starts a pixel belongs to, -1 = none (int16 where it holds W).
+        place: [B H, W] int32, the finished segment of every start, -1 = too sparse; likewise.
     """
 
     camera: Tensor
@@ -38,18 +38,18 @@ class Rows:
     moments: Tensor
     whole: Tensor
     count: Tensor
-    owner: Tensor | None
-    place: Tensor | None
+    owner: Tensor
+    place: Tensor
 
 
-def scanlines(given: SegmentInput, *, labels: bool) -> Rows:
+def scanlines(given: SegmentInput) -> Rows:
     """Cut every row into segments (``segment_scanline.scanlines``), in two launches."""
     b, height, width = given.depth.shape
     device, limits = given.depth.device, given.config
     most, rows = given.segments_per_row, b * height
 
-    def whole(*shape: int) -> Tensor:
-        return torch.empty(*shape, dtype=torch.int32, device=device)
+    def whole(*shape: int, dtype: torch.dtype = torch.int32) -> Tensor:
+        return torch.empty(*shape, dtype=dtype, device=device)
 
     camera, depth = given.intrinsics.to(torch.float64).contiguous(), given.depth.contiguous()
     valid = depth if given.valid is None else given.valid.contiguous()
@@ -61,17 +61,18 @@ def scanlines(given: SegmentInput, *, labels: bool) -> Rows:
         number=given.depth_bins, shortest=float(limits.min_gaussian_length),
         longest=float(limits.frame_max_scale * limits.min_gaussian_length), chunk=1024,
     )  # fmt: skip
+    narrow = torch.int16 if width < 2**15 else torch.int32
     moments = torch.empty(rows, most, MOMENTS, dtype=torch.float64, device=device)
     found = Rows(
         camera, lengths2, moments, whole(rows, most, WHOLE), whole(rows),
-        whole(rows, width) if labels else None, whole(rows, width) if labels else None,
+        whole(rows, width, dtype=narrow), whole(rows, width, dtype=narrow),
     )  # fmt: skip
     lanes = min(power_of_two(rows), 256) if interpreted() else 32  # the interpreter takes as long for one as for many
     launch(
         _scanline, (triton.cdiv(rows, lanes),), depth, valid, spread, camera, lengths2, bins,
-        found.moments, found.whole, found.count, _or(found.owner, bins), _or(found.place, bins), rows, height, width,
+        found.moments, found.whole, found.count, found.owner, found.place, rows, height, width,
         most,
-        masked=given.valid is not None, spread_out=given.variance is not None, labels=labels,
+        masked=given.valid is not None, spread_out=given.variance is not None,
         scale=float(limits.adaptive_thresh_scale), reference=float(limits.reference_focal),
         scaled=limits.scale_with_image, noise_floor=float(limits.noise_floor), noise_thresh=float(limits.noise_thresh),
         line_thresh=float(limits.line_thresh), max_depth=float(limits.depth_limit), gap=limits.occlusion_gap,
@@ -79,10 +80,6 @@ def scanlines(given: SegmentInput, *, labels: bool) -> Rows:
         number=given.depth_bins, lanes=lanes, warps=1,
     )  # fmt: skip
     return found
-
-
-def _or(value: Tensor | None, other: Tensor) -> Tensor:
-    return other if value is None else value
 
 
 @triton.jit
@@ -118,7 +115,7 @@ def _bins(
 @triton.jit
 def _finish(
     done, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole, place, count, r,
-    most, width, labels: tl.constexpr, sparse: tl.constexpr,
+    most, width, sparse: tl.constexpr,
 ):  # fmt: skip
     """Write the segments of the mask ``done`` [R, Q], one a row; returns the new number of the rows' segments."""
     keep = done & (n > sparse)
@@ -137,15 +134,14 @@ def _finish(
     tl.store(out + 1, nearest, mask=keep)
     tl.store(out + 2, u_left, mask=keep)
     tl.store(out + 3, u_right, mask=keep)
-    if labels:
-        tl.store(place + r[:, None] * width + born, tl.where(keep, count[:, None], -1), mask=done)
+    tl.store(place + r[:, None] * width + born, tl.where(keep, count[:, None], -1), mask=done)
     return count + tl.sum(keep.to(tl.int32), 1)
 
 
 @triton.jit
 def _scanline(
     depth, valid, spread, camera, lengths2, bins, moments, whole, counts, owner, place, rows, height, width, most,
-    masked: tl.constexpr, spread_out: tl.constexpr, labels: tl.constexpr,
+    masked: tl.constexpr, spread_out: tl.constexpr,
     scale: tl.constexpr, reference: tl.constexpr, scaled: tl.constexpr, noise_floor: tl.constexpr,
     noise_thresh: tl.constexpr, line_thresh: tl.constexpr, max_depth: tl.constexpr, gap: tl.constexpr,
     n_check: tl.constexpr, sparse: tl.constexpr, max_open: tl.constexpr, places: tl.constexpr,
@@ -205,7 +201,7 @@ def _scanline(
         if tl.max(tl.max(pushed.to(tl.int32), 1), 0) > 0:
             count = _finish(
                 pushed, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
-                place, count, r, most, width, labels, sparse,
+                place, count, r, most, width, sparse,
             )  # fmt: skip
         target = opened | (fits & (born == newest[:, None]))
         n, u_left, nearest = tl.where(opened, 0, n), tl.where(opened, u, u_left), tl.where(opened, k, nearest)
@@ -225,15 +221,14 @@ def _scanline(
         w2 = tl.where(target, ex * ex + y_factor * (ez * ez), w2)
         dx, dz = tl.where(target, dx + ex, dx), tl.where(target, dz + ez, dz)
         dxx, dxz, dzz = tl.where(target, xx, dxx), tl.where(target, xz, dxz), tl.where(target, zz, dzz)
-        if labels:
-            of = tl.sum(tl.where(target, born, 0), 1)
-            tl.store(owner + at, tl.where(use, of, -1), mask=real_row)
+        of = tl.sum(tl.where(target, born, 0), 1)
+        tl.store(owner + at, tl.where(use, of, -1), mask=real_row)
     for _ in range(max_open):
         newest = tl.max(tl.where(n > 0, born, -1), 1)
         last = (n > 0) & (born == newest[:, None])
         count = _finish(
             last, n, u_left, u_right, nearest, born, x_left, z_left, dx, dz, dxx, dxz, dzz, moments, whole,
-            place, count, r, most, width, labels, sparse,
+            place, count, r, most, width, sparse,
         )  # fmt: skip
         n = tl.where(last, 0, n)
     tl.store(counts + r, count, mask=real_row)

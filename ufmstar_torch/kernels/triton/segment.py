@@ -7,7 +7,9 @@ what is kept goes straight to its slot of the mixture.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import triton
@@ -19,7 +21,7 @@ from ufmstar_torch.kernels.triton.launch import launch, power_of_two
 from ufmstar_torch.kernels.triton.matrices import floored, store_symmetric
 from ufmstar_torch.kernels.triton.scanline import Rows, scanlines, slope_of
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.segment import _most_kept
+from ufmstar_torch.segment import most_kept
 from ufmstar_torch.segment_input import SegmentInput
 
 _PRUNE = {"none": 0, "both": 1, "either": 2}
@@ -40,32 +42,30 @@ class Floor:
 
 def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, float64 inside, with its capacity on an accelerator."""
-    mixture, labels = fit(given, before_pruning=before_pruning)
-    assert labels is not None
-    return mixture, labels.to(torch.int64)
+    mixture, read_labels = fit(given, before_pruning=before_pruning)
+    return mixture, read_labels()
 
 
 def fit(
-    given: SegmentInput, *, before_pruning: bool = False, labels: bool = True, floor: Floor | None = None
-) -> tuple[GaussianMixture, Tensor | None]:
+    given: SegmentInput, *, before_pruning: bool = False, floor: Floor | None = None
+) -> tuple[GaussianMixture, Callable[[], Tensor]]:
     """The Gaussians of B depth maps.
 
     Args:
         given: checked.
         before_pruning: keep every Gaussian.
-        labels: whether to label the pixels.
-        floor: of the covariances; the mixture is float64 then. None = none, in the dtype that ``given`` asks for.
+        floor: of the covariances; the mixture is float64 then. None = none, in the dtype that ``given`` states.
 
     Returns:
-        The mixture [B, C] and labels [B, H, W] int32 or None.
+        The mixture [B, C], and a function that writes and returns the labels [B, H, W] int64.
     """
     b, height, _ = given.depth.shape
     device = given.depth.device
     most = given.segments_per_row
     total = most * height
-    capacity = total if before_pruning else min(total, _most_kept(given))
+    capacity = total if before_pruning else min(total, most_kept(given))
     channels = 0 if given.features is None else given.features.shape[1]
-    rows = scanlines(given, labels=labels or channels > 0)
+    rows = scanlines(given)
     dtype = given.dtype if floor is None else torch.float64
     mixture = GaussianMixture.empty(b, capacity, features=channels, dtype=dtype, device=device)
     member = torch.empty(b * height, most, dtype=torch.int32, device=device)
@@ -83,18 +83,16 @@ def fit(
         near_plane=floor.near_plane if floor else 0.0, epsilon=floor.epsilon if floor else 0.0,
         pixel_variance=PIXEL_VARIANCE, lanes=lanes, warps=max(1, min(8, lanes // 32)),
     )  # fmt: skip
-    if rows.owner is None:
-        return mixture, None
-    slots = _labelled(rows, member, slot_of, given)
+    read_labels = partial(_labelled, rows, member, slot_of, given.depth.shape)
     if given.features is not None:
-        _average(given.features, slots, mixture)
-    return mixture, slots if labels else None
+        _average(given.features, read_labels(), mixture)
+    return mixture, read_labels
 
 
-def _labelled(rows: Rows, member: Tensor, slot_of: Tensor, given: SegmentInput) -> Tensor:
-    """[B, H, W] int32 the slot of every pixel, -1 = none."""
-    b, height, width = given.depth.shape
-    out = torch.empty(b, height, width, dtype=torch.int32, device=member.device)
+def _labelled(rows: Rows, member: Tensor, slot_of: Tensor, shape: torch.Size) -> Tensor:
+    """[B, H, W] int64 the slot of every pixel, -1 = none."""
+    b, height, width = shape
+    out = torch.empty(b, height, width, dtype=torch.int64, device=member.device)
     launch(
         _label, (triton.cdiv(height * width, 1024), b), rows.owner, rows.place, member, slot_of, out, height, width,
         member.shape[1], slot_of.shape[1], chunk=1024,

@@ -1,0 +1,107 @@
+"""What several sequences compute at once: a network predicts for their images, UfM* takes in their depth maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ufmstar_torch.eval.engine.clock import StageTimer
+from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput, Gaussians
+from ufmstar_torch.eval.engine.networks import NetworkSource
+from ufmstar_torch.eval.engine.predictions import DepthSource, FramePredictions
+from ufmstar_torch.eval.engine.rows import RowInput, RowRunner
+
+
+@dataclass(frozen=True, eq=False)
+class Inference:
+    """What a row needs of a frame's predictions.
+
+    Attributes:
+        predictions: of the frame.
+        source, position, every: as ``FramePredictions.of``.
+    """
+
+    predictions: FramePredictions
+    source: DepthSource
+    position: int
+    every: bool
+
+
+@dataclass(eq=False)
+class Update:
+    """A frame for a row's estimator.
+
+    Attributes:
+        row: which.
+        given: the frame.
+        answer: of the estimator: its estimate, or the error that the frame raises.
+        ms: of the estimator; of a batch, divided by its frames [ms].
+    """
+
+    row: RowRunner
+    given: RowInput
+    answer: Estimate | RuntimeError | ValueError | None = None
+    ms: float = 0.0
+
+    def answered(self) -> Estimate:
+        """The estimate; an error is raised."""
+        assert self.answer is not None
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+
+def infer_together(wanted: Sequence[Inference]) -> None:
+    """Make the inferences of several frames, as one batch of every network; those of one frame are left to it.
+
+    Inferences that fail together are left to each frame as well, which then meets its own error.
+    """
+    if len({one.predictions for one in wanted}) < 2:
+        return
+    frames: dict[tuple[object, int], dict[FramePredictions, NetworkSource]] = {}
+    for one in wanted:
+        if isinstance(one.source, NetworkSource) and one.source.batches:
+            for n in one.predictions.missing(one.source, one.position, one.every):
+                frames.setdefault((one.source.digest or one.source, n), {})[one.predictions] = one.source
+    for (_, n), sources in frames.items():
+        together = [known for known in sources if known.frame.image is not None]
+        if len(together) > 1:
+            source = next(iter(sources.values()))
+            try:
+                made = source.several([known.frame for known in together], n)
+            except (RuntimeError, ValueError):
+                continue
+            for known, prediction in zip(together, made, strict=True):
+                known.add(source, n, prediction)
+
+
+def update_together(updates: Sequence[Update]) -> None:
+    """Answer updates of different estimators; streams of one UfM* are one batch."""
+    batches: dict[object, list[Update]] = {}
+    for n, update in enumerate(updates):
+        estimator = update.row.estimator
+        batch = estimator.batch(update.given.prediction) if isinstance(estimator, Gaussians) else n
+        batches.setdefault(batch, []).append(update)
+    for batch in batches.values():
+        timer = StageTimer(batch[0].row.device)
+        with timer.stage("uncertainty"):
+            answers = _answers([one.row.estimator for one in batch], [one.given.of_estimator() for one in batch])
+        ms = timer.take()["uncertainty"] / len(batch)
+        for update, answer in zip(batch, answers, strict=True):
+            update.answer, update.ms = answer, ms
+
+
+def _answers(
+    estimators: Sequence[Estimator], inputs: Sequence[EstimatorInput]
+) -> Sequence[Estimate | RuntimeError | ValueError]:
+    """Of one estimator, or of streams of one UfM*."""
+    streams = [estimator for estimator in estimators if isinstance(estimator, Gaussians)]
+    try:
+        if streams:
+            return Gaussians.update_together(streams, inputs)
+        return [estimators[0].update(inputs[0].prediction, inputs[0].T_world_cam, inputs[0].anchors)]
+    except (RuntimeError, ValueError) as error:
+        if len(estimators) == 1:
+            return [error]
+    # UfM* has taken in nothing: one of the frames is at fault.
+    return [_answers([one], [given])[0] for one, given in zip(estimators, inputs, strict=True)]

@@ -1,0 +1,132 @@
+"""From pixels to the posterior's nodes and back, on the CPU (numba)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.compile_cpu import OPTIONS
+from ufmstar_torch.kernels.field_cpu import Floats, fast
+from ufmstar_torch.posterior.model import Model
+
+# What is claimed may be NaN.
+with_nan: Any = njit(**OPTIONS, fastmath={"contract", "reassoc", "nsz", "arcp"})
+
+
+def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: int) -> Floats:
+    """Mean of log d over the valid pixels of every cell [rows cols]; a cell covers every pixel that it touches."""
+    total, count = np.zeros((2, rows, cols))
+    _add_up(logs, valid, total, count)
+    mean = total / np.maximum(count, 1)
+    return np.where(count > 0, mean, mean.sum() / max(np.count_nonzero(count), 1)).ravel()
+
+
+@fast
+def _add_up(logs, valid, total, count):
+    """Sums over the cells."""
+    height, width = logs.shape
+    rows, cols = total.shape
+    for row in range(rows):
+        for i in range(row * height // rows, ((row + 1) * height + rows - 1) // rows):
+            for c in range(cols):
+                inside, used = 0.0, 0
+                for j in range(c * width // cols, ((c + 1) * width + cols - 1) // cols):
+                    if valid[i, j]:
+                        inside += logs[i, j]
+                        used += 1
+                total[row, c] += inside
+                count[row, c] += used
+
+
+def features(logs: Floats, u: Floats, v: Floats, hats: int) -> Floats:
+    """[N, F] of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
+    out = np.empty((len(logs), 4 + hats * hats))
+    _fill(logs, u, v, hats, out)
+    return out
+
+
+@fast
+def _fill(logs, u, v, hats, out):
+    for k in range(len(out)):
+        row = out[k]
+        row[0], row[1], row[2], row[3] = 1.0, logs[k], 2 * u[k] - 1, 2 * v[k] - 1
+        for i in range(hats):
+            across = max(1 - abs(u[k] * (hats - 1) - i), 0.0)
+            for j in range(hats):
+                row[4 + j * hats + i] = across * max(1 - abs(v[k] * (hats - 1) - j), 0.0)
+
+
+def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int64]) -> Floats:
+    """[N] largest less smallest log d of the valid pixels among a valid one and its neighbours."""
+    out = np.empty(len(index))
+    _highest_over_lowest(depth, valid, index, out)
+    return np.log(out)
+
+
+@fast
+def _highest_over_lowest(depth, valid, index, out):
+    height, width = depth.shape
+    for k in range(len(index)):
+        row, column = index[k] // width, index[k] % width
+        low = high = np.float64(depth[row, column])
+        for i in range(max(row - 1, 0), min(row + 2, height)):
+            for j in range(max(column - 1, 0), min(column + 2, width)):
+                if valid[i, j]:
+                    low, high = min(low, np.float64(depth[i, j])), max(high, np.float64(depth[i, j]))
+        out[k] = high / low
+
+
+def read(
+    depth: NDArray[Any], valid: NDArray[np.bool_], logs: NDArray[Any], claimed: NDArray[Any], nodes: Floats,
+    coefficients: Floats, mean: float, size: tuple[int, int], model: Model,
+) -> tuple[NDArray[Any], NDArray[Any]]:  # fmt: skip
+    """As :func:`ufmstar_torch.posterior.read.read`, with log d and all that UfM* claims."""
+    rows, cols = size
+    width = depth.shape[1]
+    u = (np.arange(width) + 0.5) / width
+    between = (u * cols - 0.5).clip(0, cols - 1)
+    before = np.minimum(between.astype(np.int64), max(cols - 2, 0))
+    lines = np.ascontiguousarray(nodes.reshape(rows, cols, 4).transpose(0, 2, 1))
+    left, right = lines.take(before, 2), lines.take(np.minimum(before + 1, cols - 1), 2)
+    y, spread = np.empty_like(logs), np.empty_like(logs)
+    base = coefficients[0] - coefficients[1] * mean + coefficients[2] * (2 * u - 1)
+    slopes = coefficients[1], coefficients[3]
+    limits = model.alike**2, model.claimed, model.largest
+    _pixels(depth, valid, logs, claimed, left, right, between - before, base, slopes, limits, y, spread)
+    factor = np.exp(y, out=y)
+    return depth * factor, spread * factor * factor
+
+
+@with_nan
+def _pixels(depth, valid, logs, claimed, left, right, across, base, slopes, limits, y, spread):
+    """y [H, W] and the variance of d e^y over e^2y, at every pixel; y is NaN where not valid.
+
+    ``left`` and ``right`` [R, 4, W] are the nodes before and after each column, ``across`` by how much the one after it
+    counts. The four weights s/(1 + D^2) have the quotients of s times the other three denominators.
+    """
+    height, rows = len(logs), len(left)
+    alike, claim, largest = limits
+    by_depth, by_row = slopes
+    for i in range(height):
+        v = (i + 0.5) / height
+        at = min(max(v * rows - 0.5, 0.0), rows - 1.0)
+        top = min(int(at), max(rows - 2, 0))
+        below, low = at - top, min(top + 1, rows - 1)
+        n0, n1, n2, n3 = left[top], right[top], left[low], right[low]
+        depths, used, gs, Vs, ys, out = depth[i], valid[i], logs[i], claimed[i], y[i], spread[i]
+        for j in range(len(across)):
+            g, d, V, beside = np.float64(gs[j]), np.float64(depths[j]), np.float64(Vs[j]), across[j]
+            a0, a1, a2, a3 = g - n0[0, j], g - n1[0, j], g - n2[0, j], g - n3[0, j]
+            q0, q1, q2, q3 = alike + a0 * a0, alike + a1 * a1, alike + a2 * a2, alike + a3 * a3
+            w0, w1 = (1 - below) * (1 - beside) * q1 * (q2 * q3), (1 - below) * beside * q0 * (q2 * q3)
+            w2, w3 = below * (1 - beside) * q3 * (q0 * q1), below * beside * q2 * (q0 * q1)
+            share = 1 / (w0 + w1 + w2 + w3)
+            offset = w0 * n0[1, j] + w1 * n1[1, j] + w2 * n2[1, j] + w3 * n3[1, j]
+            own = w0 * n0[2, j] + w1 * n1[2, j] + w2 * n2[2, j] + w3 * n3[2, j]
+            unseen = w0 * n0[3, j] + w1 * n1[3, j] + w2 * n2[3, j] + w3 * n3[3, j]
+            value = base[j] + by_depth * g + by_row * (2 * v - 1) + offset * share
+            ys[j] = min(max(value, -largest), largest) if used[j] else np.nan
+            out[j] = (own * d * d + unseen * (claim * V if V == V else 0.0)) * share

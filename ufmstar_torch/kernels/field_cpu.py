@@ -1,0 +1,260 @@
+"""The field on the CPU (numba), float64: its precision is eliminated row by row in a window of 32 nodes.
+
+On C columns a node is linked to none farther than C places before or behind it, and elimination links only what lies
+between: a window of C + 1 nodes is a full matrix, into which nodes enter and from which they leave in order. The
+covariance within the window follows backwards from the factor (Takahashi's equations), and with it all marginal
+variances. Node i has the place i mod 32, so that every loop runs over rows of one fixed length.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.compile_cpu import OPTIONS, kernel, part
+
+WINDOW = 32
+# Right-hand sides: the features and y, and zeros to a multiple of four.
+RIGHT = 16
+_WIDTH = WINDOW + RIGHT
+
+# Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
+fast: Any = njit(**OPTIONS, fastmath=True)
+Floats = NDArray[np.float64]
+
+
+class Field(NamedTuple):
+    """One stream's :class:`ufmstar_torch.posterior.field.Field`."""
+
+    coefficients: Floats
+    covariance: Floats
+    offset: Floats
+    response: Floats
+    variance: Floats
+
+
+class Prior(NamedTuple):
+    """One stream's :class:`ufmstar_torch.posterior.field.Prior`; F + 1 is at most ``RIGHT``, ``cols`` < ``WINDOW``."""
+
+    diagonal: Floats
+    right: Floats
+    down: Floats
+    mean: Floats
+    precision: Floats
+    cols: int
+
+
+class Observed(NamedTuple):
+    """One stream's :class:`ufmstar_torch.posterior.field.Observed`."""
+
+    node: NDArray[np.int64]
+    features: Floats
+    value: Floats
+
+
+def given(prior: Prior, observed: Observed, weight: Floats) -> Field:
+    """As :meth:`ufmstar_torch.posterior.field.Field.given`."""
+    n, F = len(prior.diagonal), len(prior.mean)
+    nodes, offset, coefficients = np.zeros((n, RIGHT)), np.empty(n), prior.mean.copy()
+    diagonal, precision, right_side = prior.diagonal.copy(), prior.precision.copy(), np.zeros(F)
+    _gather(*observed, weight, prior.mean, diagonal, nodes, precision, right_side)
+    solved, variance = solve(diagonal, prior.right, prior.down, nodes, prior.cols)
+    _give_way(nodes, solved, precision, right_side)
+    _invert(precision)
+    _back(precision, right_side, solved, coefficients, offset)
+    return Field(coefficients, precision, offset, solved[:, :F], variance)
+
+
+@fast
+def _gather(node, features, value, weight, mean, diagonal, nodes, precision, right_side):
+    """The observations' part of what is prior to begin with: w at the diagonal of their nodes, w x and w (y - x b_0)
+    at their right-hand sides, x w x^T and x w (y - x b_0) at the coefficients'."""
+    F = len(mean)
+    for k in range(len(node)):
+        x, row, w, left = features[k], nodes[node[k]], weight[k], value[k]
+        for f in range(F):
+            left -= x[f] * mean[f]
+        diagonal[node[k]] += w
+        row[F] += w * left
+        for f in range(F):
+            row[f] += w * x[f]
+            right_side[f] += w * x[f] * left
+            for g in range(F):
+                precision[f, g] += w * x[f] * x[g]
+
+
+@fast
+def _give_way(nodes, solved, precision, right_side):
+    """The Schur complement: what the field explains of the observations is left out of the coefficients' part."""
+    F = len(right_side)
+    for i in range(len(nodes)):
+        x, y = nodes[i], solved[i]
+        if x[0] > 0:  # observed; the first feature is 1
+            for f in range(F):
+                right_side[f] -= x[f] * y[F]
+                for g in range(F):
+                    precision[f, g] -= x[f] * y[g]
+
+
+@fast
+def _invert(A):
+    """A positive definite matrix [F, F], in place, one pivot after the other (Gauss-Jordan)."""
+    for k in range(len(A)):
+        pivot = 1 / A[k, k]
+        A[k, k] = 1.0
+        for c in range(len(A)):
+            A[k, c] *= pivot
+        for r in range(len(A)):
+            if r != k:
+                times = A[r, k]
+                A[r, k] = 0.0
+                for c in range(len(A)):
+                    A[r, c] -= times * A[k, c]
+
+
+@fast
+def _back(covariance, right_side, solved, coefficients, offset):
+    """What the observations add to the coefficients, and the mean of the field."""
+    F = len(right_side)
+    b = np.zeros(F)
+    for f in range(F):
+        for g in range(F):
+            b[f] += covariance[f, g] * right_side[g]
+        coefficients[f] += b[f]
+    for i in range(len(offset)):
+        offset[i] = solved[i, F]
+        for f in range(F):
+            offset[i] -= solved[i, f] * b[f]
+
+
+def at(field: Field, node: NDArray[np.int64], features: Floats) -> tuple[Floats, Floats]:
+    """As :meth:`ufmstar_torch.posterior.field.Field.at`."""
+    mean, variance = field.offset[node], field.variance[node]
+    _add_coefficients(features, features - field.response[node], field.coefficients, field.covariance, mean, variance)
+    return mean, variance
+
+
+@fast
+def _add_coefficients(features, left, b, covariance, mean, variance):
+    """x . b, and the variance of what is ``left`` of x."""
+    F = len(b)
+    for k in range(len(features)):
+        x = left[k]
+        for f in range(F):
+            mean[k] += features[k, f] * b[f]
+            along = 0.0
+            for g in range(F):
+                along += covariance[f, g] * x[g]
+            variance[k] += along * x[f]
+
+
+def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: int) -> tuple[Floats, Floats]:
+    """A^-1 columns [n, RIGHT], and the diagonal of A^-1, as :func:`ufmstar_torch.posterior.field.solve`."""
+    n = len(diagonal)
+    factor, solved, variance = np.empty((n, _WIDTH)), np.empty((n, RIGHT)), np.empty(n)
+    _eliminate(diagonal, right, down, columns, cols, np.zeros((WINDOW, _WIDTH)), factor)
+    _covary(factor, np.zeros((WINDOW, _WIDTH)), np.empty(_WIDTH), solved, variance)
+    return solved, variance
+
+
+@fast
+def _eliminate(diagonal, right, down, columns, cols, window, factor):
+    """Row j of the factor [n, 48] has the entries of the window's nodes at their places, then the right-hand sides."""
+    n = len(diagonal)
+    for j in range(-cols, n):
+        if j + cols < n:
+            _enter(window, j + cols, diagonal, right, down, columns, cols)
+        if j < 0:
+            continue
+        own, row = j % WINDOW, factor[j]
+        scale = 1 / np.sqrt(window[own, own])
+        for c in range(_WIDTH):
+            row[c] = window[own, c] * scale
+        for k in range(WINDOW):
+            other, times = window[k], row[k]
+            for c in range(_WIDTH):
+                other[c] -= times * row[c]
+        for k in range(WINDOW):
+            window[k, own] = 0.0
+        for c in range(_WIDTH):
+            window[own, c] = 0.0
+
+
+@part
+def _enter(window, i, diagonal, right, down, columns, cols):
+    """Node i with its links to those before it, at a place that is 0."""
+    own, n = i % WINDOW, len(diagonal)
+    total = diagonal[i]
+    if (i + 1) % cols:
+        total += right[i]
+    if i + cols < n:
+        total += down[i]
+    if i % cols:
+        total += right[i - 1]
+        window[own, (i - 1) % WINDOW] -= right[i - 1]
+        window[(i - 1) % WINDOW, own] -= right[i - 1]
+    if i >= cols:
+        total += down[i - cols]
+        window[own, (i - cols) % WINDOW] -= down[i - cols]
+        window[(i - cols) % WINDOW, own] -= down[i - cols]
+    window[own, own] += total
+    for c in range(RIGHT):
+        window[own, WINDOW + c] = columns[i, c]
+
+
+@fast
+def _covary(factor, window, out, solved, variance):
+    """Backwards through the factor, of which the diagonal is overwritten."""
+    for j in range(len(factor) - 1, -1, -1):
+        own, row = j % WINDOW, factor[j]
+        scale = 1 / row[own]
+        row[own] = 0.0
+        for c in range(_WIDTH):
+            out[c] = 0.0
+        for k in range(0, WINDOW, 4):
+            one, two, three, four = row[k], row[k + 1], row[k + 2], row[k + 3]
+            for c in range(_WIDTH):
+                first = one * window[k, c] + two * window[k + 1, c]
+                out[c] += first + three * window[k + 2, c] + four * window[k + 3, c]
+        along = 1.0
+        for c in range(WINDOW):
+            along += out[c] * row[c]
+            window[own, c] = -scale * out[c]
+            window[c, own] = -scale * out[c]
+        variance[j] = window[own, own] = scale * scale * along
+        for c in range(RIGHT):
+            solved[j, c] = window[own, WINDOW + c] = scale * (row[WINDOW + c] - out[WINDOW + c])
+
+
+def distance(source: NDArray[np.bool_], right: Floats, down: Floats, cols: int, limit: float) -> Floats:
+    """As :func:`ufmstar_torch.posterior.distance.distance`."""
+    way = np.where(source, 0.0, limit)
+    _sweep(way, right, down, cols)
+    return way
+
+
+@kernel
+def _sweep(way, right, down, cols):
+    """Forth and back until nothing gets shorter."""
+    n, shorter = len(way), True
+    while shorter:
+        shorter = False
+        for i in range(n):
+            best = way[i]
+            if i % cols and way[i - 1] + right[i - 1] < best:
+                best = way[i - 1] + right[i - 1]
+            if i >= cols and way[i - cols] + down[i - cols] < best:
+                best = way[i - cols] + down[i - cols]
+            shorter = shorter or best < way[i]
+            way[i] = best
+        for i in range(n - 1, -1, -1):
+            best = way[i]
+            if (i + 1) % cols and way[i + 1] + right[i] < best:
+                best = way[i + 1] + right[i]
+            if i + cols < n and way[i + cols] + down[i] < best:
+                best = way[i + cols] + down[i]
+            shorter = shorter or best < way[i]
+            way[i] = best
