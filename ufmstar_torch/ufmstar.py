@@ -33,7 +33,7 @@ from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
-from ufmstar_torch.spill import Spill
+from ufmstar_torch.spill import Spill, Spilled
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import Step, StepObserver
@@ -313,6 +313,11 @@ class UfMStar(StatefulModule):
         """The state as a step (``ufmstar_torch.step``) takes it."""
         self._settle()
         return self._stored()
+
+    @property
+    def spilled(self) -> Spilled | None:
+        """What ``config.spill`` keeps out of memory; None without it."""
+        return None if self._spill is None else self._spill.spilled(self.state)
 
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.

@@ -8,13 +8,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ufmstar_torch.kernels.compile_cpu import OPTIONS
 from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.model import Model
 
 # What is claimed may be NaN.
-with_nan: Any = njit(
-    cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, fastmath={"contract", "reassoc", "nsz", "arcp"}
-)
+with_nan: Any = njit(**OPTIONS, fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: int) -> Floats:

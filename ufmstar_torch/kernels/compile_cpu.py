@@ -12,7 +12,9 @@ from typing import Any
 from numba import njit
 from numba.extending import register_jitable
 
-kernel: Any = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+kernel: Any = njit(**OPTIONS)
 part: Any = register_jitable(error_model="numpy")
 
 # A part that allocates nothing; the kernel that calls it holds its arrays. numba counts the references of every view of

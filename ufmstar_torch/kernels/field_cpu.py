@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import OPTIONS, kernel, part
 
 WINDOW = 32
 # Right-hand sides: the features and y, and zeros to a multiple of four.
@@ -22,7 +22,7 @@ RIGHT = 16
 _WIDTH = WINDOW + RIGHT
 
 # Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
-fast: Any = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=True)
+fast: Any = njit(**OPTIONS, fastmath=True)
 Floats = NDArray[np.float64]
 
 
