@@ -61,7 +61,7 @@ def regress_maps(
             calls += [(z[b], K[b], *fields, *settings, out[b], features[b], i, shares) for i in range(shares)]
             continue
         view = in_view(*fields, K[b], *z.shape[1:], *settings, z.dtype.type(0))
-        if kernel is exact:
+        if pixels is None:
             calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
         else:
             calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, fields[4], out[b], features[b]))
