@@ -123,6 +123,14 @@ def test_a_wrong_camera_is_learnt():
     assert errors.camera(K)[0, 0] > 1.002 * K[0, 0]
 
 
+def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
+    errors, found, *_ = known(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
+    pixel, _, views = scene(5)
+    before = errors.camera(K)
+    errors.corrected(pixel, found, SHARES, views, K, 2.0, trusted=False)
+    np.testing.assert_array_equal(errors.camera(K), before)
+
+
 def test_nothing_measured_leaves_what_is_believed_of_the_poses():
     errors, found, *_ = known(3)
     pixel, _, views = scene(5)
