@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from torch import Tensor
 from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.given import Anchors
 
+if TYPE_CHECKING:
+    from ufmstar_torch.kernels.triangulate_cpu import Triangulated
+
 # Tracks by which a frame's poses are judged.
 _ENOUGH = 5
 # Errors of a tracked position add up from view to view: the variance of a track of v views is _DRIFT (v - 1) times that
@@ -26,6 +29,8 @@ _DRIFT = 0.6
 # Share of the running estimate of the residuals' variance that remains after a frame; views of the tracks that it is
 # from.
 _MEMORY, _LONG = 0.8, 4
+# Of the median depth: nearer, a point's position in an image is not computed but bounded.
+_NEAREST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -169,6 +174,7 @@ class LandmarkTracker:
         self._poses = np.tile(np.eye(4), (w, 1, 1))
         self._view = -1
         self._noise = self.config.pixel_noise**2
+        self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
 
     def state(self) -> dict[str, Tensor]:
         """A copy of all that is remembered, for :meth:`load_state`: the window, and the last image in gray."""
@@ -193,6 +199,7 @@ class LandmarkTracker:
         )
         self._gray, self._K = (gray, K) if gray.size else (None, None)
         self._view, self._noise = int(state["view"]), float(state["noise"])
+        self._triangulated()
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -217,7 +224,7 @@ class LandmarkTracker:
         if self._gray is not None and self._K is not None:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
                 raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
-            position, alive = self._followed(gray)
+            position, alive = self._followed(gray, T)
         else:
             position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)
         self._view = (self._view + 1) % self.config.window
@@ -230,12 +237,33 @@ class LandmarkTracker:
         self._gray, self._K = gray, K
         return self._landmarks(tracked)
 
-    def _followed(self, gray: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
+    def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
         position, alive = self._pixel[:, self._view].copy(), self._seen[:, self._view].copy()
         if alive.any() and self._gray is not None:
-            position[alive], alive[alive] = follow(self._gray, gray, position[alive], self.config.back_tolerance)
+            start, expected = position[alive], self._expected(alive, T)
+            position[alive], alive[alive] = follow(self._gray, gray, start, self.config.back_tolerance, expected)
         return position, alive
+
+    def _expected(self, chosen: NDArray[np.bool_], T: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Where the chosen corners of the last image should be in that of a camera T [4, 4]: each moves as its point
+        does. One without a point has the others' median depth; None where too few have one."""
+        last, K = self._poses[self._view], self._K
+        assert K is not None
+        position, point = self._pixel[chosen, self._view], self._point[chosen]
+        depth = (point - last[:3, 3]) @ last[:3, 2]
+        known = np.isfinite(depth)
+        if known.sum() < _ENOUGH:
+            return None
+        rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
+        guess = np.median(depth[known]) * rays @ last[:3, :3].T + last[:3, 3]
+        point = np.where(known[:, None], point, guess)
+
+        def seen_by(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+            cam = (point - pose[:3, 3]) @ pose[:3, :3]
+            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], _NEAREST * np.median(depth[known])))
+
+        return np.asarray(position + seen_by(T) - seen_by(last))
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
         """New corners in free slots, away from those that are followed."""
@@ -251,15 +279,26 @@ class LandmarkTracker:
         self._seen[slots, self._view] = True
         self._pixel[slots, self._view] = result
 
-    def _landmarks(self, tracked: int) -> Landmarks:
-        """What the views in the window say of the corners that the newest one shows."""
-        config = self.config
-        chosen = self._seen[:, self._view] & (self._seen.sum(1) >= config.min_views)
+    def _triangulated(self) -> tuple[NDArray[np.bool_], Triangulated | None]:
+        """Which corners of the newest image have views enough in the window [N], and their points; those that fit are
+        remembered."""
+        chosen = self._seen[:, self._view] & (self._seen.sum(1) >= self.config.min_views)
+        self._point = np.full((self.config.max_points, 3), np.nan)
         if not chosen.any() or self._K is None:
-            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked)
+            return chosen, None
         from ufmstar_torch.kernels.triangulate_cpu import triangulate  # compiles when it is first needed
 
         result = triangulate(self._pixel[chosen], self._seen[chosen], self._poses, self._K)
+        fine = result.ahead & (result.error <= self.config.max_error)
+        self._point[chosen] = np.where(fine[:, None], result.point, np.nan)
+        return chosen, result
+
+    def _landmarks(self, tracked: int) -> Landmarks:
+        """What the views in the window say of the corners that the newest one shows."""
+        config = self.config
+        chosen, result = self._triangulated()
+        if result is None:
+            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked)
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (result.point - T[:3, 3]) @ axis
