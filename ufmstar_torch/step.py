@@ -10,7 +10,7 @@ float64, so large world coordinates never reach the float32 state, and what a fr
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import partial
@@ -242,34 +242,75 @@ def step(
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
-    chosen = frame.depth if pixels is None else torch.gather(frame.depth.flatten(1), 1, pixels)
-    result, measured = unmeasured.after_regression(result, chosen, config)
-    result, residual = after_regression(result, stream)
+    result, residual, measured = after_regress(result, stream, frame, config, pixels)
     stage("regress")
 
+    counts = {
+        "components": mixture.components,
+        "segments": current_cam.components,
+        "matched": matched.sum(1),
+        "pairs": pairs.match.sum((1, 2)),
+        "new": new.sum(1) - dropped,
+        "dropped": dropped + (current_cam.valid & ~far_enough).sum(1),
+        "valid_pixels": frame.valid.sum((1, 2)),
+        "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
+        "anchors": torch.zeros_like(used) if anchors is None else anchors.valid.sum(1),
+        "anchors_used": used,
+    }
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, kernels.smooth
         )
-    statistics = FrameStatistics(
-        components=mixture.components,
-        segments=current_cam.components,
-        matched=matched.sum(1),
-        pairs=pairs.match.sum((1, 2)),
-        new=new.sum(1) - dropped,
-        dropped=dropped + (current_cam.valid & ~far_enough).sum(1),
-        valid_pixels=frame.valid.sum((1, 2)),
+    updated = after_frame(state, frame, mixture.tensors(), first, smoothed, evidence)
+    out = StepOutput(
+        disagreement, result.features, residual, measured, partial(given, labels), current_cam,
+        frame_statistics(frame, counts),
+    )  # fmt: skip
+    stage("average")
+    return updated, out
+
+
+def after_regress(
+    result: Regression, stream: Tensor | None, frame: FrameInput, config: UfMStarConfig, pixels: Tensor | None
+) -> tuple[Regression, Tensor | None, Tensor]:
+    """Separate what was regressed beside the disagreement, and fill in what was not measured.
+
+    Args:
+        result: of the mixture as ``anchors.hook`` and ``unmeasured`` made it ready.
+        stream: from ``anchors.hook.before_regression``.
+        frame, config, pixels: as :func:`step`.
+
+    Returns:
+        The regression of M and the caller's features; the residual and the share that was measured, as in
+        :class:`~ufmstar_torch.output.StepOutput`.
+    """
+    depth = frame.depth if pixels is None else torch.gather(frame.depth.flatten(1), 1, pixels)
+    result, measured = unmeasured.after_regression(result, depth, config)
+    result, residual = after_regression(result, stream)
+    return result, residual, measured
+
+
+def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameStatistics:
+    """The statistics of a frame, of which the step counted ``counts`` and the check the others."""
+    return FrameStatistics(
+        **counts,
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
-        unmeasured=(measured < unmeasured.HALF).flatten(1).sum(1),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
-        anchors=torch.zeros_like(used) if anchors is None else anchors.valid.sum(1),
-        anchors_used=used,
     )
-    updated = UfMStarState(
-        **mixture.tensors(),
+
+
+def after_frame(
+    state: UfMStarState, frame: FrameInput, mixture: dict[str, Tensor], first: Tensor, smoothed: Tensor,
+    evidence: Evidence,
+) -> UfMStarState:  # fmt: skip
+    """The state after a frame: the mixture's tensors, the first camera's pose, the moving average and the evidence are
+    given; a frame at fault counts as skipped."""
+    fine = frame.fault == 0
+    return UfMStarState(
+        **mixture,
         T_world_first=first,
         started=state.started | fine,
         frames=state.frames + fine,
@@ -279,9 +320,6 @@ def step(
         overall_evidence=evidence.overall,
         posterior=state.posterior,
     )
-    stage("average")
-    out = StepOutput(disagreement, result.features, residual, measured, partial(given, labels), current_cam, statistics)
-    return updated, out
 
 
 def _unobserved(name: str) -> None:

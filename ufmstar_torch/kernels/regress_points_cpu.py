@@ -50,17 +50,6 @@ def _occupied(weight):
 
 
 @kernel
-def unprojected(depth, valid, K, pixels, points):
-    """Points [P, 3] of pixels [P] in the dtype of depth [H, W] (``camera.unproject_at``); NaN where not valid."""
-    real = depth.dtype.type
-    fx, fy, cx, cy = real(K[0, 0]), real(K[1, 1]), real(K[0, 2]), real(K[1, 2])
-    for i in range(pixels.size):
-        v, u = pixels[i] // depth.shape[1], pixels[i] % depth.shape[1]
-        z = depth[v, u] if valid[v, u] else real(np.nan)
-        points[i, 0], points[i, 1], points[i, 2] = (real(u) - cx) / fx * z, (real(v) - cy) / fy * z, z
-
-
-@kernel
 def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
     """Regress m [K] and features [K, F] at points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not
     finite."""
