@@ -29,6 +29,8 @@ _DRIFT = 0.6
 # Share of the running estimate of the residuals' variance that remains after a frame; views of the tracks that it is
 # from.
 _MEMORY, _LONG = 0.8, 4
+# Why an image has no landmark.
+_NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
 # Of the median depth: nearer, a point's position in an image is not computed but bounded.
 _NEAREST = 1e-3
 
@@ -102,7 +104,7 @@ class Landmarks:
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
         confirmed: [N] int64, in how many later views each was confirmed; None = unknown.
-        none: why there is no landmark, where N = 0 and ``tracked`` > 0.
+        none: why there is no landmark, where N = 0.
     """
 
     pixel: NDArray[np.float64]
@@ -110,7 +112,7 @@ class Landmarks:
     variance: NDArray[np.float64]
     tracked: int
     confirmed: NDArray[np.int64] | None = None
-    none: str = "no parallax, or no track that fits the poses"
+    none: str = "no parallax, or no earlier view that agrees"
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
         """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
@@ -177,11 +179,12 @@ class LandmarkTracker:
         self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
 
     def state(self) -> dict[str, Tensor]:
-        """A copy of all that is remembered, for :meth:`load_state`: the window, and the last image in gray."""
+        """All that is remembered, for :meth:`load_state`: the window, and the last image in gray, which is shared and
+        must not be written to."""
         gray = np.zeros((0, 0), dtype=np.uint8) if self._gray is None else self._gray
         K = np.eye(3) if self._K is None else self._K
-        held = {"gray": gray, "K": K, "pixel": self._pixel, "seen": self._seen, "poses": self._poses}
-        own = {name: torch.tensor(value) for name, value in held.items()}
+        held = {"K": K, "pixel": self._pixel, "seen": self._seen, "poses": self._poses}
+        own = {"gray": torch.from_numpy(gray)} | {name: torch.tensor(value) for name, value in held.items()}
         noise = torch.tensor(self._noise, dtype=torch.float64)
         return own | {"view": torch.tensor(self._view), "noise": noise}
 
@@ -194,8 +197,9 @@ class LandmarkTracker:
         shape, own = tuple(state["pixel"].shape), self._pixel.shape
         if shape != own:
             raise ValueError(f"state must be of {own[0]} points in {own[1]} views, got {shape[0]} in {shape[1]}")
-        gray, K, self._pixel, self._seen, self._poses = (
-            np.array(state[name].numpy()) for name in ("gray", "K", "pixel", "seen", "poses")
+        gray = state["gray"].numpy()
+        K, self._pixel, self._seen, self._poses = (
+            np.array(state[name].numpy()) for name in ("K", "pixel", "seen", "poses")
         )
         self._gray, self._K = (gray, K) if gray.size else (None, None)
         self._view, self._noise = int(state["view"]), float(state["noise"])
@@ -256,12 +260,12 @@ class LandmarkTracker:
         if known.sum() < _ENOUGH:
             return None
         rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
-        guess = np.median(depth[known]) * rays @ last[:3, :3].T + last[:3, 3]
-        point = np.where(known[:, None], point, guess)
+        usual = np.median(depth[known])
+        point = np.where(known[:, None], point, usual * rays @ last[:3, :3].T + last[:3, 3])
 
         def seen_by(pose: NDArray[np.float64]) -> NDArray[np.float64]:
             cam = (point - pose[:3, 3]) @ pose[:3, :3]
-            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], _NEAREST * np.median(depth[known])))
+            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], _NEAREST * usual))
 
         return np.asarray(position + seen_by(T) - seen_by(last))
 
@@ -297,8 +301,9 @@ class LandmarkTracker:
         """What the views in the window say of the corners that the newest one shows."""
         config = self.config
         chosen, result = self._triangulated()
+        none = _NO_DEPTH if tracked else _NO_TRACK
         if result is None:
-            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked)
+            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked, none=none)
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (result.point - T[:3, 3]) @ axis
@@ -317,7 +322,7 @@ class LandmarkTracker:
         # Hopeless geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
-        return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
+        return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked, none=none)
 
 
 def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:
