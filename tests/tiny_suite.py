@@ -110,6 +110,9 @@ class Biased:
     def turn(self, position):
         return 0
 
+    def prepare(self, frame):
+        pass
+
     def one(self, frame, n):
         depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
         return Prediction(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
