@@ -5,7 +5,7 @@
 prints a row for each change of ``ufmstar_torch.posterior.model``, means over tours, networks and evidence: FastDepth,
 the demo's first network and one that is made of the truth, off by a factor of its own in every cube of space; dense
 evidence, tracked corners, and of the dense evidence only what is nearer than 40 % of the image. ``--clips`` names
-recordings, for report: FastDepth with dense evidence.
+recordings, for report: FastDepth, from the first anchor on, and the NLL of the best constant variance.
 """
 
 from __future__ import annotations
@@ -58,6 +58,10 @@ CHANGES: tuple[Mapping[str, Any], ...] = (
     {"drift": (0.12, 0.12, 0.08, 0.06)},
     {"drift": (0.03, 0.03, 0.02, 0.015)},
     {"prior": (1.0, 0.9, 0.4, 0.4)},
+    *({"flat": value} for value in (0.002, 0.008)),
+    *({"edge": value} for value in (1.0, 4.0)),
+    *({"hat": value} for value in (1e-6, 0.04)),
+    *({"rounds": value} for value in (1, 3)),
 )
 
 
@@ -153,8 +157,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=None, help="constants that are changed; default: all")
     arguments = parser.parse_args()
     every = list(recordings(arguments))
-    line("changed", *(f"{evidence}: {name}" for evidence in ("all", NEAR) for name in SHOWN))
-    line(*["---"] * (1 + 2 * len(SHOWN)))
+    if every:
+        line("changed", *(f"{evidence}: {name}" for evidence in ("all", NEAR) for name in SHOWN))
+        line(*["---"] * (1 + 2 * len(SHOWN)))
     for change in CHANGES if every else ():
         if change and arguments.only is not None and not set(change) & set(arguments.only):
             continue
@@ -163,10 +168,15 @@ def main() -> None:
         means = (np.mean([row[name] for row in of]) for of in columns for name in SHOWN)
         line(", ".join(f"{k} {v}" for k, v in change.items()) or "as it is", *map(shown, means))
     if arguments.clips:
-        network = load_network("fastdepth", arguments.weights).eval()
-        for source in arguments.clips:
-            row = figures(record(source, network, (DENSE,)), DENSE, {})
-            line(Path(source).name, *(shown(row[name]) for name in SHOWN))
+        line("sequence", "evidence", *SHOWN, "constant")
+        line(*["---"] * (3 + len(SHOWN)))
+    for source in arguments.clips:
+        taken = record(source, load_network("fastdepth", arguments.weights).eval(), (DENSE, CORNERS))
+        for kind in (DENSE, CORNERS):
+            first = next(i for i, one in enumerate(taken) if bool(one.anchors[kind].valid.any()))
+            row = figures(taken[first:], kind, {})
+            constant = 0.5 * (np.log(2 * np.pi * row["rmse"] ** 2) + 1)
+            line(Path(source).name, kind, *(shown(row[name]) for name in SHOWN), shown(constant))
 
 
 if __name__ == "__main__":

@@ -225,12 +225,12 @@ def _local(scene: _Scene, near: _Near) -> Floats:
     each = scene.believed(near) / scene.counted(np.ones(len(near.noise)))
     z2 = np.minimum(near.left_out**2 / near.total, MODEL.clip)
     grid, reach = scene.grid, MODEL.near
-    around = np.zeros((2, grid.rows + 2 * reach, grid.cols + 2 * reach))
-    for sums, values in zip(around, (each * z2, each), strict=True):
+    padded = np.zeros((2, grid.rows + 2 * reach, grid.cols + 2 * reach))
+    for sums, values in zip(padded, (each * z2, each), strict=True):
         nodes = np.bincount(scene.observed.node, values, grid.rows * grid.cols)
         sums[reach:-reach, reach:-reach] = nodes.reshape(grid.rows, grid.cols)
-    around = sum(around[:, i : i + grid.rows] for i in range(2 * reach + 1))
-    around = sum(around[:, :, i : i + grid.cols] for i in range(2 * reach + 1))
+    columns = np.sum([padded[:, i : i + grid.rows] for i in range(2 * reach + 1)], 0)
+    around = np.sum([columns[:, :, i : i + grid.cols] for i in range(2 * reach + 1)], 0)
     z2, weight = around.reshape(2, -1) + MODEL.alone
     return z2 / weight
 
