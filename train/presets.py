@@ -35,8 +35,8 @@ class Recipe(Checked):
         epochs: passes over the training part.
         max_steps: optimizer steps of one member, at which the schedule ends; 0 = all steps of the epochs.
         batch_size: images per step, over all processes together.
-        clip_frames: frames that follow one another, of which a batch consists; 1 = single images. From 2 on, the head learns
-            the variance that UfM* computes in the loop from the network's own depth, instead of its error
+        clip_frames: frames that follow one another, of which a batch consists; 1 = single images. From 2 on, the head
+            learns the variance that UfM* computes in the loop from the network's own depth, instead of its error
             (``train.distil``).
         learning_rate: Adam's step size after the warm-up.
         schedule: of the learning rate: "cosine" (down to 0 at the last step) or "constant".
@@ -76,9 +76,7 @@ class Recipe(Checked):
         if self.network.method == "batch_ensemble" and self.members > 1:
             raise ValueError("Recipe.members must be 1 for a batch_ensemble: its members are Recipe.network.members")
         if self.clip_frames > 1 and self.network.method not in ("aleatoric", "mc_dropout"):
-            raise ValueError(
-                f"Recipe.clip_frames above 1 needs an aleatoric head, got a network of {self.network.method}"
-            )
+            raise ValueError(f"Recipe.clip_frames above 1 needs an aleatoric head, got method {self.network.method!r}")
         if self.batch_size % self.clip_frames:
             raise ValueError(
                 f"Recipe.batch_size {self.batch_size} must be a multiple of clip_frames {self.clip_frames}"

@@ -38,8 +38,8 @@ class Sample(TypedDict):
     """One training sample at the network's size; a loader stacks them along a first dimension.
 
     image [3, H, W] float32 as the network's ``Preprocess`` returns it; depth [H, W] float32 [m], 0 = none;
-    valid [H, W] bool, True = has ground truth; intrinsics [3, 3] float64 [px]; T_world_cam [4, 4] float64 camera-to-world
-    [m], NaN = not known.
+    valid [H, W] bool, True = has ground truth; intrinsics [3, 3] float64 [px]; T_world_cam [4, 4] float64
+    camera-to-world [m], NaN = not known.
     """
 
     image: Tensor

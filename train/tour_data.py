@@ -2,8 +2,9 @@
 
 A tour's files are ``<seed>.image.npy`` (uint8 [F, 3, H, W]), ``<seed>.depth.npy`` (uint16 [F, H, W] in
 millimetres, 0 = none), ``<seed>.pose.npy`` (float64 [F, 4, 4], camera-to-world) and ``<seed>.camera.npy`` (float64
-[3, 3]), written atomically and the camera last, so that its presence means that the tour is complete. The name of their folder is a digest of everything that decides
-their content, the renderer's source included, so that other settings and other versions have folders of their own.
+[3, 3]), written atomically and the camera last, so that its presence means that the tour is complete. The name of
+their folder is a digest of everything that decides their content, the renderer's source included, so that other
+settings and other versions have folders of their own.
 """
 
 from __future__ import annotations
