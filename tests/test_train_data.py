@@ -127,6 +127,7 @@ def test_sequences_are_divided_with_a_gap(tmp_path):
     batch = next(iter(data.train_dataloader()))
     assert {name: tuple(x.shape) for name, x in batch.items()} == {
         "image": (2, 3, 48, 64), "depth": (2, 48, 64), "valid": (2, 48, 64), "intrinsics": (2, 3, 3),
+        "T_world_cam": (2, 4, 4),
     }  # fmt: skip
     exact = truth(np.loadtxt(path / "K.txt"), 10).depths
     for i, sample in enumerate(next(iter(data.val_dataloader()))["depth"]):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.models.distribution import GaussianDepth
-from ufmstar_torch.train.losses import depth_l1, gaussian_nll
+from ufmstar_torch.train.losses import depth_l1
 from ufmstar_torch.ufmstar import UfMStar
 
 # Share of M that rests on surfaces seen from two views or more, from which on a pixel is learnt from; as
@@ -66,9 +66,9 @@ def distillation_sums(
 ) -> tuple[Tensor, Tensor]:
     """The sum of the loss over pixels and their number (int64), as ``losses.loss_sums``.
 
-    Of a pixel: |error| of the depth where there is ground truth, [m] taken as [nat]; and where UfM* has measured V,
-    (V exp(-s) + s + log 2 pi) / 2, the expected negative log likelihood of an error of variance V, whose minimum over s
-    is at log V.
+    Of a pixel: |error| [m] of the depth where there is ground truth, and (s - log V)^2 / 2 where UfM* has measured V.
+    The likelihood of an error of variance V would be the alternative; V spans many orders of magnitude, and a few large
+    values would decide its mean.
 
     Args:
         distribution: of the network, [N, H, W].
@@ -81,5 +81,5 @@ def distillation_sums(
     depth = torch.where(known, distribution.depth.float(), 1.0)
     s = torch.where(measured, distribution.log_variance.float(), 0.0)
     off = torch.where(known, depth_l1(depth, torch.where(known, target, 1.0)), 0.0)
-    spread = gaussian_nll(torch.zeros_like(s), s, torch.where(measured, variance, 1.0).sqrt())
+    spread = 0.5 * (s - torch.where(measured, variance, 1.0).log()).square()
     return (off + torch.where(measured, spread, 0.0)).sum(), (known | measured).sum()
