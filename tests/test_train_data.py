@@ -54,7 +54,7 @@ def test_epoch_and_index_decide_the_augmentation():
     for other in (dataset[SampleKey(3, 4)], SampleDataset(source, PLAIN, augmentation, seed=4)[SampleKey(2, 4)]):
         assert not torch.equal(other["depth"], one["depth"])
     expected = make_sample(source.load(4), PLAIN, augmentation, (3, 2, 4))
-    assert all(torch.equal(one[name], expected[name]) for name in one)
+    assert all(torch.equal(one[name].nan_to_num(-1), expected[name].nan_to_num(-1)) for name in one)
 
 
 def test_a_broken_file_stops_the_run_with_its_name():
