@@ -154,11 +154,7 @@ class Preprocess(Checked):
 
     def apply_image(self, image: Tensor) -> Tensor:
         """The image alone; shapes, types and errors as in :meth:`__call__`."""
-        x = _unit_range(image)
-        g = self.geometry(*x.shape[-2:])
-        x = self._resize(x, g.resized)
-        x = x[..., g.top : g.top + g.cropped[0], g.left : g.left + g.cropped[1]]
-        x = self._resize(x, g.final)
+        x = self._resampled(image)
         if self.value_range != 1.0:
             x = x * self.value_range
         if any(self.mean) or any(s != 1.0 for s in self.std):
@@ -190,6 +186,27 @@ class Preprocess(Checked):
         columns = _source_index(g.final[1], g.cropped[1], g.left, g.resized[1], g.image[1])
         return depth[..., rows.to(depth.device)[:, None], columns.to(depth.device)]
 
+    def _resampled(self, image: Tensor) -> Tensor:
+        """[B, 3, h, w] in [0, 1]; bytes on the processor by a kernel, linearly (``preprocess_cpu``)."""
+        _check(image)
+        g = self.geometry(*image.shape[-2:])
+        single = torch.get_default_dtype() == torch.float32
+        if image.dtype == torch.uint8 and image.is_cpu and self.antialias and not self.cubic and single and len(image):
+            from ufmstar_torch.models.preprocess_cpu import resample
+
+            steps = (g.resized, g.top, g.left, g.cropped, g.final)
+            pixels = image.permute(0, 2, 3, 1).contiguous().numpy()
+            return torch.stack([torch.from_numpy(resample(one, *steps)) for one in pixels])
+        return self.resampled(image)
+
+    def resampled(self, image: Tensor) -> Tensor:
+        """[B, 3, h, w] in [0, 1], resized, cropped and resized: the reference for every device, type and filter."""
+        x = image.to(torch.get_default_dtype()) / 255 if image.dtype == torch.uint8 else image
+        g = self.geometry(*x.shape[-2:])
+        x = self._resize(x, g.resized)
+        x = x[..., g.top : g.top + g.cropped[0], g.left : g.left + g.cropped[1]]
+        return self._resize(x, g.final)
+
     def _resize(self, x: Tensor, size: tuple[int, int]) -> Tensor:
         if x.shape[-2:] == size:
             return x
@@ -198,12 +215,12 @@ class Preprocess(Checked):
         return resized.clamp(0, 1) if self.cubic else resized
 
 
-def _unit_range(image: Tensor) -> Tensor:
-    """[B, 3, H, W] checked, as floats in [0, 1]."""
+def _check(image: Tensor) -> None:
+    """Raise ValueError unless it is [B, 3, H, W], uint8 or floats in [0, 1]."""
     if image.dim() != 4 or image.shape[1] != 3:
         raise ValueError(f"image must be [B, 3, H, W], got {tuple(image.shape)}")
     if image.dtype == torch.uint8:
-        return image.to(torch.get_default_dtype()) / 255
+        return
     if not torch.is_floating_point(image):
         raise ValueError(f"image must be uint8 or floating-point, got {image.dtype}")
     if image.numel():
@@ -213,7 +230,6 @@ def _unit_range(image: Tensor) -> Tensor:
                 f"a floating-point image must lie in [0, 1], got [{float(low):.4g}, {float(high):.4g}]; "
                 "pass bytes as uint8"
             )
-    return image
 
 
 def _source_index(final: int, cropped: int, cut: int, resized: int, image: int) -> Tensor:

@@ -18,9 +18,13 @@ MAX_WORKERS = 4  # each takes up to 3 GB
 COMPILE = """
 import torch
 from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.models import Preprocess
+Preprocess(size=(8, 8)).apply_image(torch.zeros(1, 3, 16, 16, dtype=torch.uint8))
 for dtype in (torch.float32, torch.float64):
     depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
     K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+    SequenceMetrics().update(depth, depth, depth)
     ufm = UfMStar(UfMStarConfig(backend="numba", merge=1.0, merge_every=1))
     for _ in range(2):
         ufm(depth, pose, K)

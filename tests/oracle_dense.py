@@ -1,4 +1,4 @@
-"""Dense evidence in NumPy loops: the search along an epipolar line and its refinement, one pixel against one view."""
+"""Dense evidence in NumPy loops: the search along an epipolar line, errors of poses and camera, neighbours."""
 
 from __future__ import annotations
 
@@ -60,3 +60,70 @@ def along_line(image, view, pixel, H, b, low, high):
     rays = H @ np.array([*pixel, 1.0])
     axis = int(np.abs(ends[1] - ends[0]).argmax())
     return (at[axis] * rays[2] - rays[axis]) / (b[axis] - at[axis] * b[2]), best
+
+
+def displaced(pixel, rho, H, b, K, error):
+    """Where a pixel lies in a view whose pose and camera are wrong by ``error`` [10]: w, s, f, cx, cy, k."""
+    w, s, (focal, cu, cv, k) = error[:3], error[3:6], error[6:]
+    R, t = np.linalg.inv(K) @ H @ K, np.linalg.inv(K) @ b
+    fu, fv, u0, v0 = K[0, 0] * (1 + focal), K[1, 1] * (1 + focal), K[0, 2] + cu, K[1, 2] + cv
+    x, y = (pixel[0] - u0) / fu, (pixel[1] - v0) / fv
+    back = 1 - k * (x * x + y * y)
+    q = R @ np.array([x * back, y * back, 1]) + rho * t
+    q = q + np.cross(w, q) + rho * s
+    p, q = q[0] / q[2], q[1] / q[2]
+    out = 1 + k * (p * p + q * q)
+    return np.array([fu * p * out + u0, fv * q * out + v0])
+
+
+def by_errors(pixel, rho, H, b, K, step=1e-5):
+    """[2, 10] by how much a pixel moves with the errors, by differences."""
+    columns = [
+        (displaced(pixel, rho, H, b, K, step * e) - displaced(pixel, rho, H, b, K, -step * e)) for e in np.eye(10)
+    ]
+    return np.stack(columns, axis=1) / (2 * step)
+
+
+def errors_and_depths(change, value, variance, across_change, across, across_variance, precision, start, rounds=3):
+    """Errors [6 V + 4], their covariance, depths [N] and their variances [N]: one system of all of them. Views show
+    nothing where the variance is infinite."""
+    count, views, _ = change.shape
+    size = len(start)
+    weight, weight_across = np.ones((count, views)), np.ones((count, views))
+    for _ in range(rounds):
+        A = np.zeros((size + count, size + count))
+        A[:size, :size] = precision
+        r = np.concatenate([precision @ start, np.zeros(count)])
+        rows = {}
+        for n in range(count):
+            for k in range(views):
+                place = [*range(6 * k, 6 * k + 6), *range(6 * views, size)]
+                row, beside = np.zeros(size + count), np.zeros(size + count)
+                row[place], row[size + n], beside[place] = change[n, k], 1, across_change[n, k]
+                rows[n, k] = row, beside
+                for each, seen, w in (
+                    (row, value[n, k], weight[n, k] / variance[n, k]),
+                    (beside, across[n, k], weight_across[n, k] / across_variance[n, k]),
+                ):
+                    A += w * np.outer(each, each)
+                    r += w * seen * each
+        covariance = np.linalg.inv(A)
+        x = covariance @ r
+        for n in range(count):
+            for k in range(views):
+                row, beside = rows[n, k]
+                weight[n, k] = 5 / (4 + (value[n, k] - row @ x) ** 2 / variance[n, k])
+                weight_across[n, k] = 5 / (4 + (across[n, k] - beside @ x) ** 2 / across_variance[n, k])
+    return x[:size], covariance[:size, :size], x[size:], covariance.diagonal()[size:]
+
+
+def alone(pixel, rho, variance, cell, n):
+    """Variance to add to anchor n: a quarter of the mean squared difference from those in the 5 x 5 cells around it,
+    where there are four or more and fewer than two are alike. No two have a cell in common."""
+    cells = np.floor(pixel / cell)
+    near = [m for m in range(len(rho)) if m != n and np.abs(cells[m] - cells[n]).max() <= 2]
+    square = [(rho[m] - rho[n]) ** 2 for m in near]
+    alike = [s < max(9 * (variance[m] + variance[n]), (0.05 * rho[n]) ** 2) for s, m in zip(square, near, strict=True)]
+    if len(near) < 4 or sum(alike) >= 2:
+        return 0.0
+    return 0.25 * np.mean([s for s, same in zip(square, alike, strict=True) if not same])

@@ -12,10 +12,10 @@ START = {
     "amplitude": (1.0, 20.0, 0.1, 100.0),
     "roughness": (0.0025, 60.0, 1e-4, 0.04),
     "noise": (1.0, 60.0, 0.25, 16.0),
-    "unseen": (0.15, 1000.0, 0.0, 4.0),
+    "unseen": (0.05, 30.0, 0.0, 16.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
-PRIOR, DRIFT = np.array([0.5, 0.45, 0.2, 0.2]) ** 2, np.array([0.12, 0.12, 0.08, 0.06]) ** 2
+PRIOR, DRIFT = np.array([0.5, 0.45, 0.2, 0.2]) ** 2, np.array([0.06, 0.06, 0.04, 0.03]) ** 2
 MEMORY = 0.5 ** (1 / 20)
 
 
@@ -86,7 +86,7 @@ def joint_prior(logs, state):
     Q = np.zeros((q + n, q + n))
     Q[:4, :4] = np.linalg.inv(C)
     Q[4:q, 4:q] = np.eye(q - 4) / (0.01 * amplitude)
-    Q[q:, q:] = np.eye(n) * 2 / amplitude
+    Q[q:, q:] = np.eye(n) * 0.5 / amplitude
     for i, j, variance, _ in links(logs):
         w = 1 / (variance * amplitude)
         for a, b, s in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
@@ -115,13 +115,13 @@ def pull(t):
 
 
 def distances(logs, source):
-    """Dijkstra, up to .6."""
+    """Dijkstra, up to 2."""
     n = logs.size
     near = [[] for _ in range(n)]
     for i, j, _, length in links(logs):
         near[i].append((j, length))
         near[j].append((i, length))
-    way, heap = np.full(n, 0.6), [(0.0, i) for i in source]
+    way, heap = np.full(n, 2.0), [(0.0, i) for i in source]
     for i in source:
         way[i] = 0.0
     while heap:
@@ -167,7 +167,7 @@ def update(state, depth, claimed, pixel, g, variance):
         total = var + noise
         if round_ < 2:
             weight = 5 / (4 + residual**2 / total) / noise
-    share = distances(logs, set(node[weight * 0.09 >= 1])) / 0.6
+    away = distances(logs, set(node[weight * 0.09 >= 1]))
     count = np.bincount(node, minlength=n)[node]
     square = np.minimum(residual**2, 9 * total) / 0.995
     new = {}
@@ -175,8 +175,10 @@ def update(state, depth, claimed, pixel, g, variance):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    half = 0.5 * np.nan_to_num(claimed)
-    new |= discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([half[r, c] for c, r in at]) / d**2)
+    quarter = 0.25 * np.nan_to_num(claimed)
+    new |= discs(
+        state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([quarter[r, c] for c, r in at]) / d**2
+    )
     q = GLOBALS + HATS * HATS
     after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
     for name, (value, prior, low, high) in START.items():
@@ -185,9 +187,28 @@ def update(state, depth, claimed, pixel, g, variance):
         above = MEMORY * above + (1 - MEMORY) * prior * value + new[name][0]
         after["sums"][name] = [min(max(above, low * below), high * below), below]
     HX = design(X, np.arange(n), n)
-    spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness + 0.0009 + share * ratio(state, "unseen")
+    spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness
+    spread = (
+        1.7 * local(logs.shape, node, residual**2 / total, noise) * spread
+        + 0.0009
+        + away * (0.06 + ratio(state, "unseen"))
+    )
     offset = HX[:, 4:] @ mean[4:]
-    return after, *read(depth, half, logs, mean[:q], offset, spread, share)
+    return after, *read(depth, quarter, logs, mean[:q], offset, spread, np.minimum(away / 0.6, 1))
+
+
+def local(shape, node, z2, noise):
+    """Mean z^2 of the anchors in 5 x 5 cells, each cell and certain anchor counted alike, and of two of z^2 = 1."""
+    out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
+    for r in range(shape[0]):
+        for c in range(shape[1]):
+            above = below = 2.0
+            for k, i in enumerate(node):
+                if abs(i // shape[1] - r) <= 2 and abs(i % shape[1] - c) <= 2:
+                    weight = 1 / (1 + noise[k] / 0.04) / count[i]
+                    above, below = above + weight * min(z2[k], 9), below + weight
+            out[r, c] = above / below
+    return out.ravel()
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
@@ -201,18 +222,15 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
         held[:] = False
     mean, C = condition(mean0, Q, H, y, weight * rest)
     fit, var = H @ mean, np.einsum("ij,jk,ik->i", H, C, H)
-    share = (distances(logs, set(node[rest])) / 0.6)[node]
+    away = distances(logs, set(node[rest]))[node]
     total, error = var + noise, (y - fit) ** 2
     square = np.minimum(error, 9 * total) / 0.995
     believed = np.where(held, 1 / (1 + noise / 0.04), 0.0)
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
-    final = total + 0.0009 + share * (ratio(state, "unseen") + claimed)
+    final = 1.7 * var + noise + 0.0009 + away * (0.06 + ratio(state, "unseen")) + np.minimum(away / 0.6, 1) * claimed
     return {
         "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
-        "unseen": (
-            (area * (square - total - share * claimed) * share / total).sum(),
-            (area * share**2 / total).sum(),
-        ),
+        "unseen": ((area * (np.minimum(error, 4) - total)).sum(), (area * away).sum()),
         "calibration": ((area * error / final).sum(), area.sum()),
     }
 

@@ -253,8 +253,8 @@ def test_confirmations_accompany_the_anchors():
     frame = check_frame(depth, torch.eye(4)[None], K[None], None, None, None, None, **options)
     other = resize_intrinsics(K, (H, W), (2 * H, 2 * W))
     given = with_confirmed(count).moved(other, K).to("cpu")
-    assert check_anchors(given, frame, None).confirmed.tolist() == [[0, 1, 3]]
-    assert check_anchors(with_confirmed(None), frame, None).confirmed is None
+    assert check_anchors(given, frame).confirmed.tolist() == [[0, 1, 3]]
+    assert check_anchors(with_confirmed(None), frame).confirmed is None
     landmarks = Landmarks(np.zeros((2, 2)), np.ones(2), np.ones(2), 2, np.array([4, 7]))
     assert landmarks.anchors(K.numpy(), K, capacity=3).confirmed.tolist() == [[4, 7, 0]]
 

@@ -10,9 +10,12 @@ from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.anchors.evidence import inliers
-from ufmstar_torch.anchors.given import AnchorInput, Anchors
+from ufmstar_torch.anchors.evidence import Evidence, inliers
+from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors, check_values
+from ufmstar_torch.anchors.hook import learn
+from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels import anchors_cpu
+from ufmstar_torch.regress import distribute
 
 pytestmark = pytest.mark.numerics
 
@@ -75,23 +78,98 @@ def test_a_sequence_agrees_with_the_oracle(expected, backend):
     assert 0 < float((output.anchored[output.valid] > 0).double().mean()) < 1, "B is cut off at 0 in some places"
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_the_compiled_support_is_the_references_own(seed):
-    """Clusters, equal positions, wrong tracks and invalid anchors, from none to hundreds."""
+def drawn(seed: int, b: int, n: int) -> tuple[torch.Tensor, ...]:
+    """Pixels, predicted and measured depths, variances [b, n]: clusters, equal positions, wrong tracks."""
     generator = torch.Generator().manual_seed(seed)
-    b, n = 2, (1, 2, 3, 4, 5, 9, 12, 40, 100, 300, 301, 500)[seed]
 
     def uniform(*shape: int) -> torch.Tensor:
         return torch.rand(b, *shape, generator=generator, dtype=torch.float64)
 
     pixel = (uniform(n, 2) * (200 if seed % 2 else 12)).round()
     predicted = 1 + 4 * uniform(n)
-    wrong = uniform(n) < 0.3
-    depth = predicted * (1.1 + 0.02 * uniform(n)) * torch.where(wrong, 1 + uniform(n), 1.0)
+    depth = predicted * (1.1 + 0.02 * uniform(n)) * torch.where(uniform(n) < 0.3, 1 + uniform(n), 1.0)
     variance = 1e-4 * depth.square() * (uniform(n) < 0.5)
-    valid = uniform(n) < (0.9 if seed % 3 else 0.5)
+    return pixel, predicted, depth, variance, uniform(n)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_compiled_support_is_the_references_own(seed):
+    """From none to hundreds of anchors, some of them not valid."""
+    n = (1, 2, 3, 4, 5, 9, 12, 40, 100, 300, 301, 1500)[seed]
+    pixel, predicted, depth, variance, chance = drawn(seed, 2, n)
+    valid = chance < (0.9 if seed % 3 else 0.5)
     given = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, valid)
     expected = inliers(given)
     assert torch.equal(anchors_cpu.inliers(given), expected)
     if n >= 40:
         assert 0 < expected.sum() < valid.sum()
+
+
+@pytest.mark.parametrize("where", ["line", "point", "two points"])
+def test_neighbours_of_anchors_that_lie_together(where):
+    """Cells have no area, or all but two are empty."""
+    pixel, predicted, depth, variance, _ = drawn(1, 1, 60)
+    pixel[..., 1] = 7.0
+    if where != "line":
+        pixel[..., 0] = 3.0
+    if where == "two points":
+        pixel[:, ::3] = 190.0
+    given = AnchorInput(pixel, pixel[..., 0].long(), predicted, depth, variance, 0 * depth, depth > 0)
+    assert torch.equal(anchors_cpu.inliers(given), inliers(given))
+
+
+def test_compiled_checks_are_the_references_own():
+    size, n = (40, 60), 400
+    pixel, _, depth, variance, chance = drawn(3, 2, n)
+    generator = torch.Generator().manual_seed(0)
+    pixel = pixel / 3 - 2 + torch.rand(pixel.shape, generator=generator).double()
+    strange = torch.tensor([torch.nan, torch.inf, -torch.inf, 0.0, -1.0, 1e-300, 1e300, 1e30])
+    for i, value in enumerate(strange):
+        pixel[:, i, 0] = pixel[:, 10 + i, 1] = value
+        depth[:, 20 + i] = variance[:, 30 + i] = value
+    pixel[0, 50], pixel[0, 51] = torch.tensor([59.5, 0.0]), torch.tensor([-0.5, 39.5])
+    maps = 1 + 4 * torch.rand(3, 2, *size, generator=generator)
+    maps[0, 0, 10:20, 10:20] = 0
+    cameras = torch.eye(4).expand(2, 4, 4), torch.tensor([[60.0, 0, 30], [0, 60, 20], [0, 0, 1]])
+    frame = check_frame(maps[0], *cameras, None, None, None, None, feature_count=0, rotation_tolerance=1e-3)
+    claims: list[tuple[torch.Tensor, ...]] = [(), (maps[1],), (maps[1], maps[2])]
+    for own, mask in zip(claims, (None, chance < 0.7, None), strict=True):
+        given = Anchors(pixel, depth, variance, mask)
+        slow, fast = (check_anchors(given, frame, own, kernel) for kernel in (check_values, anchors_cpu.check_values))
+        assert 100 < slow.valid.sum() < 2 * n
+        for name in ("pixel", "predicted", "depth", "variance", "own_variance", "valid"):
+            assert torch.equal(getattr(fast, name), getattr(slow, name)), name
+        assert torch.equal(fast.index[slow.valid], slow.index[slow.valid])
+        assert 0 <= int(fast.index.min()) <= int(fast.index.max()) < size[0] * size[1]
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 2e-6)])
+@pytest.mark.parametrize("n", [0, 1, 40, 1200])
+def test_the_compiled_lesson_is_the_references_own(n, dtype, tolerance):
+    """Many anchors of two streams, on surfaces with and without a component, over three frames."""
+    depths, poses, K = scenes.sequence(3, HEIGHT, WIDTH, 0.04)
+    config = ANCHORED.replace(backend="numba")
+    walked, generator = UfMStar(config, dtype=dtype), torch.Generator().manual_seed(n)
+    for depth, T in zip(depths, poses, strict=True):
+        walked(torch.tensor(depth).expand(2, -1, -1), torch.tensor(T), torch.tensor(K))
+    mixture = walked.mixture.to(torch.float64)
+    seen = torch.tensor(depth, dtype=dtype).expand(2, -1, -1)
+    frame = check_frame(
+        seen, torch.eye(4), torch.tensor(K), None, None, None, None, feature_count=0, rotation_tolerance=1e-3
+    )
+    slow = fast = Evidence.empty(2, mixture.capacity, dtype=dtype, device="cpu")
+    for _ in range(3):
+        pixel = torch.rand(2, n, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT]) - 0.5
+        relative = 1.2 + 0.1 * torch.randn(2, n, generator=generator)
+        u, v = pixel.round().long().clamp_min(0).unbind(-1)
+        g = seen[0, v.clamp_max(HEIGHT - 1), u.clamp_max(WIDTH - 1)] * relative
+        anchors = check_anchors(Anchors(pixel, g, (0.02 * g).square()), frame, (0.01 * seen,))
+        a = learn(slow, mixture, frame, anchors, config, distribute)
+        b = anchors_cpu.learn(fast, mixture, frame, anchors, config)
+        slow, fast = a.evidence, b.evidence
+        assert torch.equal(a.used, b.used)
+        for name in ("beyond", "stream"):
+            torch.testing.assert_close(getattr(b, name), getattr(a, name), rtol=tolerance, atol=tolerance)
+        for name in ("component", "overall"):
+            torch.testing.assert_close(getattr(fast, name), getattr(slow, name), rtol=tolerance, atol=10 * tolerance)
+    assert n == 0 or slow.component.abs().max() > 0

@@ -19,10 +19,17 @@ from ufmstar_torch import UfMStar, UfMStarConfig, cli
 from ufmstar_torch.eval.bench import benchmark
 from ufmstar_torch.eval.bench.compare import compare, measure_peer
 from ufmstar_torch.eval.bench.floors import stage_floors
-from ufmstar_torch.eval.bench.frames import PosedDepth, RecordedSequence, RenderedRoom
+from ufmstar_torch.eval.bench.frames import (
+    PosedDepth,
+    RecordedSequence,
+    RenderedBuilding,
+    RenderedRoom,
+    RenderedStreet,
+)
+from ufmstar_torch.eval.bench.growth import measure_growth, measure_long_run
 from ufmstar_torch.eval.bench.memory import state_memory
 from ufmstar_torch.eval.bench.runtimes import fastest
-from ufmstar_torch.eval.bench.step import build_up, components_in_view, measure_long_run
+from ufmstar_torch.eval.bench.step import build_up, components_in_view
 from ufmstar_torch.eval.bench.text import format_report
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
 from ufmstar_torch.eval.commands import bench_command
@@ -478,22 +485,40 @@ def test_a_long_run_compares_the_same_room_early_and_late():
         measure_long_run(RenderedRoom(), UfMStarConfig(), size=48, frames=24, early=10, window=10)
 
 
-def test_a_long_run_with_merging_is_drawn_beside_one_without(tmp_path):
-    def run(limit: float) -> dict:
-        config = UfMStarConfig(merge=limit, merge_every=5)
-        return {
-            "merge": limit,
-            **measure_long_run(RenderedRoom(period=10), config, size=48, frames=40, early=10, window=10),
-        }
-
-    runs = [run(0.0), run(2.0)]
-    assert runs[1]["memory"]["components"] < runs[0]["memory"]["components"]
+def test_long_runs_are_drawn_by_world(tmp_path):
+    """With merging and without, with a limit of the components in memory and without."""
+    config = UfMStarConfig(merge_every=5)
+    worlds = {"room": (RenderedRoom(period=10), config), "building": (RenderedBuilding(boxes=5, period=10), config)}
+    said = []
+    runs = measure_growth(worlds, (0.0, 2.0), (0, 40), size=48, frames=40, window=10, progress=said.append)
+    assert [(run["world"], run["merge"], run["max_components"]) for run in runs] == [
+        (world, merge, most) for world in worlds for merge in (0.0, 2.0) for most in (None, 40)
+    ]
+    assert len(said) == 8
+    room, bounded, merged, _, building, pages, *_ = runs
+    assert merged["memory"]["components"] < room["memory"]["components"]
+    for free, limited in ((room, bounded), (building, pages)):
+        last = limited["rows"][-1]
+        assert last["components"] + last["out"] == free["rows"][-1]["components"], "the same components"
+        assert 0 == free["rows"][-1]["out"] < last["out"]
+    assert sum(row["pages_read"] for row in pages["rows"]) > 0
     figure = draw_growth(runs)
     lines = [line for axes in figure.axes for line in axes.lines]
-    assert [list(line.get_xdata()) for line in lines] == [[10, 20, 30, 40]] * 4
-    assert lines[1].get_ydata()[-1] == runs[1]["memory"]["components"]
+    assert len(figure.axes) == 4
+    assert [list(line.get_xdata()) for line in lines] == [[10, 20, 30, 40]] * 16
     save_figure(figure, tmp_path / "growth.svg")
-    assert "merge 2" in (tmp_path / "growth.svg").read_text()
+    assert "merge 2, at most 40" in (tmp_path / "growth.svg").read_text()
+
+
+def test_a_building_is_seen_again_and_a_street_is_not():
+    first, *_, again = RenderedBuilding(floors=1, boxes=3, period=4, flicker=0.0).frames(48, 17)
+    assert float((first.T_world_cam - again.T_world_cam)[:3, 3].abs().max()) < 1.0, "in the middle of the same room"
+    rooms = [f.T_world_cam[:3, 3] for f in RenderedBuilding(floors=2, boxes=3, period=1).frames(16, 8)]
+    assert int((torch.cdist(*[torch.stack(rooms)] * 2) > 2.0).sum()) == 8 * 7
+    street = list(RenderedStreet().frames(48, 30))
+    assert [round(float(f.T_world_cam[2, 3]), 9) for f in street] == [2.0 * i for i in range(30)]
+    for frame in street:
+        assert 1.0 < float(frame.depth[frame.depth > 0].min()) < float(frame.depth.max()) <= 1.2 * 60
 
 
 def report_with(**changes):
@@ -535,6 +560,7 @@ def test_targets_are_told_as_met_or_missed():
         (["--sequence", "nowhere"], "nowhere"),
         (["--weights", "nothing.onnx"], "nothing.onnx"),
         (["--merge", "-1"], "at least 0"),
+        (["--max-components", "-1"], "at least 0"),
     ],
 )
 def test_arguments_that_do_not_fit(words, told, capsys):

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import colour_table
 from ufmstar_torch.eval.report.figures_calibration import write_curves
-from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
@@ -34,7 +34,7 @@ from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, save_trained
 from ufmstar_torch.pipeline import NetworksInTurn
 
-METHODS = (NETWORK, UFM, UFM_STAR, ENSEMBLE)
+METHODS = (NETWORK, UFM, UFM_STAR, POSTERIOR, ENSEMBLE)
 CPU = torch.device("cpu")
 FRAMES, SEED = 7, 5
 SHIPPED = Path(str(files("ufmstar_torch.models").joinpath("weights", "demo.safetensors")))
@@ -89,8 +89,8 @@ def test_the_command_prints_one_table_and_says_where_everything_is(done):
     lines = message.splitlines()
     for name in ("delta1", "NLL", "ECE_delta", "ECE_q", "AUSE [m]", "network ms", "+ ms", "state kB"):
         assert name in lines[0]
-    assert [line[:26].strip() for line in lines[1:5]] == [
-        "3 members in turn, alone", "with UfM", "with UfM*", "all 3 members per image",
+    assert [line[:26].strip() for line in lines[1:6]] == [
+        "3 members in turn, alone", "with UfM", "with UfM*", "posterior", "all 3 members per image",
     ]  # fmt: skip
     for name in ("contact_sheet.png", "calibration.png", "mixture.ply", "summary.json"):
         assert f"{out}/{name}: " in message
@@ -107,7 +107,7 @@ def test_everything_is_there_and_complete(done):
     header = (out / "mixture.ply").read_bytes().split(b"end_header")[0].decode()
     assert f"element vertex {summary['components']}\n" in header
     curves = json.loads((out / "curves.json").read_text())
-    assert len(curves) == 4
+    assert len(curves) == 5
     assert all(len(values["ece_q_observed"]) == 10 for values in curves.values())
 
 
@@ -129,13 +129,15 @@ def test_times_and_memory_of_every_row(done):
     summary = read_summary(done[0])
     rows = summary["methods"]
     assert list(rows) == list(METHODS)
-    assert all(rows[m]["network_ms"] == rows[NETWORK]["network_ms"] > 0 for m in (UFM, UFM_STAR))
+    assert all(rows[m]["network_ms"] == rows[NETWORK]["network_ms"] > 0 for m in (UFM, UFM_STAR, POSTERIOR))
     assert rows[ENSEMBLE]["network_ms"] > rows[NETWORK]["network_ms"], "three inferences take longer than one"
     assert rows[UFM]["uncertainty_ms"] > 0
     assert rows[UFM_STAR]["uncertainty_ms"] > 0
+    assert rows[POSTERIOR]["uncertainty_ms"] > rows[UFM_STAR]["uncertainty_ms"]
     assert rows[NETWORK]["uncertainty_ms"] is rows[ENSEMBLE]["uncertainty_ms"] is None
     assert rows[UFM]["state_bytes"] == 40 * summary["points"] > 0
     assert rows[UFM_STAR]["state_bytes"] == 64 * summary["components"] > 0
+    assert rows[POSTERIOR]["state_bytes"] > rows[UFM_STAR]["state_bytes"], "with the evidence"
     assert rows[NETWORK]["state_bytes"] == rows[ENSEMBLE]["state_bytes"] == 0
 
 
@@ -218,7 +220,7 @@ def test_the_ensemble_row_is_the_mixture_of_all_members(sequence, compared):
 
 def test_one_network_is_no_ensemble(sequence):
     [result] = walked(members(1), sequence, range(1))
-    assert tuple(result.rows) == (NETWORK, UFM, UFM_STAR)
+    assert tuple(result.rows) == (NETWORK, UFM, UFM_STAR, POSTERIOR)
 
 
 def test_networks_without_a_variance_are_refused(ufmstar, tmp_path):

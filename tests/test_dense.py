@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -91,6 +94,44 @@ def test_poses_that_contradict_the_images_give_few_anchors(tour):
     right, noisy = (sum(len(f.depth) for f in run(DenseEvidence(), tour, T)) for T in (None, wrong))
     assert right > 400
     assert noisy < 0.1 * right
+
+
+def test_after_a_jump_of_the_poses_landmarks_from_before_are_not_believed(tour):
+    """As a loop closure does: from one frame on, all poses are 15 cm and 4 degrees beside those before."""
+    frames, jump = [*tour, *tour[::-1], *tour], np.eye(4)
+    jump[:3, :3], jump[:3, 3] = Rotation.from_rotvec([0, 0, np.deg2rad(4)]).as_matrix(), [0.1, -0.1, 0.05]
+    poses = [jump @ f.T_world_cam if i >= 14 else f.T_world_cam for i, f in enumerate(frames)]
+    counts, wrong = [], []
+    for frame, result in zip(frames[14:], run(DenseEvidence(), frames, poses)[14:], strict=True):
+        z = true_depth(frame, result.pixel)
+        wrong.extend(np.abs(1 / result.depth - 1 / z) * result.depth**2 / np.sqrt(result.variance) > 5)
+        counts.append(len(z))
+    assert np.mean(wrong) < 0.1
+    assert np.median(counts[-14:]) > 40, "evidence comes back"
+
+
+@pytest.fixture(scope="module")
+def long_tours():
+    names = ["tour:71?style=mixed&frames=60&size=240x320", "tour:72?frames=60&size=240x320"]
+    return [list(open_sequence(name)) for name in names]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["exact", "noise", "drift", "late", "focal", "centre", "image", "blur"])
+def test_on_worse_recordings_errors_are_as_large_as_stated(long_tours, how, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "docs"))
+    script = importlib.import_module("measure_evidence")
+    middle, outliers = [], []
+    for tour in long_tours:
+        sizes = []
+        for frame, result, _ in script.measured(tour, DenseEvidence(), script.DISTURBANCES[how]):
+            z = true_depth(frame, result.pixel)
+            sizes.extend(np.abs(1 / result.depth - 1 / z) * result.depth**2 / np.sqrt(result.variance))
+        assert len(sizes) > 90 * len(tour)
+        middle.append(np.median(sizes) / 0.674)
+        outliers.append(np.mean(np.array(sizes) > 5))
+    assert 0.7 < np.mean(middle) < 1.35
+    assert np.mean(outliers) < 0.07
 
 
 def test_a_thing_that_moves_by_itself_gives_hardly_any_anchors(tour):

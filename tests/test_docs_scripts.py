@@ -133,3 +133,14 @@ def test_constants_of_anchors(script: Any, monkeypatch: pytest.MonkeyPatch, caps
     plain, anchored, never = (np.array(values, dtype=float) for _, *values in lines)
     assert (anchored != plain).all()
     np.testing.assert_array_equal(never, plain)
+
+
+@pytest.mark.slow
+def test_a_faster_growth_of_the_posterior_variance_is_less_confident(script: Any) -> None:
+    """A tiny tour and the network that is made of the truth: the depth stays, the variance follows the constant."""
+    posterior = script("measure_posterior")
+    taken = posterior.record("tour:1?frames=6&size=96x128", None, (posterior.DENSE, posterior.NEAR))
+    for kind in (posterior.DENSE, posterior.NEAR):
+        slow, fast = (posterior.figures(taken, kind, {"growth": value}) for value in (0.0, 1.0))
+        assert fast["rmse"] == slow["rmse"] > 0
+        assert fast["overconfidence"] < slow["overconfidence"]

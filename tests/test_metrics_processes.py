@@ -66,17 +66,3 @@ def test_two_processes_reduce_to_what_one_computes(tmp_path):
             got = torch.tensor({**curves, **binned}[name], dtype=torch.float64)
             want = torch.tensor(value, dtype=torch.float64)
             torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-12, equal_nan=True)
-
-
-def test_no_state_grows_with_the_frames():
-    metrics, by_error = SequenceMetrics(), NLLByError()
-
-    def size():
-        states = [*metrics.state_dict().values(), *by_error.state_dict().values()]
-        return sum(state.numel() * state.element_size() for state in states)
-
-    before = size()
-    for frame in frames(8):
-        metrics.update(*frame)
-        by_error.update(*frame)
-    assert size() == before < 3_000_000

@@ -110,8 +110,8 @@ class TestContactSheet:
         scales = fit_scales([one])
         assert scales.length.low == 0
         assert scales.length.high == pytest.approx(np.percentile(2 * one.sigma[4:], 99))
-        labels = [(c.label, c.scale) for c in map_columns(scales, with_error=True, with_own=True)]
-        assert labels[1:] == [(name, scales.length) for name in ("σ, network alone", "σ, UfM*", "|error|")]
+        labels = [(c.label, c.scale) for c in map_columns(scales, with_error=True)]
+        assert labels[1:] == [(name, scales.length) for name in ("σ", "|error|")]
 
     def test_names_are_no_formulas(self, tmp_path: Path) -> None:
         contact_sheet([panel("a$b$_{")], tmp_path / "s.png", title=r"$\\x$ $")

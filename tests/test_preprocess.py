@@ -244,3 +244,15 @@ def test_ground_truth_of_a_real_frame_keeps_its_statistics() -> None:
     assert set(carried.unique().tolist()) <= set(depth.unique().tolist())
     inside = depth[0, 21:459, 27:611]  # the crop in the original
     assert float((carried == 0).float().mean()) == pytest.approx(float((inside == 0).float().mean()), abs=0.005)
+
+
+@pytest.mark.parametrize("size", [(480, 640), (375, 1242), (100, 120)])
+@pytest.mark.parametrize("preprocess", [NYU, Preprocess(size=(224, 224)), Preprocess(crop=(64, 96)), Preprocess()])
+def test_the_kernel_equals_the_reference(size, preprocess):
+    """Of bytes, in either order of axes in memory, to the rounding of fused products."""
+    image = torch.randint(0, 256, (2, *size, 3), generator=torch.Generator().manual_seed(1), dtype=torch.uint8)
+    image = image.permute(0, 3, 1, 2)
+    fast, slow = preprocess.apply_image(image), preprocess.resampled(image)
+    assert fast.is_contiguous()
+    torch.testing.assert_close(fast, slow, rtol=0, atol=1e-6)
+    torch.testing.assert_close(fast, preprocess.apply_image(image.contiguous()), rtol=0, atol=0)

@@ -9,10 +9,14 @@ import json
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.spill import MEMORY, Folder
+from ufmstar_torch.spill import MEMORY
+from ufmstar_torch.spill_index import CELL, Page, PageIndex, View
+from ufmstar_torch.spill_store import Folder
 
 FRAMES, LIMIT = 36, 60
 
@@ -59,7 +63,9 @@ def test_written_out_and_read_back_equals_never_written_out(kind, tmp_path):
     for ours, theirs in zip(maps, expected, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-9, equal_nan=True)
     assert counts[23] < 0.7 * growing[23]
-    assert ufm._spill.pages
+    assert ufm.spilled.pages > 0
+    assert ufm.spilled.read > 0
+    assert ufm.spilled.components + counts[-1] == len(rows(plain))
     assert ufm.mean.shape[1] < plain.mean.shape[1]
     points = torch.tensor([[[0.5, 1.0, 2.0], [1.0, 1.0, 20.0]]], dtype=torch.float64)
     torch.testing.assert_close(ufm.query(points).disagreement, plain.query(points).disagreement, rtol=1e-9, atol=1e-12)
@@ -79,10 +85,11 @@ def test_a_killed_run_goes_on_from_its_last_saved_state(tmp_path):
         ours = again.state_dict()[name]
         assert name == "_extra_state" or torch.equal(ours.nan_to_num(-1), value.nan_to_num(-1)), name
     assert all(torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) for a, b in zip(later, maps[20:], strict=True))
-    assert again._spill.pages == whole._spill.pages
+    assert again.spilled.pages == whole.spilled.pages > 0
 
 
-def test_a_frame_that_raises_loses_no_page(tmp_path, monkeypatch):
+@pytest.mark.parametrize("fails", ["write", "append"])
+def test_a_frame_that_raises_loses_no_page(fails, tmp_path, monkeypatch):
     config = UfMStarConfig(max_components=LIMIT, spill=str(tmp_path))
     ufm, _, _ = walk(config, 0, 24)
     before = rows(ufm)
@@ -96,7 +103,7 @@ def test_a_frame_that_raises_loses_no_page(tmp_path, monkeypatch):
         raise OSError("no space left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Folder, "__setitem__", full)
+        patch.setattr(Folder, fails, full)
         with pytest.raises(OSError, match="no space"):
             walk(config, 24, FRAMES, ufm)
     done = int(ufm.frames)
@@ -110,19 +117,41 @@ def test_a_reset_begins_anew(tmp_path):
     ufm, _, _ = walk(config, 0, 24)
     ufm.reset()
     ufm, _, _ = walk(config, 0, 3, ufm)
-    assert all(path.name <= "pages-000000000003.json" for path in tmp_path.glob("*.json")), "old lists are gone"
+    changes = [json.loads(line) for line in (tmp_path / "pages.jsonl").read_text().splitlines()]
+    assert all(change["frames"] <= 3 for change in changes), "the old journal is gone"
     fresh, _, _ = walk(UfMStarConfig(), 0, 3)
     assert torch.equal(rows(ufm), rows(fresh))
 
 
-def test_files_are_named_by_their_content_and_lists_by_frames(tmp_path):
-    ufm, _, _ = walk(UfMStarConfig(max_components=LIMIT, spill=str(tmp_path)), 0, 24)
-    lists = sorted(tmp_path.glob("pages-*.json"))
-    assert lists
-    assert int(lists[-1].stem.split("-")[1]) <= 24
-    listed = json.loads(lists[-1].read_text())
-    assert {page["name"] for page in listed} <= {p.name for p in tmp_path.glob("*.npy")}
-    assert sum(page["count"] for page in listed) + int(ufm.mixture.components) == len(rows(ufm))
+def test_files_are_named_by_their_content_and_the_journal_keeps_what_changed(tmp_path):
+    ufm, _, _ = walk(UfMStarConfig(max_components=LIMIT, spill=str(tmp_path)), 0, 30)
+    changes = [json.loads(line) for line in (tmp_path / "pages.jsonl").read_text().splitlines()]
+    frames = [change["frames"] for change in changes]
+    assert frames == sorted(set(frames))
+    assert frames[-1] <= 30
+    written = [page for change in changes for page in change["out"]]
+    assert {page["name"] for page in written} == {p.name for p in tmp_path.glob("*.f64")}
+    back = {number for change in changes for number in change["back"]}
+    assert len(back) == ufm.spilled.read > 0
+    out = [page["count"] for number, page in enumerate(written) if number not in back]
+    assert (len(out), sum(out)) == (ufm.spilled.pages, ufm.spilled.components)
+    assert ufm.spilled.components + int(ufm.mixture.components) == len(rows(ufm))
+
+
+def test_what_a_killed_process_left_of_a_line_does_not_count(tmp_path):
+    config = UfMStarConfig(max_components=LIMIT, spill=str(tmp_path))
+    ufm, _, _ = walk(config, 0, 24)
+    saved = copy.deepcopy(ufm.state_dict())
+    with open(tmp_path / "pages.jsonl", "ab") as journal:
+        journal.write(b'{"frames": 25, "out": [{"na')
+    again = UfMStar(config, dtype=torch.float64)
+    again.load_state_dict(saved)
+    again, _, _ = walk(config, 24, FRAMES, again)
+    plain, _, _ = walk(UfMStarConfig())
+    assert torch.equal(rows(again), rows(plain))
+    fresh = UfMStar(config, dtype=torch.float64)
+    fresh.load_state_dict(again.state_dict())
+    assert torch.equal(rows(fresh), rows(plain)), "the journal can be read to its end"
 
 
 @pytest.mark.parametrize("values", [{"spill": "x"}, {"spill": "", "max_components": 5}])
@@ -131,8 +160,61 @@ def test_a_folder_needs_a_limit(values):
         UfMStarConfig(**values)
 
 
-def test_one_stream_only():
-    depth, pose, K = corridor()[0]
-    ufm = UfMStar(UfMStarConfig(max_components=LIMIT, spill=MEMORY))
-    with pytest.raises(ValueError, match="spill needs one stream, got 2"):
-        ufm(depth.expand(2, -1, -1), pose, K)
+def test_streams_have_pages_of_their_own(tmp_path):
+    """Two streams at different places of the corridor equal two runs of one stream each."""
+    config = UfMStarConfig(max_components=LIMIT, spill=str(tmp_path))
+    both, starts = UfMStar(config, dtype=torch.float64), (0, 6)
+    for i in range(28):
+        depth, pose, K = zip(*(corridor()[i + start] for start in starts), strict=True)
+        both(torch.cat(depth), torch.stack(pose), torch.stack(K))
+    state = both._spill.everything(both.state)
+    for b, start in enumerate(starts):
+        plain, _, _ = walk(UfMStarConfig(), start, start + 28)
+        n = int(state.mixture.components[b])
+        table = torch.cat([v[b, :n].double().reshape(n, -1) for v in state.mixture.tensors().values()], 1)
+        assert torch.equal(torch.tensor(sorted(table.tolist())), rows(plain))
+        assert int(both.mixture.components[b]) < n
+        assert (tmp_path / f"stream-{b}" / "pages.jsonl").exists()
+
+
+@given(seed=st.integers(0, 10**6), pages=st.integers(0, 60))
+@settings(max_examples=40)
+def test_the_index_returns_what_a_look_at_every_page_returns(seed, pages):
+    rng = np.random.default_rng(seed)
+    index, scale = PageIndex(), 10 ** rng.uniform(0, 3.5)
+    for number in range(pages):
+        corner = CELL * np.floor(rng.normal(0, scale, 3) / CELL)
+        means = np.sort(corner + rng.uniform(0, CELL, (2, 3)), 0)
+        reach = means + np.array([[-1], [1]]) * rng.exponential(2.0, 3)
+        index.add(number, Page(f"{number}", 1, np.stack([means, reach])))
+    for number in rng.permutation(pages)[: pages // 3]:
+        index.remove(int(number))
+    for _ in range(5):
+        planes = [np.concatenate([rng.normal(size=(n, 3)), rng.normal(0, scale, (n, 1))], 1) for n in (3, 4)]
+        view = View(*planes)
+        every = view.reaches(np.array([index[n].boxes for n in index]).reshape(-1, 2, 2, 3))
+        assert index.reached(view) == [number for number, hit in zip(index, every, strict=True) if hit]
+    for number in list(index):
+        index.remove(number)
+    assert not index._root.children
+
+
+def test_a_frame_looks_at_few_of_many_pages(monkeypatch):
+    """A street of 8 km: the boxes that a view is compared with do not depend on the length behind it."""
+    looked = []
+
+    def counting(self, boxes):
+        looked[-1] += len(boxes)
+        return reaches(self, boxes)
+
+    reaches = View.reaches
+    monkeypatch.setattr(View, "reaches", counting)
+    ahead = np.array([[0.0, 0.0, 1.0, -1.0]])
+    for length in (500, 2000):  # pages of 4 m
+        index = PageIndex()
+        for number in range(length):
+            box = np.array([[0.0, 0.0, -4.0 * number], [3.0, 3.0, -4.0 * number + 3.0]])
+            index.add(number, Page("", 1, np.stack([box, box])))
+        looked.append(0)
+        assert index.reached(View(ahead, ahead)) == [0]
+    assert max(looked) < 40

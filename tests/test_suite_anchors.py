@@ -56,6 +56,9 @@ class Biased:
     def turn(self, position):
         return 0
 
+    def prepare(self, frame):
+        pass
+
     def one(self, frame, n):
         depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
         return Prediction(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
@@ -158,11 +161,16 @@ def test_suites_and_words(tmp_path):
         "UfM*-Anchored-DepthOnly, disagreement overlap",
         "UfM*-Anchored-DepthOnly, depth corrected on",
         "UfM*-Posterior-DepthOnly",
-        f"{NAME}, anchored by dense",
-        f"{NAME}, anchored by dense, posterior on",
+        f"{NAME}, anchored by dense evidence",
+        f"{NAME}, anchored by dense evidence, posterior",
         f"{NAME}, anchored by ground truth",
-        f"{NAME}, anchored by ground truth, posterior on",
+        f"{NAME}, anchored by ground truth, posterior",
     ]
+    posterior = suite_named("posterior")
+    assert posterior.bases == ("depth_only", "ensemble")
+    assert {r.setting.anchors for r in posterior.rows if r.setting.posterior} == {"tracked", "dense", "truth"}
+    varied = [name for name in posterior.sweep if any(name in r.setting.to_dict() for r in posterior.rows)]
+    assert varied == list(posterior.sweep)
     every = suite_named("all-anchored")
     assert set(every.bases) == set(BASES)
     assert [r.label for r in every.rows if r.method.base == "evidential"] == [

@@ -3,7 +3,7 @@ and uncertainty"): B independent streams of K slots, padded and masked."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -74,7 +74,7 @@ class GaussianMixture:
 
     def tensors(self) -> dict[str, Tensor]:
         """The fields by name, without copying."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        return dict(vars(self))
 
     def replace(self, **changes: Tensor) -> GaussianMixture:
         """A copy with some fields exchanged."""
@@ -120,10 +120,10 @@ class GaussianMixture:
         return GaussianMixture(**{name: pad(value) for name, value in self.tensors().items()})
 
     def __post_init__(self) -> None:
-        b, k = self.weight.shape
-        expected = {"mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": (b, k), "count": (b, k)}
+        slots = b, k = self.weight.shape
+        expected = {"mean": (b, k, 3), "covariance": (b, k, 3, 3), "disagreement": slots, "count": slots}
         for name, shape in expected.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {tuple(getattr(self, name).shape)}")
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} must have shape {tuple(shape)}, got {tuple(getattr(self, name).shape)}")
         if self.features.shape[:2] != (b, k) or self.features.dim() != 3:
             raise ValueError(f"features must have shape ({b}, {k}, F), got {tuple(self.features.shape)}")

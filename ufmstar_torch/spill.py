@@ -11,21 +11,18 @@ Both are decided by axis-aligned boxes against the planes of the viewing pyramid
 often. So matching and fusion are those of a mixture that was never written out, to the last bit, and the map differs by
 rounding; components stand in another order. What lies within reach of one frame is kept even beyond the limit.
 
-Pages never change: a file is named by its content. Which pages are out is written beside them whenever it changes,
-under the number of frames, so that a saved state finds its own pages as long as the folder is kept. A folder belongs to
-one run.
+The work of a frame depends on what is in memory and what it reads back: pages are looked up in a tree of boxes
+(``spill_index``), and a journal keeps what changed (``spill_store``). Streams are independent; each has its own limit
+and pages. A folder belongs to one run.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-import json
 import math
 import os
-from collections.abc import Iterator, MutableMapping
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -34,234 +31,262 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.spill_index import CELL, Page, PageIndex, View
+from ufmstar_torch.spill_store import Change, Folder, Memory
 from ufmstar_torch.state import UfMStarState
 
 MEMORY = "memory"
 _COLUMNS = ("mean", "covariance", "weight", "disagreement", "count", "features", "evidence")
-_PAGE = 4.0  # [m] edge of the cubes whose components share a page
+_CUBE = 4.0  # [m] edge of the cubes whose components go together
+_CUBES = round(CELL / _CUBE)
+_SPREAD = np.array([0, 1, 8, 9, 64, 65, 72, 73])  # the bits of 0 to 7, two places between them
+_PAGE = 64  # components from which on a page is full
 _KEPT = 0.75  # share of the limit that is left after writing out
 _NEGLIGIBLE = 1e-9  # density at a point, in units of the prior's weight
 
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]
-
 
 @dataclass(frozen=True)
-class Page:
-    """Components that were written out together.
+class Spilled:
+    """What is out of memory, over all streams.
 
     Attributes:
-        name: of the file.
-        count: of its components.
-        means: box around their means, lower and upper corner in the frame of the first camera [m].
-        reach: box outside of which none of them counts [m].
+        pages: that are out.
+        components: in them.
+        read: how many pages were read back so far.
     """
 
-    name: str
-    count: int
-    means: Box
-    reach: Box
-
-
-class Folder(MutableMapping[str, bytes]):
-    """Files of a folder by name; each is either the old one or the whole new one."""
-
-    def __init__(self, path: str) -> None:
-        self._path = Path(path)
-        self._path.mkdir(parents=True, exist_ok=True)
-
-    def __getitem__(self, name: str) -> bytes:
-        return (self._path / name).read_bytes()
-
-    def __setitem__(self, name: str, value: bytes) -> None:
-        partial = self._path / f"{name}.partial"
-        partial.write_bytes(value)
-        os.replace(partial, self._path / name)
-
-    def __delitem__(self, name: str) -> None:
-        (self._path / name).unlink()
-
-    def __contains__(self, name: object) -> bool:
-        return (self._path / str(name)).exists()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(sorted(p.name for p in self._path.iterdir() if p.suffix in (".npy", ".json")))
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
+    pages: int
+    components: int
+    read: int
 
 
 class Spill:
-    """The pages of one stream of frames.
+    """The pages of every stream.
 
     Args:
         config: with ``spill`` and ``max_components``.
 
     Attributes:
         config: of the steps, whose mixture may grow.
-        pages: that are out.
     """
 
     def __init__(self, config: UfMStarConfig) -> None:
         assert config.spill is not None
         assert config.max_components is not None
         self.config = config.replace(max_components=None, spill=None)
-        self.pages: tuple[Page, ...] = ()
-        self._limit = config.max_components
-        self._store: MutableMapping[str, bytes] = {} if config.spill == MEMORY else Folder(config.spill)
-        self._left: tuple[Page, ...] = ()  # those that the present frame has not read back
-        self._frames = -1
+        self._limit, self._place = config.max_components, config.spill
+        self._streams: list[_StreamPages] = []
 
     def read_back(self, state: UfMStarState, frame: FrameInput) -> UfMStarState:
         """The state with all components within reach of a frame. The pages stay listed until :meth:`write_out`.
 
         Raises:
-            ValueError: several streams.
             OSError: a page cannot be read.
         """
-        if state.weight.shape[0] != 1:
-            raise ValueError(f"spill needs one stream, got {state.weight.shape[0]}")
-        self._follow(int(state.frames[0]))
-        self._left = self.pages
-        if not self.pages or bool(frame.fault[0] != 0):
+        streams = self._at(state)
+        for b, pages in enumerate(streams):
+            usable = len(pages.index) > 0 and bool(frame.fault[b] == 0)
+            pages.back = pages.index.reached(_view(state, frame, b, self.config)) if usable else []
+        if not any(pages.back for pages in streams):
             return state
-        boxes = (np.array([page.means for page in self.pages]), np.array([page.reach for page in self.pages]))
-        reached = _reached(*boxes, state, frame, self.config)
-        if not reached.any():
-            return state
-        self._left = tuple(page for page, hit in zip(self.pages, reached, strict=True) if not hit)
-        rows = [self._read(page) for page, hit in zip(self.pages, reached, strict=True) if hit]
-        return _with_rows(state, np.concatenate([_rows(state), *rows]))
+        return _with_rows(state, [pages.joined(_rows(state, b), pages.back) for b, pages in enumerate(streams)])
 
     def write_out(self, state: UfMStarState, frame: FrameInput) -> UfMStarState:
         """The state without what is beyond the limit, as far as the frame cannot reach it.
 
         Raises:
-            OSError: a page cannot be written; the list of pages is as before the frame.
+            OSError: a page cannot be written; the pages are those before the frame.
         """
-        pages = list(self._left)
-        if int(state.mixture.components[0]) > self._limit and bool(frame.fault[0] == 0):
-            rows = _rows(state)
-            means, reach = _boxes(rows, self.config)
-            free = np.flatnonzero(~_reached(means, reach, state, frame, self.config))
-            camera = torch.linalg.inv(state.T_world_first[0]) @ frame.T_world_cam[0].to(state.T_world_first)
-            cubes, member = np.unique(np.floor(rows[free, :3] / _PAGE), axis=0, return_inverse=True)
-            distance = np.linalg.norm((cubes + 0.5) * _PAGE - camera[:3, 3].cpu().numpy(), axis=1)
-            stays = np.ones(len(rows), np.bool_)
-            for cube in np.argsort(-distance, kind="stable"):
-                if stays.sum() <= _KEPT * self._limit:
-                    break
-                out = free[member.ravel() == cube]
-                stays[out] = False
-                pages.append(self._write(rows[out], means[out], reach[out]))
-            state = _with_rows(state, rows[stays], max(self._limit, int(stays.sum())))
-        frames = int(state.frames[0])
-        if tuple(pages) != self.pages:
-            self._list(tuple(pages), frames)
-        self.pages, self._frames = tuple(pages), frames
-        return state
+        beyond = (state.mixture.components > self._limit) & (frame.fault == 0)
+        rows, out = [], []
+        for b, pages in enumerate(self._streams):
+            pages.changing()
+            own = _rows(state, b) if bool(beyond.any()) else np.empty((0, 0))
+            stays, left = _parted(own, state, frame, b, self.config, self._limit) if bool(beyond[b]) else (own, [])
+            rows.append(stays)
+            out.append([pages.write(*part) for part in left])
+        for pages, new, frames in zip(self._streams, out, state.frames.tolist(), strict=True):
+            pages.settle(frames, new)
+        for pages, frames in zip(self._streams, state.frames.tolist(), strict=True):
+            pages.frames = frames
+        return _with_rows(state, rows, self._limit) if bool(beyond.any()) else state
 
     def everything(self, state: UfMStarState) -> UfMStarState:
         """The state with all components, as if none had been written out."""
-        self._follow(int(state.frames[0]))
-        return _with_rows(state, np.concatenate([_rows(state), *map(self._read, self.pages)]))
+        return _with_rows(
+            state, [pages.joined(_rows(state, b), pages.index) for b, pages in enumerate(self._at(state))]
+        )
 
-    def _read(self, page: Page) -> NDArray:
-        rows: NDArray = np.load(io.BytesIO(self._store[page.name]))
-        return rows
+    def spilled(self, state: UfMStarState) -> Spilled:
+        """What is out of memory beside a state."""
+        streams = self._at(state)
+        each = [(len(pages.index), pages.index.components, pages.read) for pages in streams]
+        return Spilled(*(sum(numbers) for numbers in zip((0, 0, 0), *each, strict=True)))
 
-    def _write(self, rows: NDArray, means: NDArray, reach: NDArray) -> Page:
-        buffer = io.BytesIO()
-        np.save(buffer, rows)
-        name = f"{hashlib.sha256(buffer.getvalue()).hexdigest()[:24]}.npy"
-        if name not in self._store:
-            self._store[name] = buffer.getvalue()
-        return Page(name, len(rows), _around(means), _around(reach))
+    def _at(self, state: UfMStarState) -> list[_StreamPages]:
+        """The pages of the streams as they were at a state."""
+        frames = state.frames.tolist()
+        if len(self._streams) != len(frames):
+            alone = len(frames) == 1
+            self._streams = [_StreamPages(self._place, "" if alone else f"stream-{b}") for b in range(len(frames))]
+        for pages, number in zip(self._streams, frames, strict=True):
+            pages.follow(number)
+        return self._streams
 
-    def _list(self, pages: tuple[Page, ...], frames: int) -> None:
-        """Write the list of pages that holds after so many frames."""
-        self._forget(_index(frames))  # a run that went on from here before wrote others
-        self._store[_index(frames)] = json.dumps([asdict(page) for page in pages]).encode()
 
-    def _forget(self, first: str) -> None:
-        for name in [n for n in self._store if n.endswith(".json") and n >= first]:
-            del self._store[name]
+class _StreamPages:
+    """The pages of one stream.
 
-    def _follow(self, frames: int) -> None:
-        """Make the list of pages that of a state after so many frames: another one was loaded, or it was reset."""
-        if frames == self._frames:
+    Args:
+        place: a folder, or ``MEMORY``.
+        name: of the stream's own folder in it.
+
+    Attributes:
+        index: of the pages that are out.
+        back: numbers of those that the present frame reads back.
+        read: how many were read back so far.
+        frames: after which these are out; -1 = to be looked up.
+    """
+
+    def __init__(self, place: str, name: str) -> None:
+        self.index, self.back, self.read, self.frames = PageIndex(), list[int](), 0, -1
+        self._store = Memory() if place == MEMORY else Folder(os.path.join(place, name))
+        self._journal: tuple[Change, ...] | None = None  # to be written where that of the store is of another run
+        self._next = 0
+
+    def follow(self, frames: int) -> None:
+        """Make the pages those of a state after so many frames: another one was loaded, or it was reset."""
+        if frames == self.frames:
             return
-        if frames == 0:
-            self._forget("")
-        known = [name for name in self._store if name.endswith(".json") and name <= _index(frames)]
-        listed = json.loads(self._store[max(known)]) if known else []
-        self.pages = tuple(Page(p["name"], p["count"], _tuples(p["means"]), _tuples(p["reach"])) for p in listed)
-        self._frames = frames
+        journal = self._store.changes()
+        own = tuple(change for change in journal if 0 < change.frames <= frames)
+        self._journal = None if own == journal else own
+        self.index, self.frames, self._next = PageIndex(), frames, 0
+        for change in own:
+            self._take(change)
+
+    def joined(self, rows: NDArray, numbers: Sequence[int] | PageIndex) -> NDArray:
+        """Rows, and behind them those of pages."""
+        pages = [self.index[number] for number in numbers]
+        contents = [np.frombuffer(self._store.read(page.name)).reshape(page.count, -1) for page in pages]
+        return np.concatenate([rows, *contents])
+
+    def write(self, rows: NDArray, boxes: NDArray) -> Page:
+        """A page of rows [n, C] with their boxes [n, 2, 2, 3], which is not listed yet."""
+        content = rows.tobytes()
+        name = f"{hashlib.sha256(content).hexdigest()[:24]}.f64"
+        self._store.write(name, content)
+        return Page(name, len(rows), np.stack([boxes[:, :, 0].min(0), boxes[:, :, 1].max(0)], 1))
+
+    def changing(self) -> None:
+        """From here on the pages are between two states: an error sends the next frame to the journal."""
+        self.frames = -1
+
+    def settle(self, frames: int, out: Sequence[Page]) -> None:
+        """List the pages of a frame that has been taken in."""
+        change = Change(frames, tuple(out), tuple(self.back))
+        changes = (change,) if out or self.back else ()
+        if self._journal is not None:
+            self._store.rewrite((*self._journal, *changes))
+            self._journal = None
+        elif changes:
+            self._store.append(change)
+        self._take(change)
+        self.read += len(self.back)
+        self.back = []
+
+    def _take(self, change: Change) -> None:
+        for number in change.back:
+            self.index.remove(number)
+        for page in change.out:
+            self.index.add(self._next, page)
+            self._next += 1
 
 
-def _index(frames: int) -> str:
-    return f"pages-{frames:012d}.json"
+def _parted(
+    rows: NDArray, state: UfMStarState, frame: FrameInput, b: int, config: UfMStarConfig, limit: int
+) -> tuple[NDArray, list[tuple[NDArray, NDArray]]]:
+    """The rows that stay, and those of every page that goes, with their boxes."""
+    boxes = _boxes(rows, config)
+    free = np.flatnonzero(~_view(state, frame, b, config).reaches(boxes))
+    cubes, member, count = _cubes(rows[free, :3])
+    camera = torch.linalg.inv(state.T_world_first[b]) @ frame.T_world_cam[b].to(state.T_world_first)
+    distance = np.linalg.norm((cubes + 0.5) * _CUBE - camera[:3, 3].cpu().numpy(), axis=1)
+    farthest = np.argsort(-distance, kind="stable")
+    left = len(rows) - np.cumsum(count[farthest]) + count[farthest]  # components when it is a cube's turn
+    page = _packed(cubes, count, farthest[left > _KEPT * limit])[member]
+    order = np.argsort(page, kind="stable")
+    parts = np.split(free[order], np.searchsorted(page[order], np.arange(page.max(initial=-1) + 1)))
+    stays = np.ones(len(rows), np.bool_)
+    stays[free[page >= 0]] = False
+    return rows[stays], [(rows[part], boxes[part]) for part in parts[1:]]
 
 
-def _tuples(box: list[list[float]]) -> Box:
-    (a, b, c), (d, e, f) = box
-    return (a, b, c), (d, e, f)
+def _cubes(means: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Of points [n, 3] the cubes [q, 3] in which they lie, cell by cell and neighbours next to each other; the number
+    of each point's cube [n]; and how many points each cube has [q]."""
+    cube = np.floor(means / _CUBE).astype(np.int64)
+    cell, inner = (cube // _CUBES) % 2**18, _SPREAD[cube % _CUBES]  # cells repeat after 8,000 km
+    key = (cell @ [2**36, 2**18, 1]) * _CUBES**3 + inner @ [4, 2, 1]
+    _, first, member, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
+    return cube[first], member, count
 
 
-def _around(boxes: NDArray) -> Box:
-    return _tuples([boxes[:, 0].min(0).tolist(), boxes[:, 1].max(0).tolist()])
+def _packed(cubes: NDArray, count: NDArray, going: NDArray) -> NDArray:
+    """[q] the page of every cube that goes, -1 for the others. Cubes of one cell share a page until it is full."""
+    page, going = np.full(len(cubes), -1), np.sort(going)
+    last, size, number = None, _PAGE, -1
+    for cube, cell in zip(going.tolist(), (cubes[going] // _CUBES).tolist(), strict=True):
+        if size >= _PAGE or cell != last:
+            last, size, number = cell, 0, number + 1
+        page[cube] = number
+        size += count[cube]
+    return page
 
 
-def _rows(state: UfMStarState) -> NDArray:
-    """[n, C] float64, the components in use; every number of a state is exact in it."""
-    n = int(state.mixture.components[0])
-    columns = [value for name in _COLUMNS if len(value := getattr(state, name)[0])]
+def _rows(state: UfMStarState, b: int) -> NDArray:
+    """[n, C] float64, the components of a stream; every number of a state is exact in it."""
+    n = int(state.mixture.components[b])
+    columns = [value for name in _COLUMNS if len(value := getattr(state, name)[b])]
     return np.concatenate([v[:n].cpu().double().reshape(n, math.prod(v.shape[1:])).numpy() for v in columns], 1)
 
 
-def _with_rows(state: UfMStarState, rows: NDArray, capacity: int | None = None) -> UfMStarState:
-    """The state with other components, in as many slots as before or more, or in ``capacity``."""
-    slots = max(state.weight.shape[1], len(rows)) if capacity is None else capacity
-    table, at, changed = torch.from_numpy(rows), 0, {}
+def _with_rows(state: UfMStarState, rows: Sequence[NDArray], capacity: int | None = None) -> UfMStarState:
+    """The state with other components [n, C] in every stream, in as many slots as before or more, or in ``capacity`` or
+    more."""
+    slots = max(state.weight.shape[1] if capacity is None else capacity, *map(len, rows))
+    tables, at, changed = [torch.from_numpy(table) for table in rows], 0, {}
     for name in _COLUMNS:
         old: Tensor = getattr(state, name)
         if not old.shape[1]:
             continue  # no evidence without anchors
         width = math.prod(old.shape[2:])
-        new = old.new_zeros(1, slots, *old.shape[2:])
-        new[0, : len(rows)] = table[:, at : at + width].reshape(len(rows), *old.shape[2:]).to(new)
+        new = old.new_zeros(len(tables), slots, *old.shape[2:])
+        for b, table in enumerate(tables):
+            new[b, : len(table)] = table[:, at : at + width].reshape(len(table), *old.shape[2:]).to(new)
         changed[name], at = new, at + width
     return replace(state, **changed)
 
 
-def _boxes(rows: NDArray, config: UfMStarConfig) -> tuple[NDArray, NDArray]:
-    """[n, 2, 3] the means as boxes, and the boxes outside of which a component's density is negligible [m]."""
+def _boxes(rows: NDArray, config: UfMStarConfig) -> NDArray:
+    """[n, 2, 2, 3] the means as boxes, and the boxes outside of which a component's density is negligible [m]."""
     mean, covariance, weight = rows[:, :3], rows[:, 3:12].reshape(-1, 3, 3), rows[:, 12]
     log_peak = np.log(weight) - 1.5 * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(covariance)[1]
     square = np.maximum(2 * (log_peak - math.log(_NEGLIGIBLE * config.prior_weight)), 0.0)
     half = np.sqrt(square[:, None] * np.einsum("kii->ki", covariance)) * (1 + 1e-6)
-    return np.stack([mean, mean], 1), np.stack([mean - half, mean + half], 1)
+    return np.stack([mean, mean, mean - half, mean + half], 1).reshape(-1, 2, 2, 3)
 
 
-def _reached(means: NDArray, reach: NDArray, state: UfMStarState, frame: FrameInput, config: UfMStarConfig) -> NDArray:
-    """[n] bool, whether a frame may reach what lies in boxes [n, 2, 3] in the frame of the first camera."""
-    first = state.T_world_first[0] if bool(state.started[0]) else frame.T_world_cam[0]
-    T = torch.linalg.inv(frame.T_world_cam[0]) @ first
-    K, (height, width) = frame.intrinsics[0].cpu().double(), frame.size
+def _view(state: UfMStarState, frame: FrameInput, b: int, config: UfMStarConfig) -> View:
+    """What the frame of one stream may reach, in the frame of its first camera."""
+    first = state.T_world_first[b] if bool(state.started[b]) else frame.T_world_cam[b]
+    move = (torch.linalg.inv(frame.T_world_cam[b]) @ first).cpu().double().numpy()
+    K, (height, width) = frame.intrinsics[b].cpu().double(), frame.size
     fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     # Inside: n . x + d >= 0 for every plane, in camera coordinates; a hair wider than the image.
     left, right, top, bottom = cx + 0.501, width - 0.499 - cx, cy + 0.501, height - 0.499 - cy
     sides = [[fx, 0, left, 0], [-fx, 0, right, 0], [0, fy, top, 0], [0, -fy, bottom, 0]]
-    depth = torch.where(frame.valid, frame.depth, 0.0).max()
+    depth = torch.where(frame.valid[b], frame.depth[b], 0.0).max()
     near, far = [0, 0, 1, -config.near_plane * (1 - 1e-6)], [0, 0, -1, float(depth) * (1 + 1e-6)]
-    move = T.cpu().double().numpy()
-    matching = _meets(means, np.array([*sides, near], dtype=np.float64) @ move)
-    return matching | _meets(reach, np.array([*sides, [0, 0, 1, 0], far], dtype=np.float64) @ move)
-
-
-def _meets(boxes: NDArray, planes: NDArray) -> NDArray:
-    """[n] False where a box [n, 2, 3] lies outside of one of the planes [P, 4]."""
-    normal, offset = planes[:, :3], planes[:, 3]
-    corner = np.where(normal >= 0, boxes[:, None, 1], boxes[:, None, 0])  # [n, P, 3] farthest along the normal
-    slack = 1e-9 * (np.abs(corner) * np.abs(normal)).sum(-1)
-    inside: NDArray = ((corner * normal).sum(-1) + offset >= -slack).all(1)
-    return inside
+    planes = [np.array([*sides, *rest], dtype=np.float64) @ move for rest in ([near], [[0, 0, 1, 0], far])]
+    return View(*planes)

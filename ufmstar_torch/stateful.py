@@ -6,6 +6,7 @@ import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import torch
@@ -14,6 +15,8 @@ from torch import Tensor, nn
 
 class Config(Protocol):
     """A frozen config with a form as plain values."""
+
+    def __hash__(self) -> int: ...
 
     def to_dict(self) -> dict[str, Any]:
         """Nested plain values."""
@@ -80,7 +83,7 @@ class StatefulModule(nn.Module):
 
     def get_extra_state(self) -> Tensor:
         """The config as bytes, so that a checkpoint (safetensors too) contains it."""
-        return torch.tensor(list(json.dumps(self.config.to_dict()).encode()), dtype=torch.uint8)
+        return _bytes_of(self.config).clone()
 
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
@@ -164,6 +167,12 @@ def _fitting(name: str, saved: object, own: Tensor) -> Tensor:
     if not isinstance(saved, Tensor) or not fits:
         raise ValueError(f"{name} must be a tensor that fits {own.dtype}, got {kind}")
     return saved.detach().to(own.dtype)
+
+
+@lru_cache(maxsize=16)
+def _bytes_of(config: Config) -> Tensor:
+    """Its plain values as the bytes of JSON."""
+    return torch.tensor(list(json.dumps(config.to_dict()).encode()), dtype=torch.uint8)
 
 
 def _config_of(state: object) -> dict[str, Any]:

@@ -9,7 +9,8 @@ float64, so large world coordinates never reach the float32 state, and what a fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import partial
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch import correspond, fuse, gaussian, regress, segment, unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression
+from ufmstar_torch.anchors.hook import AnchorInput, Evidence, after_regression, before_regression, learn
 from ufmstar_torch.camera import focal_and_centre, relative_pose
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.correspond import Correspondence
@@ -235,40 +236,81 @@ def step(
     mixture, dropped = fuse.append(mixture, current_first, new)
     evidence, used, mixture_cam, stream = before_regression(
         Evidence(state.evidence, state.overall_evidence), mixture.to(torch.float64).rigid(R_cam, t_cam),
-        frame, anchors, config, kernels.distribute,
+        frame, anchors, config, functools.partial(learn, distribute=kernels.distribute),
     )  # fmt: skip
     mixture_cam = unmeasured.before_regression(mixture_cam, config)
     stage("append")
 
     result = kernels.regress_image(mixture_cam, frame.depth, frame.intrinsics, frame.valid, config, pixels)
-    chosen = frame.depth if pixels is None else torch.gather(frame.depth.flatten(1), 1, pixels)
-    result, measured = unmeasured.after_regression(result, chosen, config)
-    result, residual = after_regression(result, stream)
+    result, residual, measured = after_regress(result, stream, frame, config, pixels)
     stage("regress")
 
+    counts = {
+        "components": mixture.components,
+        "segments": current_cam.components,
+        "matched": matched.sum(1),
+        "pairs": pairs.match.sum((1, 2)),
+        "new": new.sum(1) - dropped,
+        "dropped": dropped + (current_cam.valid & ~far_enough).sum(1),
+        "valid_pixels": frame.valid.sum((1, 2)),
+        "unmeasured": (measured < unmeasured.HALF).flatten(1).sum(1),
+        "anchors": torch.zeros_like(used) if anchors is None else anchors.valid.sum(1),
+        "anchors_used": used,
+    }
     disagreement, smoothed = result.disagreement, state.smoothed
     if smooth and config.ema_alpha < 1.0:
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, kernels.smooth
         )
-    statistics = FrameStatistics(
-        components=mixture.components,
-        segments=current_cam.components,
-        matched=matched.sum(1),
-        pairs=pairs.match.sum((1, 2)),
-        new=new.sum(1) - dropped,
-        dropped=dropped + (current_cam.valid & ~far_enough).sum(1),
-        valid_pixels=frame.valid.sum((1, 2)),
+    updated = after_frame(state, frame, mixture.tensors(), first, smoothed, evidence)
+    out = StepOutput(
+        disagreement, result.features, residual, measured, partial(given, labels), current_cam,
+        frame_statistics(frame, counts),
+    )  # fmt: skip
+    stage("average")
+    return updated, out
+
+
+def after_regress(
+    result: Regression, stream: Tensor | None, frame: FrameInput, config: UfMStarConfig, pixels: Tensor | None
+) -> tuple[Regression, Tensor | None, Tensor]:
+    """Separate what was regressed beside the disagreement, and fill in what was not measured.
+
+    Args:
+        result: of the mixture as ``anchors.hook`` and ``unmeasured`` made it ready.
+        stream: from ``anchors.hook.before_regression``.
+        frame, config, pixels: as :func:`step`.
+
+    Returns:
+        The regression of M and the caller's features; the residual and the share that was measured, as in
+        :class:`~ufmstar_torch.output.StepOutput`.
+    """
+    depth = frame.depth if pixels is None else torch.gather(frame.depth.flatten(1), 1, pixels)
+    result, measured = unmeasured.after_regression(result, depth, config)
+    result, residual = after_regression(result, stream)
+    return result, residual, measured
+
+
+def frame_statistics(frame: FrameInput, counts: Mapping[str, Tensor]) -> FrameStatistics:
+    """The statistics of a frame, of which the step counted ``counts`` and the check the others."""
+    return FrameStatistics(
+        **counts,
         beyond=frame.beyond,
         out_of_range=frame.out_of_range,
-        unmeasured=(measured < unmeasured.HALF).flatten(1).sum(1),
         fault=frame.fault,
         rotation_deviation=frame.rotation_deviation,
-        anchors=torch.zeros_like(used) if anchors is None else anchors.valid.sum(1),
-        anchors_used=used,
     )
-    updated = UfMStarState(
-        **mixture.tensors(),
+
+
+def after_frame(
+    state: UfMStarState, frame: FrameInput, mixture: dict[str, Tensor], first: Tensor, smoothed: Tensor,
+    evidence: Evidence,
+) -> UfMStarState:  # fmt: skip
+    """The state after a frame: the mixture's tensors, the first camera's pose, the moving average and the evidence are
+    given; a frame at fault counts as skipped."""
+    fine = frame.fault == 0
+    return UfMStarState(
+        **mixture,
         T_world_first=first,
         started=state.started | fine,
         frames=state.frames + fine,
@@ -278,9 +320,6 @@ def step(
         overall_evidence=evidence.overall,
         posterior=state.posterior,
     )
-    stage("average")
-    out = StepOutput(disagreement, result.features, residual, measured, partial(given, labels), current_cam, statistics)
-    return updated, out
 
 
 def _unobserved(name: str) -> None:

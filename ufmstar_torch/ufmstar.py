@@ -17,7 +17,14 @@ from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.fixed_order import apply, total
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.kernels.select import LateStep, select_check, select_merge, select_posterior, select_step
+from ufmstar_torch.kernels.select import (
+    LateStep,
+    select_anchor_check,
+    select_check,
+    select_merge,
+    select_posterior,
+    select_step,
+)
 from ufmstar_torch.merge import merged
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import MeanUncertainty as MeanUncertainty
@@ -26,7 +33,7 @@ from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
 from ufmstar_torch.regress import Regression, regress, sample_pixels
-from ufmstar_torch.spill import Spill
+from ufmstar_torch.spill import Spill, Spilled
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision
 from ufmstar_torch.step import Step, StepObserver
@@ -307,6 +314,11 @@ class UfMStar(StatefulModule):
         self._settle()
         return self._stored()
 
+    @property
+    def spilled(self) -> Spilled | None:
+        """What ``config.spill`` keeps out of memory; None without it."""
+        return None if self._spill is None else self._spill.spilled(self.state)
+
     def reset(self, streams: Sequence[int] | Tensor | None = None, *, keep_evidence: bool = False) -> None:
         """Forget everything, or only some streams.
 
@@ -347,8 +359,8 @@ class UfMStar(StatefulModule):
             return None
         if not self.config.anchored:
             raise ValueError("anchors need UfMStarConfig(anchored=True)")
-        own = self._own(frame)
-        return check_anchors(anchors, frame, torch.stack(own).sum(0) if own else None)
+        kernel = select_anchor_check(self.config.backend, frame.depth.device.type)
+        return check_anchors(anchors, frame, self._own(frame), kernel)
 
     def _checked(self, depth: Tensor, pose: Tensor, intrinsics: Tensor, *optional: Tensor | None) -> FrameInput:
         aleatoric, epistemic, valid, features = optional
@@ -442,6 +454,8 @@ class UfMStar(StatefulModule):
         """Warn once where a stream had depth but no segment; on the CPU only, elsewhere the look would wait."""
         if self._warned or frame.depth.device.type != "cpu":
             return
+        if all(out.statistics.segments.tolist()):
+            return
         given = out.statistics.valid_pixels + frame.beyond + frame.out_of_range
         empty = (given > 0) & (out.statistics.segments == 0)
         if not bool(empty.any()):
@@ -462,7 +476,7 @@ class UfMStar(StatefulModule):
         return [value for value, counts in both if value is not None and counts]
 
     def _stored(self) -> UfMStarState:
-        return UfMStarState(**{name: getattr(self, name) for name in self.STATE})
+        return UfMStarState(**{name: self._buffers[name] for name in self.STATE})
 
     def _step(self, device_type: str) -> Step:
         """The step for a device, the same one as long as the state goes on."""

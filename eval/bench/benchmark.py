@@ -7,12 +7,16 @@ docs/results/benchmark.md for what each figure means.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.bench.timing import pinned_threads
+
+if TYPE_CHECKING:
+    from ufmstar_torch.eval.bench.frames import FrameSource
 
 # Milliseconds and ratios at 224 x 224, bytes and ratios for one room; the tracker's mean processor time for 300 corners
 # at 640 x 480. For information.
@@ -26,6 +30,7 @@ _TARGETS = {
 }
 _TARGET_SIZE, _TARGET_CORNERS = 224, 300
 _WARM_UP, _TORCH_ROUNDS = 3, 3
+_PARTS = ("compilation", "long_run", "anchors", "peer", "against", "rates", "device")  # None where not measured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +55,11 @@ class BenchSettings:
         boxes: number of boxes in the rendered room
         threads: number of threads of torch and numba; default: the cores of this process
         seed: of the rendered room
-        long: also time this many frames in one room (1000 without a number)
-        merge: limits of merging (UfMStarConfig.merge) of the long run, which is run with each; 0 = off
+        long: also time this many frames of each world (1000 without a number)
+        world: of the long runs: one room (or the sequence); a building of twenty rooms, each seen for 50 frames, then
+            again; a drive straight on, 2 m a frame
+        merge: limits of merging (UfMStarConfig.merge) of the long runs, which are run with each; 0 = off
+        max_components: likewise limits of the components in memory, the others in a temporary folder; 0 = all in memory
         anchors: also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one
             thread (300 without a number; needs OpenCV)
         skip_compile: do not time compilation (some tens of seconds)
@@ -73,7 +81,9 @@ class BenchSettings:
     threads: int | None = None
     seed: int = 0
     long: int | None = field(default=None, metadata={"const": 1000})
+    world: tuple[str, ...] = field(default=("room",), metadata={"choices": ("room", "building", "drive")})
     merge: tuple[float, ...] = (0.0,)
+    max_components: tuple[int, ...] = (0,)
     anchors: int | None = field(default=None, metadata={"const": _TARGET_CORNERS})
     skip_compile: bool = False
     device: str = "cpu"
@@ -86,6 +96,8 @@ class BenchSettings:
                 raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
         if not self.merge or min(self.merge) < 0:
             raise ValueError(f"--merge must be limits of at least 0, got {list(self.merge)}")
+        if not self.max_components or min(self.max_components) < 0:
+            raise ValueError(f"--max-components must be limits of at least 0, got {list(self.max_components)}")
         if min(self.sizes) < 16:
             raise ValueError(f"--sizes must be at least 16 pixels, got {list(self.sizes)}")
 
@@ -99,71 +111,87 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
 
     Returns:
         The report: settings, versions, hardware, "results" per size and backend, "rates" of the machine, "compilation",
-        "long_run", "growth" (a long run for each limit of merging), "anchors", "device", "peer" and "against" where
-        asked for, and "targets".
+        "long_run", "growth" (a long run for each world, limit of merging and limit of components), "anchors", "device",
+        "peer" and "against" where asked for, and "targets".
 
     Raises:
         ValueError: an option is out of range.
         FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
     """
-    from ufmstar_torch import UfMStarConfig
-    from ufmstar_torch.eval.bench.compare import compare, measure_peer
-    from ufmstar_torch.eval.bench.floors import machine_rates
-    from ufmstar_torch.eval.bench.step import measure_compilation, measure_long_run
+    from ufmstar_torch.eval.bench.compare import compare
     from ufmstar_torch.eval.results import machine
 
     if options.against is not None and not options.against.is_file():
         raise FileNotFoundError(f"--against {options.against} does not exist")
-    config = UfMStarConfig()
+    report: dict[str, Any] = {**dict.fromkeys(_PARTS), "growth": [], "results": []}
+    load = {"before": machine.load_average()}
     threads = machine.available_cores() if options.threads is None else options.threads
-    report: dict[str, Any] = {
+    report |= {
         "schema": 1,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": machine.versions(),
         "hardware": machine.hardware(),
-        "load_average": {"before": machine.load_average()},
-        "settings": {"threads": threads, "seed": options.seed, "config": config.to_dict()},
-        "compilation": None,
-        "long_run": None,
-        "growth": [],
-        "anchors": None,
-        "peer": None,
-        "against": None,
-        "rates": None,
-        "device": None,
-        "results": [],
+        "settings": {"threads": threads, "seed": options.seed, "config": UfMStarConfig().to_dict()},
     }
-    if options.device != "cpu":
+    if options.device == "cpu":
+        report |= _on_cpu(options, threads, report["settings"], progress)
+        report["targets"] = targets(report)
+    else:
         from ufmstar_torch.eval.bench.device import measure_device
 
-        report["device"] = measure_device(options.device, options.sizes, options.frames, options.seed, progress)
-        report["load_average"]["after"] = machine.load_average()
-        return {**report, "targets": []}
-    if "numba" in options.backends and not options.skip_compile:
-        progress("compilation")
-        report["compilation"] = measure_compilation()
-    with pinned_threads(threads):
-        report["rates"] = machine_rates()
-        fastdepth, source = _inputs(options)
-        report["settings"]["source"] = source.describe()
-        report["results"] = _results(options, config, fastdepth, source, report["rates"], progress)
-        if options.peer is not None:
-            progress("the peer")
-            report["peer"] = measure_peer(options.peer, source.frames(options.sizes[0], options.frames))
-        if options.long is not None:
-            backend = config.replace(backend=options.backends[0])
-            for limit in options.merge:
-                progress(f"long run of {options.long} frames, merge {limit:g}")
-                run = measure_long_run(source, backend.replace(merge=limit), size=_TARGET_SIZE, frames=options.long)
-                report["growth"].append({"merge": limit, **run})
-            report["long_run"] = report["growth"][0]
-        if options.anchors is not None:
-            report["anchors"] = _anchors(options, config, source, progress)
-    report["load_average"]["after"] = machine.load_average()
-    report["targets"] = targets(report)
-    if options.against is not None:
+        measured = measure_device(options.device, options.sizes, options.frames, options.seed, progress)
+        report |= {"device": measured, "targets": []}
+    report["load_average"] = {**load, "after": machine.load_average()}
+    if options.against is not None and options.device == "cpu":
         report["against"] = compare(report, options.against)
     return report
+
+
+def _on_cpu(
+    options: BenchSettings, threads: int, settings: dict[str, Any], progress: Callable[[str], object]
+) -> dict[str, Any]:
+    """The parts of the report that are measured here; "source" is added to the settings."""
+    from ufmstar_torch.eval.bench.compare import measure_peer
+    from ufmstar_torch.eval.bench.floors import machine_rates
+    from ufmstar_torch.eval.bench.step import measure_compilation
+
+    parts: dict[str, Any] = {}
+    if "numba" in options.backends and not options.skip_compile:
+        progress("compilation")
+        parts["compilation"] = measure_compilation()
+    config = UfMStarConfig()
+    with pinned_threads(threads):
+        parts["rates"] = machine_rates()
+        fastdepth, source = _inputs(options)
+        settings["source"] = source.describe()
+        parts["results"] = _results(options, config, fastdepth, source, parts["rates"], progress)
+        if options.peer is not None:
+            progress("the peer")
+            parts["peer"] = measure_peer(options.peer, source.frames(options.sizes[0], options.frames))
+        if options.long is not None:
+            parts["growth"] = _growth(options, config, source, progress)
+            parts["long_run"] = parts["growth"][0]
+        if options.anchors is not None:
+            parts["anchors"] = _anchors(options, config, source, progress)
+    return parts
+
+
+def _growth(
+    options: BenchSettings, config: UfMStarConfig, source: FrameSource, progress: Callable[[str], object]
+) -> list[dict[str, Any]]:
+    """The long runs."""
+    from ufmstar_torch.eval.bench.frames import RenderedBuilding, RenderedStreet
+    from ufmstar_torch.eval.bench.growth import measure_growth
+
+    assert options.long is not None
+    config = config.replace(backend=options.backends[0])
+    building, street = RenderedBuilding(boxes=options.boxes, seed=options.seed), RenderedStreet(seed=options.seed)
+    far = config.replace(segment=replace(config.segment, max_depth=street.max_depth))
+    worlds = {"room": (source, config), "building": (building, config), "drive": (street, far)}
+    chosen = {name: worlds[name] for name in options.world}
+    return measure_growth(
+        chosen, options.merge, options.max_components, size=_TARGET_SIZE, frames=options.long, progress=progress
+    )
 
 
 def _inputs(options: BenchSettings) -> tuple[Any, Any]:

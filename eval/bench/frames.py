@@ -9,12 +9,15 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, Preprocess
+
+_PITCH = np.array([7.2, 3.0, 7.2])  # from one room of a building to the next [m]
 
 
 class PosedDepth(NamedTuple):
@@ -81,6 +84,97 @@ class RenderedRoom:
     def describe(self) -> dict[str, object]:
         """The settings, for the report."""
         return {"kind": "rendered room", **asdict(self)}
+
+
+@dataclass(frozen=True)
+class RenderedBuilding:
+    """Frames of furnished rooms, four on a floor, in each of which the camera turns once; after the last one, again
+    from the first.
+
+    Attributes:
+        floors: of four rooms each.
+        boxes: number of things in a room.
+        period: frames per turn of the camera.
+        flicker: see :class:`RenderedRoom`.
+        seed: of the rooms and of the flicker.
+    """
+
+    floors: int = 5
+    boxes: int = 40
+    period: int = 50
+    flicker: float = 0.03
+    seed: int = 0
+
+    @property
+    def available(self) -> int | None:
+        """None: it goes on for ever."""
+        return None
+
+    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
+        """The first ``count`` frames at size x size pixels."""
+        rooms = [synthetic.BoxRoom.furnished(self.boxes, self.seed + number) for number in range(4 * self.floors)]
+        K, rng = synthetic.intrinsics(size, size), np.random.default_rng(self.seed)
+        for number, T in enumerate(synthetic.walk(count, self.period)):
+            room = number // self.period % len(rooms)
+            depth = synthetic.flicker(synthetic.render(rooms[room], T, K, size, size), self.flicker, rng)
+            T[:3, 3] += np.array([room % 2, -(room // 4), room // 2 % 2]) * _PITCH
+            yield PosedDepth(torch.from_numpy(depth).float()[None], torch.from_numpy(T), torch.from_numpy(K))
+
+    def describe(self) -> dict[str, object]:
+        """The settings, for the report."""
+        return {"kind": "rendered building", **asdict(self)}
+
+
+@dataclass(frozen=True)
+class RenderedStreet:
+    """Frames of a drive straight along a street of 20 m between houses, with things on both sides, without an end.
+
+    Attributes:
+        step: way between two frames [m].
+        gap: mean way between two things of one side [m].
+        max_depth: what lies farther has no depth [m].
+        flicker: see :class:`RenderedRoom`.
+        seed: of the things and of the flicker.
+    """
+
+    step: float = 2.0
+    gap: float = 6.0
+    max_depth: float = 60.0
+    flicker: float = 0.03
+    seed: int = 0
+
+    @property
+    def available(self) -> int | None:
+        """None: it goes on for ever."""
+        return None
+
+    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
+        """The first ``count`` frames at size x size pixels."""
+        K, rng = synthetic.intrinsics(size, size), np.random.default_rng(self.seed)
+        for number in range(count):
+            z = self.step * number
+            sway = np.sin(0.05 * number)
+            T = synthetic.look((sway, 0.0, z), 0.1 * np.sin(0.11 * number), 0.05)
+            depth = synthetic.flicker(synthetic.render(self._around(z), T, K, size, size), self.flicker, rng)
+            depth = np.where(depth <= self.max_depth, depth, 0.0)
+            yield PosedDepth(torch.from_numpy(depth).float()[None], torch.from_numpy(T), torch.from_numpy(K))
+
+    def _around(self, z: float) -> synthetic.BoxRoom:
+        """What a camera at z can see of the street."""
+        places = range(int((z - 2 * self.gap) / self.gap), int((z + 1.2 * self.max_depth) / self.gap) + 1)
+        boxes = np.array([self._thing(place, side) for place in places for side in (-1.0, 1.0)])
+        return synthetic.BoxRoom(np.array([[-10.0, -12.0, z - 60.0], [10.0, 1.5, z + 10 * self.max_depth]]), boxes)
+
+    def _thing(self, place: int, side: float) -> NDArray[np.float64]:
+        """[2, 3] the corners of the thing at a place of one side."""
+        rng = np.random.default_rng([self.seed, place + 2**31, int(side > 0)])
+        size = rng.uniform((0.6, 0.8, 0.8), (1.8, 4.0, 4.5))
+        x, z = side * rng.uniform(4.5, 8.5), self.gap * (place + rng.uniform(0, 1))
+        return np.array([[x - size[0] / 2, 1.5 - size[1], z], [x + size[0] / 2, 1.5, z + size[2]]])
+
+    def describe(self) -> dict[str, object]:
+        """The settings, for the report."""
+        return {"kind": "rendered street", **asdict(self)}
 
 
 @dataclass(frozen=True)

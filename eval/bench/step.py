@@ -1,4 +1,4 @@
-"""Times of a UfM* step: beside the networks that it accompanies, after a long time in one room, and when compiling."""
+"""Times of a UfM* step: beside the networks that it accompanies, and when compiling."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from importlib.util import find_spec
 from itertools import islice
 from typing import Any
 
-import numpy as np
 import torch
 
 from ufmstar_torch import UfMStar, UfMStarConfig
@@ -102,7 +101,7 @@ def measure_step(
         **({} if backend == "torch" else {"ufm": pointwise}),
     }
     timed = TimedCalls(before=networks)
-    counts = _Counts("components", "segments", "matched", "new")
+    counts = FrameCounts("components", "segments", "matched", "new")
     for frame in timed.frames(frames, warm_up=warm_up):
         counts.add(timed.call(calls, *frame)["step"].statistics, whole, frame)
     times = timed.times
@@ -124,61 +123,6 @@ def measure_step(
         "allocations": step_allocations(lambda: average(*frames[-1])),
         "memory": state_memory(whole),
         "ratios": {f"{a}/{b}": times.ratio(a, b) for a, b in pairs},
-    }
-
-
-def measure_long_run(
-    source: FrameSource, config: UfMStarConfig, *, size: int, frames: int, early: int = 100, window: int = 100
-) -> dict[str, Any]:
-    """Run ``frames`` steps; compare those around frame ``early`` with the last ones.
-
-    Args:
-        source: of the frames, in one room.
-        config: of UfM*.
-        size: of the depth maps [px].
-        frames: in all.
-        early: the centre of the early window, counted from 1.
-        window: frames per window; a whole turn of the camera, so that both contain all of the room.
-
-    Returns:
-        "ratio" and "cpu_ratio": median time of the last ``window`` steps over the median of the early ones;
-        and a row per ``window`` frames with times and numbers of components.
-
-    Raises:
-        ValueError: the early and the last window would overlap, or the source has fewer frames.
-    """
-    start = max(0, early - window // 2)
-    if frames < start + 2 * window:
-        raise ValueError(f"a long run needs at least {start + 2 * window} frames for two windows, got {frames}")
-    if source.available is not None and source.available < frames:
-        raise ValueError(f"a long run of {frames} frames was asked for, there are {source.available}")
-    ufm, timed, counts = UfMStar(config), TimedCalls(), _Counts("components", "segments", "matched", "new")
-    for frame in timed.frames(source.frames(size, frames)):
-        counts.add(timed.call({"step": ufm}, *frame)["step"].statistics, ufm, frame)
-    wall, cpu = timed.times.wall["step"], timed.times.cpu["step"]
-
-    def at(low: int) -> dict[str, Any]:
-        part = slice(low, low + window)
-        names = ("in_view", "segments", "matched", "new")
-        return {
-            "frames": [low + 1, low + window],
-            "step_median_ms": float(np.median(wall[part])),
-            "step_cpu_median_ms": float(np.median(cpu[part])),
-            "components": counts["components"][part][-1],
-            **{f"{name}_mean": float(np.mean(counts[name][part])) for name in names},
-        }
-
-    first, last = at(start), at(frames - window)
-    return {
-        "size": size,
-        "backend": config.backend,
-        "frames": frames,
-        "early": first,
-        "late": last,
-        "ratio": last["step_median_ms"] / first["step_median_ms"],
-        "cpu_ratio": last["step_cpu_median_ms"] / first["step_cpu_median_ms"],
-        "memory": state_memory(ufm),
-        "rows": [at(low) for low in range(0, frames - window + 1, window)],
     }
 
 
@@ -210,7 +154,7 @@ def first_steps(size: int) -> list[float]:
     return [1e-3 * ms for ms in timed.times.wall["step"]]
 
 
-class _Counts(dict[str, list[int]]):
+class FrameCounts(dict[str, list[int]]):
     """Statistics of the steps by name, and "in_view"."""
 
     def __init__(self, *names: str) -> None:

@@ -117,16 +117,19 @@ def _against(against: Mapping[str, Any]) -> list[str]:
 
 def _long_run(run: Mapping[str, Any]) -> list[str]:
     lines = [
-        f"long run, {run['size']} x {run['size']}, {run['frames']} frames in one room, merge {run['merge']:g}: "
+        f"long run, {run['world']}, {run['size']} x {run['size']}, {run['frames']} frames, merge {run['merge']:g}, at "
+        f"most {run['max_components'] or 'all'} components in memory: "
         f"last steps / early ones = {run['ratio']:.2f} (CPU {run['cpu_ratio']:.2f}), "
         f"{run['memory']['in_use'] / 1e3:.1f} kB in use, {run['memory']['packed'] / 1e3:.1f} kB packed",
-        f"  {'frames':>12}{'step [ms]':>11}{'CPU [ms]':>10}{'total':>8}{'in view':>9}{'segments':>10}{'new':>7}",
+        f"  {'frames':>12}{'step [ms]':>11}{'CPU [ms]':>10}{'memory':>8}{'out':>8}{'read':>6}{'in view':>9}"
+        f"{'segments':>10}{'new':>7}",
     ]
     for row in run["rows"]:
         low, high = row["frames"]
         lines.append(
             f"  {f'{low}-{high}':>12}{row['step_median_ms']:11.2f}{row['step_cpu_median_ms']:10.2f}"
-            f"{row['components']:8d}{row['in_view_mean']:9.0f}{row['segments_mean']:10.1f}{row['new_mean']:7.2f}"
+            f"{row['components']:8d}{row['out']:8d}{row['pages_read']:6d}{row['in_view_mean']:9.0f}"
+            f"{row['segments_mean']:10.1f}{row['new_mean']:7.2f}"
         )
     return lines
 

@@ -24,10 +24,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.commands.run import Progress
+from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks, landmarks_of
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, Pointwise
 from ufmstar_torch.eval.engine.judge import RegionMetrics
 from ufmstar_torch.eval.engine.load import sha256
@@ -36,8 +38,9 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
+from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.ufm import UfMConfig
-from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, panel, write_pictures
+from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR, panel, write_pictures
 from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
@@ -55,6 +58,7 @@ from ufmstar_torch.ufmstar import UfMStar
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
 STYLE = "mixed"
 SHEET_ROWS = 6
+_POSTERIOR = UfMStarConfig(anchored=True, posterior=True)
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
 DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
@@ -151,12 +155,14 @@ def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
 
 
 def demo_rows(source: DepthSource, device: torch.device) -> list[RowRunner]:
-    """The rows of the table, at the start. The first three judge one prediction, of the member in turn; the last one
+    """The rows of the table, at the start. The first four judge one prediction, of the member in turn; the last one
     is all members on every image, which is what alternation saves. A single network is no ensemble."""
+    dense = AnchorSource(Setting(anchors=DENSE, posterior=True), Tracks(landmarks_of(DENSE, None)))
     rows = [
         RowRunner(NETWORK, source, Alone(), device=device),
         RowRunner(UFM, source, Pointwise(UfMConfig(), device), device=device),
         RowRunner(UFM_STAR, source, Gaussians(UfMStarConfig(), device), device=device),
+        RowRunner(POSTERIOR, source, Gaussians(_POSTERIOR, device, posterior=True), anchors=dense, device=device),
     ]
     several = [RowRunner(ENSEMBLE, source, Alone(), every=True, device=device)]
     return rows + (several if source.passes > 1 else [])
@@ -209,9 +215,9 @@ class _Walk(FrameSink):
         components = int(self._gaussians.memory()["count"])
         self._progress(Progress("frames", result.number + 1, len(self._unfamiliar), components, 0))
 
-    def median_ms(self, key: str, stage: str) -> float:
-        """Of the typical frame [ms]."""
-        return median(ms[stage] for ms in self.ms[key])
+    def median_ms(self, key: str, *stages: str) -> float:
+        """Of the typical frame, for those of the stages that the row has [ms]."""
+        return median(sum(ms.get(stage, 0.0) for stage in stages) for ms in self.ms[key])
 
 
 def _walk(
@@ -252,7 +258,7 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
 
     progress(Progress("rooms", 0, len(sequence), None, 0))
     with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(UfMStar(device=device).warm_up, (64, 64), progress=compiling)
+        compiled = beside.submit(UfMStar(_POSTERIOR, device=device).warm_up, (64, 64), progress=compiling)
         for index in range(len(sequence)):
             frames.append(sequence[index])
             progress(Progress("rooms", index + 1, len(sequence), None, 0))
@@ -279,11 +285,17 @@ def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict
         row.key: {
             "figures": overall[row.key].compute(),
             "network_ms": walk.median_ms(row.key, "network"),
-            "uncertainty_ms": walk.median_ms(row.key, "uncertainty") if row.estimator.memory() else None,
-            "state_bytes": int(row.estimator.memory().get("bytes", 0)),
+            "uncertainty_ms": walk.median_ms(row.key, "anchors", "uncertainty") if row.estimator.memory() else None,
+            "state_bytes": _state_bytes(row),
         }
         for row in rows
     }
+
+
+def _state_bytes(row: RowRunner) -> int:
+    """What the next frame depends on, but for the map kept for smoothing."""
+    evidence = {} if row.anchors is None else row.anchors.state()
+    return int(row.estimator.memory().get("bytes", 0)) + sum(value.nbytes for value in evidence.values())
 
 
 def _network(info: TrainedInfo, digest: str, members: int) -> dict[str, Any]:

@@ -198,9 +198,11 @@ def run(
 
 def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None], stop: Callable[[], bool]) -> None:
     """The frames that are left."""
-    UfMStar(job.config, device=job.device).warm_up(
-        (32, 32), progress=lambda *n: progress(Progress("kernels", *n, None, 0))
-    )
+
+    def compiling(done: int, total: int) -> None:
+        progress(Progress("kernels", done, total, None, 0))
+
+    UfMStar(job.config, device=job.device).warm_up((32, 32), progress=compiling)
     position = folder.checkpoint.position
     row = job.row(folder.checkpoint.module, position)
     metrics, maps = RunMetrics(UFM, folder.checkpoint.metrics), MapWriter(UFM, folder.writer)

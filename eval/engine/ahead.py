@@ -1,9 +1,9 @@
-"""Frames that are read ahead: decoded in a thread while the frames before them are computed."""
+"""Frames that are read ahead: decoded and prepared in a thread while the frames before them are computed."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
@@ -19,10 +19,13 @@ class FramesAhead:
     Args:
         sequence: whose frames.
         indices: which of them, in order.
+        prepare: called with every frame that was read, in the thread.
     """
 
-    def __init__(self, sequence: FrameSequence, indices: Iterable[int]) -> None:
-        self._sequence, self._left = sequence, iter(indices)
+    def __init__(
+        self, sequence: FrameSequence, indices: Iterable[int], prepare: Callable[[Frame], None] = lambda _: None
+    ) -> None:
+        self._sequence, self._left, self._prepare = sequence, iter(indices), prepare
         self._thread = ThreadPoolExecutor(1)
         self._reading: deque[Future[Frame]] = deque()
 
@@ -40,7 +43,12 @@ class FramesAhead:
             StopIteration: the last one was read before.
         """
         while len(self._reading) <= _AHEAD and (index := next(self._left, None)) is not None:
-            self._reading.append(self._thread.submit(self._sequence.__getitem__, index))
+            self._reading.append(self._thread.submit(self._read, index))
         if not self._reading:
             raise StopIteration
         return self._reading.popleft().result()
+
+    def _read(self, index: int) -> Frame:
+        frame = self._sequence[index]
+        self._prepare(frame)
+        return frame

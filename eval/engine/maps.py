@@ -86,6 +86,9 @@ class MapSource:
         """0: maps have no members."""
         return 0
 
+    def prepare(self, frame: Frame) -> None:
+        """Nothing."""
+
     def one(self, frame: Frame, n: int) -> Prediction:
         """The frame's map; no network runs.
 

@@ -6,6 +6,7 @@ import copy
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, cast
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
@@ -61,7 +62,8 @@ class NetworkSource:
         self.identity, self.label, self.digest = dict(identity), label, digest
         self._timer = StageTimer(device)
         self._generator = torch.Generator(device)
-        self._inputs: dict[Frame, tuple[Tensor, Tensor]] = {}
+        self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()
+        self._seeded: Frame | None = None
         sampling = stochastic(networks.networks) if seeding is not None else []
         self._draws = bool(sampling)
         for network in sampling:
@@ -103,7 +105,7 @@ class NetworkSource:
             return self
         other = copy.copy(self)
         other._turns = NetworksInTurn(self._members, samples=self._turns.samples, preprocess=changed)
-        other._inputs, other._timer = {}, StageTimer(self._device)
+        other._inputs, other._seeded, other._timer = WeakKeyDictionary(), None, StageTimer(self._device)
         other.identity = {**self.identity, "preprocess": how}
         other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
         return other
@@ -159,18 +161,25 @@ class NetworkSource:
         made = Prediction.each(prediction, K, self._timer.take()["network"])
         return [one.to(torch.float32) for one in made] if reduced else made
 
+    def prepare(self, frame: Frame) -> None:
+        """See ``DepthSource``; on the processor."""
+        if self._device.type == "cpu" and frame.image is not None:
+            self._input(frame)
+
     def _prepared(self, frames: Sequence[Frame]) -> list[tuple[Tensor, Tensor]]:
-        """The networks' inputs [1, 3, h, w] and their intrinsics [1, 3, 3]; once for all members."""
-        if any(frame not in self._inputs for frame in frames):
-            self._inputs = {frame: self._inputs.get(frame) or self._input(frame) for frame in frames}
-        return [self._inputs[frame] for frame in frames]
+        """The networks' inputs [1, 3, h, w] and their intrinsics [1, 3, 3]; a frame seeds once for all members."""
+        if self._seeding == "frame" and self._seeded is not frames[-1]:
+            self._generator.manual_seed(frames[-1].index)
+            self._seeded = frames[-1]
+        return [self._input(frame) for frame in frames]
 
     def _input(self, frame: Frame) -> tuple[Tensor, Tensor]:
-        image, K = image_tensor(frame).to(self._device), torch.from_numpy(frame.intrinsics)[None]
-        x, K = self._turns.prepare(image, K)
-        if self._seeding == "frame":
-            self._generator.manual_seed(frame.index)
-        return x, K
+        """Computed once, as long as the frame is used."""
+        if frame not in self._inputs:
+            image, K = image_tensor(frame).to(self._device), torch.from_numpy(frame.intrinsics)[None]
+            with torch.no_grad():
+                self._inputs[frame] = self._turns.prepare(image, K)
+        return self._inputs[frame]
 
 
 def prepared_as(own: Preprocess, how: str) -> Preprocess:

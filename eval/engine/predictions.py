@@ -144,6 +144,10 @@ class DepthSource(Protocol):
         """The member for the image that a row uses after ``position`` others; 0 for maps."""
         ...
 
+    def prepare(self, frame: Frame) -> None:
+        """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
+        ...
+
     def one(self, frame: Frame, n: int) -> Prediction:
         """One timed inference, of member (or sample) n.
 

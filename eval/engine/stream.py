@@ -163,6 +163,12 @@ class FrameStream:
         left = range(self.position, len(self.indices))
         return [self.indices[n] for n in left if not self.rows or any(row.selects(n) for row in self.rows)]
 
+    def prepare(self, frame: Frame) -> None:
+        """The networks' input, unless a store may have all predictions."""
+        if self._store is None:
+            for row in self.rows:
+                row.source.prepare(frame)
+
     def next(self, frames: FramesAhead) -> _Frame:
         """The way of the next frame; it stops where a network is needed, and where the rows' estimators are.
 
@@ -262,7 +268,7 @@ class _Lane:
         self.error: Exception | None = None
         self._frame: _Frame | None = None
         self._open = ExitStack()
-        self._frames = self._open.enter_context(FramesAhead(stream.sequence, stream.needed()))
+        self._frames = self._open.enter_context(FramesAhead(stream.sequence, stream.needed(), stream.prepare))
         with self._own_errors():
             for sink in sinks:
                 sink.begin(stream)

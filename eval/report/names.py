@@ -128,9 +128,10 @@ _WORDS = {
     ("preprocess", "resize"): "whole frame",
     ("preprocess", "crop"): "NYU's crop",
     ("aleatoric_in_h", True): "A in H",
+    ("posterior", True): "posterior",
 }
 # Values in words.
-_VALUES = {"tracked": "tracked corners", "truth": "ground truth"}
+_VALUES = {"tracked": "tracked corners", "dense": "dense evidence", "truth": "ground truth"}
 
 
 def setting_name(name: str) -> str:

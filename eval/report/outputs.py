@@ -28,8 +28,8 @@ from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole
 from ufmstar_torch.ufmstar import UfMStar
 
-# Rows of the demo beside UfM and UfM*: the member in turn alone, and all members on every image.
-NETWORK, ENSEMBLE = "network", "ensemble"
+# Rows of the demo beside UfM and UfM*: the member in turn alone, its posterior, and all members on every image.
+NETWORK, POSTERIOR, ENSEMBLE = "network", "posterior", "ensemble"
 SHEET, CURVES, PLY, ELLIPSOIDS, NPZ = (
     "contact_sheet.png",
     "calibration.png",
@@ -172,29 +172,32 @@ def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: 
 
 
 def panel(name: str, note: str, result: FrameResult) -> FramePanel:
-    """One row of the demo's sheet: the network's depth, its own sigma, that of UfM*, and the true error.
+    """One row of the demo's sheet: depth, sigma and true error, of UfM* and of the posterior.
 
     Args:
         name: of the frame.
         note: the kind of room.
         result: the frame through the demo's rows, with an image and ground truth.
     """
-    own, star, truth = result.rows[NETWORK].estimate, result.rows[UFM_STAR].estimate, result.rows[UFM_STAR].truth
+    star, after, truth = result.rows[UFM_STAR].estimate, result.rows[POSTERIOR].estimate, result.rows[UFM_STAR].truth
     assert result.frame is not None
     assert result.frame.image is not None
     assert truth is not None
     assert star.variance is not None
-    assert own.variance is not None
-    depth = star.depth.float().numpy()
+    assert after.variance is not None
+    depth, corrected = star.depth.float().numpy(), after.depth.float().numpy()
+    before_error, error = (np.where(truth > 0, np.abs(d - truth), np.nan) for d in (depth, corrected))
     return FramePanel(
         name=name,
         note=note,
         image=result.frame.image,
         depth=depth,
         sigma=star.variance.float().sqrt().numpy(),
-        own_sigma=own.variance.float().sqrt().numpy(),
-        error=np.where(truth > 0, np.abs(depth - truth), np.nan).astype(np.float32),
+        error=before_error.astype(np.float32),
         valid=star.valid.numpy(),
+        posterior=corrected,
+        posterior_sigma=after.variance.float().sqrt().numpy(),
+        posterior_error=error.astype(np.float32),
     )
 
 

@@ -266,7 +266,6 @@ class FramePanel:
         valid: [h, w] bool, True where depth and sigma hold; None = everywhere finite.
         note: a short line beside the name, "K = 31" say.
         anchored: [h, w] the part of sigma that is due to anchors, sqrt(B) [m]; None of a run without.
-        own_sigma: [h, w] standard deviation of the network alone [m], where sigma is that of UfM*; or None.
         posterior, posterior_sigma, posterior_error: [h, w] the same three of the posterior [m]; None of a run without.
 
     Raises:
@@ -281,7 +280,6 @@ class FramePanel:
     valid: NDArray[np.bool_] | None = None
     note: str = ""
     anchored: NDArray[Any] | None = None
-    own_sigma: NDArray[Any] | None = None
     posterior: NDArray[Any] | None = None
     posterior_sigma: NDArray[Any] | None = None
     posterior_error: NDArray[Any] | None = None
@@ -290,14 +288,14 @@ class FramePanel:
         if self.image.ndim != 3 or self.image.shape[-1] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be uint8 [H, W, 3], got {self.image.dtype} {self.image.shape}")
         of_posterior = ("posterior", "posterior_sigma", "posterior_error")
-        for label in ("sigma", "error", "valid", "anchored", "own_sigma", *of_posterior):
+        for label in ("sigma", "error", "valid", "anchored", *of_posterior):
             value = getattr(self, label)
             if value is not None and value.shape != self.depth.shape:
                 raise ValueError(f"{label} must have the depth's shape {self.depth.shape}, got {value.shape}")
 
 
 # Maps that share the scale of sigma and error.
-_LENGTHS = ("sigma", "own_sigma", "error", "posterior_sigma", "posterior_error")
+_LENGTHS = ("sigma", "error", "posterior_sigma", "posterior_error")
 
 
 @dataclass(frozen=True)
@@ -323,11 +321,12 @@ class MapColumn:
 
 
 def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
-    """Scales over all panels: depth between its 1st and 99th percentile; sigma and error share one, from 0.
+    """Scales over all panels: depths between their 1st and 99th percentile; sigma and error share one, from 0.
 
     That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
     """
-    depth = robust_range([(p.depth, p.valid) for p in panels], from_zero=False)
+    corrected = [(p.posterior, p.valid) for p in panels if p.posterior is not None]
+    depth = robust_range([*((p.depth, p.valid) for p in panels), *corrected], from_zero=False)
     maps = ([(getattr(p, name), p.valid) for p in panels] for name in _LENGTHS)
     ranges = [robust_range(known, from_zero=True) for of in maps if (known := [m for m in of if m[0] is not None])]
     return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(0.0, max(high for _, high in ranges), ERROR_MAP))
@@ -338,10 +337,9 @@ def map_columns(
     *,
     with_error: bool,
     with_anchored: bool = False,
-    with_own: bool = False,
     with_posterior: bool = False,
 ) -> list[MapColumn]:
-    """The columns right of the image: depth, sigma (of the network alone too), what anchors add, the error; with a
+    """The columns right of the image: depth, sigma, what anchors add, the error; with a
     posterior depth, sigma and error before and after."""
     columns = [MapColumn("depth", scales.depth, "depth")]
     if with_posterior:
@@ -349,8 +347,7 @@ def map_columns(
         columns += [MapColumn("|error|", scales.length, "error")] if with_error else []
         columns += [MapColumn("σ, posterior", scales.length, "posterior_sigma")]
         return columns + ([MapColumn("|error|, posterior", scales.length, "posterior_error")] if with_error else [])
-    columns += [MapColumn("σ, network alone", scales.length, "own_sigma")] if with_own else []
-    columns += [MapColumn("σ, UfM*" if with_own else "σ", scales.length, "sigma")]
+    columns += [MapColumn("σ", scales.length, "sigma")]
     columns += [MapColumn("√B", scales.length, "anchored")] if with_anchored else []
     return columns + ([MapColumn("|error|", scales.length, "error")] if with_error else [])
 
@@ -388,9 +385,9 @@ def contact_sheet(
     require_matplotlib()
     used = fit_scales(panels) if scales is None else scales
     if columns is None:
-        fields = ("error", "anchored", "own_sigma", "posterior")
+        fields = ("error", "anchored", "posterior")
         has = {name: any(getattr(p, name) is not None for p in panels) for name in fields}
-        columns = map_columns(used, **{f"with_{name.removesuffix('_sigma')}": shown for name, shown in has.items()})
+        columns = map_columns(used, **{f"with_{name}": shown for name, shown in has.items()})
     rows = [
         GridRow(p.name, p.note.split(", ") if p.note else [], [Panel(p.image), *(_map_panel(c, p) for c in columns)])
         for p in panels

@@ -11,7 +11,7 @@ from ufmstar_torch.anchors.tracker import TrackerConfig
 from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULTS, TRACKED, TRUTH, default_of
+from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, mean_over, value_of
 from ufmstar_torch.eval.report.names import Quantity, setting_label
@@ -22,7 +22,7 @@ Rest = tuple[tuple[str, Any], ...]
 _COUNTS = {"": 0, TRACKED: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
 # What a row without anchors cannot have, beside what begins with "anchor_".
 _OF_ANCHORS = ("anchors", "track_noise", "corrected", "posterior")
-_ANCHORED = {TRACKED: "anchored", TRUTH: "truth anchors"}
+_ANCHORED = {TRACKED: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, ENSEMBLE, NETWORK, PLY, SHEET
+from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, ENSEMBLE, NETWORK, PLY, POSTERIOR, SHEET
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import main_table
 from ufmstar_torch.eval.report.write import Report
@@ -69,7 +69,7 @@ def demo_names(members: int) -> dict[str, str]:
     """The names of the demo's methods."""
     alone = "network alone" if members == 1 else f"{members} members in turn, alone"
     inferences = f"all {members} members per image"
-    return {NETWORK: alone, UFM: "  with UfM", UFM_STAR: "  with UfM*", ENSEMBLE: inferences}
+    return {NETWORK: alone, UFM: "  with UfM", UFM_STAR: "  with UfM*", POSTERIOR: "  posterior", ENSEMBLE: inferences}
 
 
 def demo_table(summary: Mapping[str, Any]) -> str:
@@ -106,7 +106,7 @@ def demo_explanation(summary: Mapping[str, Any]) -> str:
         "Better: a high delta1, a low NLL, ECE and AUSE, and a sigma that equals the RMSE beside it.",
     ]
     hints = {
-        SHEET: f"the last three columns share a scale, so sigma can be compared with the error; {unseen} rooms below",
+        SHEET: f"the last four columns share a scale, so sigma can be compared with the error; {unseen} rooms below",
         CURVES: "nearer to the diagonal is better; on the left, a curve below it is over-confident",
         PLY: f"the mixture, brighter = views disagree more; for splat viewers ({ELLIPSOIDS}: MeshLab, Blender)",
     }

@@ -20,11 +20,12 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.dense_keyframes import Keyframes
 from ufmstar_torch.anchors.dense_memory import Memory
+from ufmstar_torch.anchors.dense_poses import PoseErrors
 from ufmstar_torch.anchors.tracker import Landmarks, checked
 from ufmstar_torch.checked import Checked, number
 
 if TYPE_CHECKING:
-    from ufmstar_torch.kernels.dense_cpu import Measured, Search, Views
+    from ufmstar_torch.kernels.dense_cpu import Search, Views
 
 # Baselines of the keyframes that a frame is compared with, as shares of the median depth.
 _BASELINES = (0.04, 0.1, 0.22, 0.45)
@@ -32,10 +33,10 @@ _BASELINES = (0.04, 0.1, 0.22, 0.45)
 _NEAREST, _FARTHEST = 6.0, -0.03
 # Views that must agree; anchors on which running estimates of noise are based.
 _AGREE, _ENOUGH = 2, 10
-# Median of the square of a standard normal variable.
-_MEDIAN_SQUARE = 0.4549
-# [px] Standard deviation of a position by errors of the poses, before it is estimated.
-_FIRST_NOISE = 0.3
+# Frames in a row that contradict their poses, after which keyframes and landmarks are forgotten: the poses have jumped.
+_JUMPED = 3
+# Standard deviation of an inverse depth, as a share, by what no image shows: the scale of the poses.
+_SCALE = 0.005
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,8 @@ class DenseEvidence:
     def __init__(self, config: DenseConfig | None = None) -> None:
         self.config = config if config is not None else DenseConfig()
         self._keyframes = Keyframes(self.config.keyframes)
-        self._memory = Memory(self.config.landmarks)
+        self._memory = Memory(self.config.landmarks, self.config.memory)
+        self._errors = PoseErrors(len(_BASELINES), self.config.memory)
         self.reset()
 
     @property
@@ -104,19 +106,16 @@ class DenseEvidence:
         """Forget everything."""
         self._keyframes.reset()
         self._memory.reset()
+        self._errors.reset()
         self._camera: tuple[tuple[int, ...], NDArray[np.float64]] | None = None
-        self._depth = self.config.start_depth
-        self._noise = np.full(len(_BASELINES), _FIRST_NOISE**2)
-        self._disagreement = self._again = 1.0
+        self._depth, self._contradicted = self.config.start_depth, 0
 
     def state(self) -> dict[str, Tensor]:
         """A copy of all that is remembered, for :meth:`load_state`."""
         size, K = ((0, 0), np.eye(3)) if self._camera is None else self._camera
-        numbers = np.array([self._depth, self._disagreement, self._again])
-        held = {"size": np.array(size), "K": K, "noise": self._noise, "numbers": numbers}
-        return (
-            {name: torch.tensor(value) for name, value in held.items()} | self._keyframes.state() | self._memory.state()
-        )
+        numbers = torch.tensor([self._depth, self._contradicted], dtype=torch.float64)
+        held = {"size": torch.tensor(size), "K": torch.tensor(K), "numbers": numbers}
+        return held | self._keyframes.state() | self._memory.state() | self._errors.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where :meth:`state` was taken, with the same anchors to the last bit.
@@ -126,10 +125,11 @@ class DenseEvidence:
         """
         self._keyframes.load_state(state)
         self._memory.load_state(state)
-        K, self._noise = (np.array(state[name].numpy()) for name in ("K", "noise"))
+        self._errors.load_state(state)
         height, width = state["size"].tolist()
-        self._camera = ((height, width), K) if height else None
-        self._depth, self._disagreement, self._again = state["numbers"].tolist()
+        self._camera = ((height, width), np.array(state["K"].numpy())) if height else None
+        self._depth, contradicted = state["numbers"].tolist()
+        self._contradicted = int(contradicted)
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -157,39 +157,43 @@ class DenseEvidence:
             raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
         small, scale = _reduced(gray, self.config.width)
         result = self._measured(small, scale, T, scale @ K)
+        if self._contradicted >= _JUMPED:
+            self._contradicted = 0
+            self._keyframes.reset()
+            self._memory.forget()
         self._keyframes.add(small, T, self._depth)
         return result
 
     def _measured(self, small: NDArray[np.uint8], scale: NDArray, T: NDArray, K: NDArray) -> Landmarks:
         """The depths of a reduced image: landmarks that it shows, measured again where the camera has moved, and new
         ones in the cells between them. The running estimates follow."""
-        from ufmstar_torch.kernels.dense_cpu import measure  # compiles when it is first needed
+        from ufmstar_torch.kernels.beside_cpu import beside  # kernels compile when they are first needed
+        from ufmstar_torch.kernels.dense_cpu import measure
 
-        cell = _cell(small.shape[1])
+        cell, K = _cell(small.shape[1]), self._errors.camera(K)
         sighted = self._memory.sighted(small, T, K, cell)
         known, searched = len(sighted.slot), 0
         pixel = np.concatenate([sighted.pixel, _pixels(small, cell, sighted.pixel)])
         rho, variance = np.zeros(len(pixel)), np.ones(len(pixel))
-        agreed, trusted, factor = np.zeros(len(pixel), dtype=np.bool_), True, 1.0
+        agreed, trusted = np.zeros(len(pixel), dtype=np.bool_), True
         chosen = self._keyframes.choose(T, K, self._depth, _BASELINES)
         if len(chosen) >= _AGREE:
             expected = np.concatenate([np.flatnonzero(sighted.due), np.arange(known, len(pixel))])
             every = -(-len(expected) // self.config.searches) or 1
             expected = expected[self._memory.frame % every :: every]
             shares = np.array([share for share, _ in chosen])
-            views = self._views([keyframe for _, keyframe in chosen], shares, T, K)
+            noise = self._errors.positions(K, small.shape[1], self._depth)[shares]
+            views = self._views([keyframe for _, keyframe in chosen], noise, T, K)
             actual = measure(small, pixel[expected], views, self._search())
-            self._learn(actual, shares)
-            factor = max(self._disagreement, self._again, 1)
+            fit = self._errors.corrected(pixel[expected], actual, shares, views, K, self._depth)
             searched = len(expected)
-            rho[expected], variance[expected] = actual.rho, actual.variance * factor
+            rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
             agreed[expected] = (actual.agreed >= _AGREE) & (actual.contradicted == 0)
             matched = int((actual.agreed > 0).sum())
             trusted = matched < _ENOUGH or agreed.sum() >= self.config.min_share * matched
+        self._contradicted = 0 if trusted else self._contradicted + 1
         agreed &= (rho > np.sqrt(variance)) & trusted
-        both, fine, differ = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
-        if len(differ) >= _ENOUGH:
-            self._again = self._faded(self._again, factor * np.median(differ) / _MEDIAN_SQUARE)
+        both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])
         again, new = np.flatnonzero(agreed[:known] & fine), np.flatnonzero(agreed[known:]) + known
         self._memory.write(both.slot[again], small, both.pixel[again], both.rho[again], both.variance[again], T, K)
         self._memory.write(None, small, pixel[new], rho[new], variance[new], T, K)
@@ -199,8 +203,10 @@ class DenseEvidence:
             step = (1 - self.config.memory) * np.log(np.median(1 / rho[kept]) / self._depth)
             self._depth *= float(np.exp(step))
         confirmed = np.concatenate([self._memory.confirmed[both.slot[fine & trusted]], np.zeros(len(new), np.int64)])
-        depth, position = 1 / rho[kept], (pixel[kept] - scale[:2, 2]) / scale.diagonal()[:2]
-        return Landmarks(position, depth, variance[kept] * depth**4, searched + known, confirmed)
+        stated = variance[kept] + self._memory.apart * np.square(rho[kept])
+        surface, alone = beside(small, pixel[kept], rho[kept], stated, cell)
+        depth, position = 1 / rho[kept], (surface - scale[:2, 2]) / scale.diagonal()[:2]
+        return Landmarks(position, depth, (stated + alone) * depth**4, searched + known, confirmed)
 
     def _search(self) -> Search:
         from ufmstar_torch.kernels.dense_cpu import Search
@@ -216,7 +222,7 @@ class DenseEvidence:
             match=config.match_noise,
         )
 
-    def _views(self, keyframes: list[int], shares: NDArray, T: NDArray, K: NDArray) -> Views:
+    def _views(self, keyframes: list[int], noise: NDArray, T: NDArray, K: NDArray) -> Views:
         """The chosen keyframes, and how pixels of the camera T [4, 4] get into them."""
         from ufmstar_torch.kernels.dense_cpu import Views
 
@@ -224,22 +230,7 @@ class DenseEvidence:
         into = pose[:, :3, :3].transpose(0, 2, 1)
         H = K @ into @ T[:3, :3] @ np.linalg.inv(K)
         b = ((T[:3, 3] - pose[:, :3, 3])[:, None] @ pose[:, :3, :3])[:, 0] @ K.T
-        return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), self._noise[shares])
-
-    def _faded(self, before: float, now: float) -> float:
-        return self.config.memory * before + (1 - self.config.memory) * float(now)
-
-    def _learn(self, found: Measured, shares: NDArray) -> None:
-        """Running estimates of the poses' noise by baseline, and of how far keyframes disagree."""
-        for column, share in enumerate(shares):
-            shown = np.isfinite(found.across[:, column]) & (found.agreed >= _AGREE)
-            if shown.sum() >= _ENOUGH:
-                seen = np.median(np.square(found.across[shown, column])) / _MEDIAN_SQUARE
-                noise = max(seen - np.median(found.across_noise[shown, column]), 0.0)
-                self._noise[share] = self._faded(self._noise[share], noise)
-        differ = found.differ[np.isfinite(found.differ)]
-        if len(differ) >= _ENOUGH:
-            self._disagreement = self._faded(self._disagreement, np.median(differ) / _MEDIAN_SQUARE)
+        return Views(image, np.ascontiguousarray(H), np.ascontiguousarray(b), noise)
 
 
 def _reduced(gray: NDArray[np.uint8], width: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

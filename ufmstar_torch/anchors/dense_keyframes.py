@@ -26,7 +26,7 @@ class Keyframes:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._image = np.zeros((self._count, 0, 0), np.uint8)
+        self._image = [np.zeros((0, 0), np.uint8)] * self._count  # none is ever written to
         self._pose = np.tile(np.eye(4), (self._count, 1, 1))
         self._added = 0
 
@@ -43,8 +43,8 @@ class Keyframes:
             T_world_cam: [4, 4] [m].
             depth: median of the scene [m].
         """
-        if self._image.shape[1:] != image.shape:
-            self._image = np.zeros((self._count, *image.shape), np.uint8)
+        if self._image[0].shape != image.shape:
+            self._image = [np.zeros(image.shape, np.uint8)] * self._count
         if self._added:
             last = self._pose[(self._added - 1) % self._count]
             moved = np.linalg.norm(last[:3, 3] - T_world_cam[:3, 3])
@@ -52,7 +52,7 @@ class Keyframes:
             if moved < _MOVED * depth and turned < _TURNED:
                 return
         slot = self._added % self._count
-        self._image[slot], self._pose[slot] = image, T_world_cam
+        self._image[slot], self._pose[slot] = image.copy(), T_world_cam
         self._added += 1
 
     def choose(
@@ -90,7 +90,7 @@ class Keyframes:
         self, pose: NDArray[np.float64], T: NDArray[np.float64], K: NDArray[np.float64], depth: float
     ) -> NDArray[np.float64]:
         """[n] share of a grid of points at a depth before the camera T that the views show."""
-        height, width = self._image.shape[1:]
+        height, width = self._image[0].shape
         u, v = np.meshgrid((np.arange(4) + 0.5) * width / 4, (np.arange(4) + 0.5) * height / 4)
         rays = np.stack([u.ravel(), v.ravel(), np.ones(16)], -1) @ np.linalg.inv(K).T
         world = depth * rays @ T[:3, :3].T + T[:3, 3]
@@ -102,16 +102,16 @@ class Keyframes:
 
     def images(self, keyframes: list[int]) -> NDArray[np.uint8]:
         """[V, H, W] of some."""
-        return self._image[keyframes]
+        return np.stack([self._image[keyframe] for keyframe in keyframes])
 
     def poses(self, keyframes: list[int]) -> NDArray[np.float64]:
         """[V, 4, 4] camera-to-world of some [m]."""
         return self._pose[keyframes]
 
     def state(self) -> dict[str, Tensor]:
-        """A copy of all that is remembered, for :meth:`load_state`."""
-        held = {"image": self._image, "pose": self._pose, "added": np.array(self._added)}
-        return {name: torch.tensor(value) for name, value in held.items()}
+        """All that is remembered, for :meth:`load_state`; the images are shared and must not be written to."""
+        images = {f"image{i}": torch.from_numpy(image) for i, image in enumerate(self._image)}
+        return images | {"pose": torch.tensor(self._pose), "added": torch.tensor(self._added)}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where :meth:`state` was taken.
@@ -121,5 +121,6 @@ class Keyframes:
         """
         if len(state["pose"]) != self._count:
             raise ValueError(f"state must be of {self._count} keyframes, got {len(state['pose'])}")
-        self._image, self._pose = (np.array(state[name].numpy()) for name in ("image", "pose"))
+        self._image = [state[f"image{i}"].numpy() for i in range(self._count)]
+        self._pose = np.array(state["pose"].numpy())
         self._added = int(state["added"])

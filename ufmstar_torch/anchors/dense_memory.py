@@ -15,6 +15,10 @@ from torch import Tensor
 _DUE, _SELDOM = 0.04, 4
 # Confirmed where two measurements differ by at most so many standard deviations, and this share of the inverse depth.
 _SIGMAS, _SHARE = 3.5, 0.01
+# Measurements on which the running estimate of ``apart`` is based, its first value, and steps of its bisection.
+_ENOUGH, _FIRST_APART, _STEPS = 10, 0.01**2, 16
+# The median of the square of a standard normal variable.
+_MEDIAN_SQUARE = 0.4549
 # Failures in a row, beyond the number of confirmations, after which a landmark is forgotten.
 _FAILURES = 3
 
@@ -41,13 +45,19 @@ class Sighted:
 class Memory:
     """At most ``count`` landmarks.
 
+    Args:
+        count: of landmarks.
+        fading: share of the running estimate that remains after a frame.
+
     Attributes:
+        apart: variance of an inverse depth, as a share of its square, beyond what is stated: by so much do measurements
+            of a landmark from different times differ. It is what the views of one time have in common.
         confirmed: [count] in how many later views each was confirmed.
         frame: images so far.
     """
 
-    def __init__(self, count: int) -> None:
-        self._count = count
+    def __init__(self, count: int, fading: float) -> None:
+        self._count, self._fading = count, fading
         self.reset()
 
     def reset(self) -> None:
@@ -60,12 +70,13 @@ class Memory:
         self._patch = np.zeros((n, SIDE, SIDE), np.float32)
         self._used = np.zeros(n, dtype=np.bool_)
         self.confirmed, self._failed, self._seen = (np.zeros(n, np.int64) for _ in range(3))
-        self.frame = 0
+        self.frame, self.apart = 0, _FIRST_APART
 
     def state(self) -> dict[str, Tensor]:
         """A copy of all that is remembered, for :meth:`load_state`."""
         held = {name: torch.tensor(getattr(self, attribute)) for name, attribute in _HELD.items()}
-        return held | {"landmark_frame": torch.tensor(self.frame)}
+        numbers = torch.tensor([self.frame, self.apart], dtype=torch.float64)
+        return held | {"landmark_numbers": numbers}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """Go on where :meth:`state` was taken.
@@ -77,7 +88,8 @@ class Memory:
             raise ValueError(f"state must be of {self._count} landmarks, got {len(state['landmark_point'])}")
         for name, attribute in _HELD.items():
             setattr(self, attribute, np.array(state[name].numpy()))
-        self.frame = int(state["landmark_frame"])
+        frame, self.apart = state["landmark_numbers"].tolist()
+        self.frame = int(frame)
 
     def sighted(
         self, image: NDArray[np.uint8], T_world_cam: NDArray[np.float64], K: NDArray[np.float64], cell: int
@@ -114,12 +126,16 @@ class Memory:
         rho = 1 / depth[kept]
         return Sighted(slot, pixel[kept], rho, np.square(spread[kept] * rho * rho), due)
 
+    def forget(self) -> None:
+        """Forget all landmarks, and keep the running estimate."""
+        self._used[:] = False
+
     def _forget(self, slot: NDArray[np.int64]) -> None:
         self._used[slot[self._failed[slot] > _FAILURES + self.confirmed[slot]]] = False
 
     def compare(
         self, sighted: Sighted, rho: NDArray[np.float64], variance: NDArray[np.float64], measured: NDArray[np.bool_]
-    ) -> tuple[Sighted, NDArray[np.bool_], NDArray[np.float64]]:
+    ) -> tuple[Sighted, NDArray[np.bool_]]:
         """Confirm or refute landmarks by new measurements.
 
         Args:
@@ -129,11 +145,14 @@ class Memory:
             measured: [n] which were.
 
         Returns:
-            The landmarks with both measurements together; [n] which of them are not refuted; [m] of those measured,
-            the squared difference by its variance.
+            The landmarks with both measurements together; [n] which of them are not refuted.
         """
-        spread, difference = sighted.variance + variance, np.square(rho - sighted.rho)
-        alike = difference <= _SIGMAS**2 * spread + np.square(_SHARE * sighted.rho)
+        spread, square = sighted.variance + variance, np.square(sighted.rho)
+        difference = np.square(rho - sighted.rho)
+        alike = difference <= _SIGMAS**2 * (spread + self.apart * square) + _SHARE**2 * square
+        if measured.sum() >= _ENOUGH:
+            now = _beyond((difference / square)[measured], (spread / square)[measured])
+            self.apart = self._fading * self.apart + (1 - self._fading) * now
         confirmed, refuted = measured & alike, measured & ~alike
         self.confirmed[sighted.slot[confirmed]] += 1
         self._failed[sighted.slot[refuted]] += 2
@@ -143,7 +162,7 @@ class Memory:
         both = np.where(confirmed, (sighted.rho * old + rho * new) / (old + new), sighted.rho)
         # Measurements share keyframes and patches: together they are as certain as the better one.
         least = np.where(confirmed, np.minimum(sighted.variance, variance), sighted.variance)
-        return Sighted(sighted.slot, sighted.pixel, both, least, sighted.due), ~refuted, (difference / spread)[measured]
+        return Sighted(sighted.slot, sighted.pixel, both, least, sighted.due), ~refuted
 
     def write(
         self,
@@ -178,6 +197,18 @@ class Memory:
         self._pose[slot], self._sigma[slot] = T_world_cam, np.sqrt(variance[:n]) / rho[:n]
         self._patch[slot] = patches(image, pixel[:n])
         self._used[slot], self._failed[slot], self._seen[slot] = True, 0, self.frame
+
+
+def _beyond(square: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
+    """The variance that, added to those stated, makes squared differences of a median as they should have."""
+    low, high = 1e-8, 0.3**2
+    if np.median(square / (variance + low)) <= _MEDIAN_SQUARE:
+        return 0.0
+    for _ in range(_STEPS):
+        middle = float(np.sqrt(low * high))
+        too_small = np.median(square / (variance + middle)) > _MEDIAN_SQUARE
+        low, high = (middle, high) if too_small else (low, middle)
+    return high
 
 
 _HELD = {

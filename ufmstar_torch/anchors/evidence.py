@@ -56,8 +56,8 @@ TIE = 1e-6
 # .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
 SIMILAR_SIGMAS, LOWER_QUARTILE = 2.5, 0.4506
 # Claims of more than so many times the mean square error of the frame's other anchors count less; an anchor with less
-# than _COUNTS of its weight is not reported as used.
-_CLAIM, _COUNTS = 4.0, 0.5
+# than COUNTS of its weight is not reported as used.
+CLAIM, COUNTS = 4.0, 0.5
 # Least sigma of log g/d: tracked landmarks are right to some 2 %, whatever variance they state.
 LEAST_SIGMA = 0.02
 
@@ -101,7 +101,7 @@ def inliers(anchors: AnchorInput) -> Tensor:
     u, v = anchors.pixel.unbind(-1)
     apart = (u[:, :, None] - u[:, None]).square_().add_((v[:, :, None] - v[:, None]).square_())
     # Of neighbours equally near the first given counts: which of them topk takes depends on how far a row is padded.
-    apart += TIE * torch.arange(n, device=few.device)
+    apart += TIE * torch.arange(n, dtype=apart.dtype, device=few.device)
     apart.masked_fill_(~anchors.valid[:, None], torch.inf).diagonal(dim1=1, dim2=2).fill_(torch.inf)
     distance, neighbour = apart.topk(min(NEIGHBOURS, n - 1), dim=2, largest=False)
     requested = (distance < torch.inf) & anchors.valid[:, :, None]
@@ -144,7 +144,7 @@ def observe(
     w = _weight(r.square(), claim, supported)
     rows = torch.stack([w, w * r, w * (r.square() - claim)], dim=-1)
     rows = torch.where(supported[..., None], rows, torch.zeros_like(rows))
-    used = supported & (w >= _COUNTS)
+    used = supported & (w >= COUNTS)
     dtype = evidence.overall.dtype
     fresh = used.any(1, keepdim=True).double()
     fade = memory * fresh + (1 - fresh)
@@ -158,7 +158,7 @@ def _weight(r2: Tensor, claim: Tensor, supported: Tensor) -> Tensor:
     r2 = torch.where(supported, r2, torch.zeros_like(r2))
     others = (supported.sum(1, keepdim=True) - 1).clamp_min(0)
     mean = (total(r2, 1)[:, None] - r2) / others.clamp_min(1)
-    limit = others.clamp_max(_CLAIM) * mean.clamp_min(LEAST_SIGMA**2)
+    limit = others.clamp_max(CLAIM) * mean.clamp_min(LEAST_SIGMA**2)
     limit = torch.where(others > 0, limit, torch.ones_like(limit))
     return (limit / claim.clamp_min(torch.finfo(claim.dtype).tiny)).clamp_max(1).square()
 

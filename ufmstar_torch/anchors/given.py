@@ -6,7 +6,9 @@ prediction is known. ``evidence`` says what is learnt from that, and how it is s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -17,14 +19,15 @@ from ufmstar_torch.frame import FrameInput
 
 # An anchor whose standard deviation is as large as its depth, or that is off from the prediction by a factor like this,
 # measures nothing: one alone would decide the mean of all others, and larger values overflow in the state.
-_FARTHEST_OFF = 100.0
+FARTHEST_OFF = 100.0
 
 
 @dataclass(frozen=True)
 class Anchors:
     """Sparse depths of one frame, padded to N per stream.
 
-    Some hundred are enough. Each is compared with all others: time and memory grow with N^2, to gigabytes at 10 000.
+    Some hundred are enough. On the CPU time and memory grow with N; elsewhere each is compared with all others, and
+    they grow with N^2, to gigabytes at 10 000.
 
     Attributes:
         pixel: [B, N, 2] position (u, v) in the depth map, first pixel's centre at (0, 0) [px].
@@ -136,7 +139,59 @@ class AnchorInput:
     confirmed: Tensor | None = None
 
 
-def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | None) -> AnchorInput:
+def claimed(own: Sequence[Tensor], index: Tensor, valid: Tensor) -> Tensor:
+    """[B, N] float64 the sum of the maps ``own`` [B, H, W] at pixels ``index``, 0 where not valid."""
+    zero = torch.zeros(index.shape, dtype=torch.float64, device=index.device)
+    if not own:
+        return zero
+    total, *others = (torch.gather(value.detach().flatten(1), 1, index) for value in own)
+    for other in others:
+        total = total + other
+    return torch.where(valid, total.double(), zero)
+
+
+class CheckKernel(Protocol):
+    """Anchors of the right shapes and dtypes, on the frame's device, and what the network claims
+    (:func:`check_values`)."""
+
+    def __call__(self, anchors: Anchors, frame: FrameInput, own: Sequence[Tensor], /) -> AnchorInput: ...
+
+
+def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
+    """The anchors, ready to be used; see :func:`check_anchors`.
+
+    Args:
+        anchors: of the right shapes, in float64, ``confirmed`` in int64.
+        frame, own: as :func:`check_anchors`.
+    """
+    pixel, depth, variance = anchors.pixel, anchors.depth, anchors.variance
+    height, width = frame.size
+    # Compared as standard deviations: the square of a large depth overflows.
+    valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & pixel.isfinite().all(-1)
+    if anchors.valid is not None:
+        valid = valid & anchors.valid
+    pixel = torch.where(valid[..., None], pixel, torch.zeros_like(pixel))
+    u, v = pixel.round().long().unbind(-1)
+    index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
+    predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
+    valid = valid & _inside(pixel, frame.size) & torch.gather(frame.valid.flatten(1), 1, index)
+    valid = valid & (depth <= FARTHEST_OFF * predicted) & (predicted <= FARTHEST_OFF * depth)
+    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
+    return AnchorInput(
+        pixel=pixel,
+        index=index,
+        predicted=torch.where(valid, predicted, one),
+        depth=torch.where(valid, depth, one),
+        variance=torch.where(valid, variance, zero),
+        own_variance=claimed(own, index, valid),
+        valid=valid,
+        confirmed=anchors.confirmed,
+    )
+
+
+def check_anchors(
+    anchors: Anchors, frame: FrameInput, own: Sequence[Tensor] = (), kernel: CheckKernel = check_values
+) -> AnchorInput:
     """Anchors of one frame, ready to be used; in float64 on the depth's device.
 
     An anchor whose values make no sense, that lies beside the image or on a pixel without a depth, or that says nothing
@@ -145,13 +200,14 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
     Args:
         anchors: see :class:`Anchors`.
         frame: B streams, the same.
-        own_variance: [B, H, W] A + E [m^2], or None.
+        own: the network's own variances that count, A and E, each [B, H, W] [m^2].
+        kernel: an implementation of :func:`check_values`.
 
     Raises:
         TypeError: something else than anchors; a field is no tensor or of the wrong kind of dtype.
         ValueError: a field has the wrong shape or lies on another device.
     """
-    b, (height, width) = frame.depth.shape[0], frame.size
+    b = frame.depth.shape[0]
     anchors = require_anchors(anchors)
     pixel = require_float("anchors.pixel", anchors.pixel, like=frame.depth).detach().double()
     if pixel.dim() != 3 or pixel.shape[0] != b or pixel.shape[2] != 2:
@@ -159,31 +215,12 @@ def check_anchors(anchors: Anchors, frame: FrameInput, own_variance: Tensor | No
     shape = [(b, pixel.shape[1])]
     depth = require_float("anchors.depth", anchors.depth, shape, frame.depth).detach().double()
     variance = require_float("anchors.variance", anchors.variance, shape, frame.depth).detach().double()
-    # Compared as standard deviations: the square of a large depth overflows.
-    valid = (depth > 0) & (depth < torch.inf) & (variance >= 0) & (variance.sqrt() < depth) & pixel.isfinite().all(-1)
-    if anchors.valid is not None:
-        valid = valid & require_mask("anchors.valid", anchors.valid, shape, frame.depth)
-    confirmed = anchors.confirmed
+    valid, confirmed = anchors.valid, anchors.confirmed
+    if valid is not None:
+        valid = require_mask("anchors.valid", valid, shape, frame.depth)
     if confirmed is not None:
         confirmed = require_whole("anchors.confirmed", confirmed, shape, frame.depth).long()
-    pixel = torch.where(valid[..., None], pixel, torch.zeros_like(pixel))
-    u, v = pixel.round().long().unbind(-1)
-    index = v.clamp(0, height - 1) * width + u.clamp(0, width - 1)
-    predicted = torch.gather(frame.depth.flatten(1), 1, index).double()
-    valid = valid & _inside(pixel, frame.size) & torch.gather(frame.valid.flatten(1), 1, index)
-    valid = valid & (depth <= _FARTHEST_OFF * predicted) & (predicted <= _FARTHEST_OFF * depth)
-    one, zero = torch.ones_like(depth), torch.zeros_like(depth)
-    own = zero if own_variance is None else torch.gather(own_variance.detach().flatten(1), 1, index).double()
-    return AnchorInput(
-        pixel=pixel,
-        index=index,
-        predicted=torch.where(valid, predicted, one),
-        depth=torch.where(valid, depth, one),
-        variance=torch.where(valid, variance, zero),
-        own_variance=torch.where(valid, own, zero),
-        valid=valid,
-        confirmed=confirmed,
-    )
+    return kernel(Anchors(pixel, depth, variance, valid, confirmed), frame, own)
 
 
 def require_anchors(anchors: object) -> Anchors:

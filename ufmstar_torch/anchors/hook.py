@@ -8,7 +8,8 @@ anchors through this file only.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -27,14 +28,81 @@ __all__ = [
     "AnchorInput",
     "Anchors",
     "Evidence",
+    "Learnt",
     "after_regression",
     "anchored_term",
     "before_regression",
     "check_anchors",
+    "learn",
 ]
 
 # (mixture in the camera frame, points [B, N, 3], values [B, N, C], config) -> sums by component [B, K, C]
 Distribute = Callable[[GaussianMixture, Tensor, Tensor, UfMStarConfig], Tensor]
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What is known after a frame's anchors.
+
+    Attributes:
+        evidence: this frame's included.
+        used: [B] how many anchors were used.
+        beyond: [B, K, 2] mean r and e of the components less the stream's (``evidence.means``).
+        stream: [B, 2] the stream's.
+    """
+
+    evidence: Evidence
+    used: Tensor
+    beyond: Tensor
+    stream: Tensor
+
+
+class LearnKernel(Protocol):
+    """Evidence with room for the mixture, M_i in the camera frame, a frame and its anchors (:func:`learn`)."""
+
+    def __call__(
+        self,
+        evidence: Evidence,
+        mixture_cam: GaussianMixture,
+        frame: FrameInput,
+        anchors: AnchorInput | None,
+        config: UfMStarConfig,
+        /,
+    ) -> Learnt: ...
+
+
+def learn(
+    evidence: Evidence,
+    mixture_cam: GaussianMixture,
+    frame: FrameInput,
+    anchors: AnchorInput | None,
+    config: UfMStarConfig,
+    distribute: Distribute,
+    supported: Callable[[AnchorInput], Tensor] = inliers,
+) -> Learnt:
+    """Add a frame's anchors to the evidence.
+
+    Args:
+        evidence: up to the frame before.
+        mixture_cam: M_i in the camera frame, [B, K].
+        frame: the same B streams.
+        anchors: of this frame, or None.
+        config: of UfM*.
+        distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
+        supported: which anchors their neighbours support (``evidence.inliers``).
+    """
+    used = torch.zeros_like(frame.fault)
+    if anchors is not None:
+        points = unproject_at(anchors.predicted, anchors.index, frame.size[1], frame.intrinsics)
+
+        def by_component(rows: Tensor) -> Tensor:
+            return distribute(mixture_cam, points, rows, config)
+
+        memory = 0.5 ** (1 / config.anchor_half_life)
+        # A faulty frame's anchors are not valid.
+        evidence, each = observe(evidence, anchors, by_component, memory, supported)
+        used = each.sum(1)
+    return Learnt(evidence, used, *means(evidence, config.anchor_shrinkage))
 
 
 def before_regression(
@@ -43,41 +111,24 @@ def before_regression(
     frame: FrameInput,
     anchors: AnchorInput | None,
     config: UfMStarConfig,
-    distribute: Distribute,
-    supported: Callable[[AnchorInput], Tensor] = inliers,
+    kernel: LearnKernel,
 ) -> tuple[Evidence, Tensor, GaussianMixture, Tensor | None]:
     """Add a frame's anchors to the evidence, and make the mixture ready to regress it.
 
     Args:
-        evidence: up to the frame before.
-        mixture_cam: M_i in the camera frame, [B, K].
-        frame: the same B streams.
-        anchors: of this frame, or None.
+        evidence, mixture_cam, frame, anchors: as :func:`learn`.
         config: ``anchored`` False = everything is returned as it is.
-        distribute: sums values at points by component (:func:`ufmstar_torch.regress.distribute`).
-        supported: which anchors their neighbours support (``evidence.inliers``).
+        kernel: an implementation of :func:`learn`.
 
     Returns:
         The evidence, this frame's included; how many anchors were used [B]; the mixture with two more features, the
         components' mean r and e less the stream's; the stream's means [B, 2], for :func:`after_regression`.
     """
-    used = torch.zeros_like(frame.fault)
     if not config.anchored:
-        return evidence, used, mixture_cam, None
-    evidence = evidence.padded(mixture_cam.capacity)
-    if anchors is not None:
-        points = unproject_at(anchors.predicted, anchors.index, frame.size[1], frame.intrinsics)
-
-        def by_component(rows: Tensor) -> Tensor:
-            return distribute(mixture_cam, points, rows, config)
-
-        memory = 0.5 ** (1 / config.anchor_half_life)
-        evidence, each = observe(
-            evidence, anchors, by_component, memory, supported
-        )  # a faulty frame's anchors are not valid
-        used = each.sum(1)
-    beyond, stream = means(evidence, config.anchor_shrinkage)
-    return evidence, used, mixture_cam.replace(features=torch.cat([mixture_cam.features, beyond], dim=-1)), stream
+        return evidence, torch.zeros_like(frame.fault), mixture_cam, None
+    learnt = kernel(evidence.padded(mixture_cam.capacity), mixture_cam, frame, anchors, config)
+    features = torch.cat([mixture_cam.features, learnt.beyond], dim=-1)
+    return learnt.evidence, learnt.used, mixture_cam.replace(features=features), learnt.stream
 
 
 def after_regression(result: Regression, stream: Tensor | None) -> tuple[Regression, Tensor | None]:
@@ -106,4 +157,4 @@ def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> Tensor
         excess: e, likewise, the relative mean square error that the network does not state (``evidence``).
         disagreement: M, likewise [m^2].
     """
-    return (depth.square() * excess - disagreement).clamp_min(0)
+    return depth.square().mul_(excess).sub_(disagreement).clamp_min_(0)

@@ -1,93 +1,393 @@
-"""Which anchors their neighbours support, on the CPU (numba): neighbours along a sorted axis instead of all pairs."""
+"""A frame's anchors on the CPU (numba): their check, which of them their neighbours support, and what they teach.
+
+Neighbours, and the components near an anchor, are searched in a grid over the image: time and memory grow with the
+number of anchors. Shares are summed cell by cell, in each in the order of the anchors: padding and other streams change
+no bit.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.anchors.evidence import LEAST_SIGMA, LOWER_QUARTILE, NEIGHBOURS, SIMILAR_SIGMAS, SUPPORT, TIE
-from ufmstar_torch.anchors.given import AnchorInput
+from ufmstar_torch.anchors.evidence import (
+    CLAIM,
+    COUNTS,
+    LEAST_SIGMA,
+    LOWER_QUARTILE,
+    NEIGHBOURS,
+    SIMILAR_SIGMAS,
+    SUPPORT,
+    TIE,
+    Evidence,
+)
+from ufmstar_torch.anchors.given import FARTHEST_OFF, AnchorInput, Anchors, claimed
+from ufmstar_torch.anchors.hook import Learnt
+from ufmstar_torch.anchors.hook import learn as learn_reference
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.regress_cpu import EPSILON
+from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
+from ufmstar_torch.kernels.threads_cpu import each
+from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.regress import distribute
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Anchors of a cell, on average, where neighbours are searched and where components are.
+_FEW, _SOME = 3, 32
+
+
+def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
+    """As :func:`ufmstar_torch.anchors.given.check_values`, for CPU tensors."""
+    b, n = anchors.depth.shape
+    pixel, index, valid = np.empty((b, n, 2)), np.empty((b, n), np.int64), np.empty((b, n), np.bool_)
+    predicted, depth, variance = np.empty((3, b, n))
+    mask = np.empty((b, 0), np.bool_) if anchors.valid is None else anchors.valid.contiguous().numpy()
+    given = (value.contiguous().numpy() for value in (anchors.pixel, anchors.depth, anchors.variance))
+    maps = (value.contiguous().numpy() for value in (frame.depth, frame.valid))
+    _check(*given, mask, *maps, FARTHEST_OFF, pixel, index, predicted, depth, variance, valid)
+    at, usable = torch.from_numpy(index), torch.from_numpy(valid)
+    p, d, g, s2 = (torch.from_numpy(value) for value in (pixel, predicted, depth, variance))
+    return AnchorInput(p, at, d, g, s2, claimed(own, at, usable), usable, anchors.confirmed)
+
+
+@kernel
+def _check(given, measured, spread, mask, depth, use, farthest, pixel, index, predicted, out, variance, valid):
+    height, width = use.shape[1:]
+    for b in range(valid.shape[0]):
+        for i in range(valid.shape[1]):
+            u, v, g, s2 = given[b, i, 0], given[b, i, 1], measured[b, i], spread[b, i]
+            ok = 0 < g < np.inf and s2 >= 0 and math.sqrt(s2) < g and math.isfinite(u) and math.isfinite(v)
+            ok = ok and (mask.shape[1] == 0 or mask[b, i])
+            u, v = (u, v) if ok else (0.0, 0.0)
+            column, row = np.rint(u), np.rint(v)
+            inside = 0 <= column < width and 0 <= row < height
+            column, row = min(max(column, 0.0), width - 1.0), min(max(row, 0.0), height - 1.0)
+            x, y = int(column), int(row)
+            d = np.float64(depth[b, y, x])
+            ok = ok and inside and use[b, y, x] and g <= farthest * d and d <= farthest * g
+            pixel[b, i, 0], pixel[b, i, 1], index[b, i], valid[b, i] = u, v, y * width + x, ok
+            predicted[b, i], out[b, i], variance[b, i] = (d, g, s2) if ok else (1.0, 1.0, 0.0)
 
 
 def inliers(anchors: AnchorInput) -> Tensor:
     """As :func:`ufmstar_torch.anchors.evidence.inliers`, for CPU tensors; the same anchors."""
-    n = anchors.valid.shape[1]
-    if n <= SUPPORT:
-        return anchors.valid
-    log_ratio = (anchors.depth / anchors.predicted).log()
-    noise = anchors.variance / anchors.depth.square()
-    tie = (TIE * torch.arange(n)).double().numpy()
-    out = np.empty(anchors.valid.shape, np.bool_)
-    given = (value.contiguous().numpy() for value in (anchors.pixel, anchors.valid, log_ratio, noise))
-    for pixel, valid, ratio, spread, supported in zip(*given, out, strict=True):
-        order = np.argsort(pixel[:, 0])
-        order = order[valid[order]]
-        _supported(pixel, valid, ratio, spread, tie, order, min(NEIGHBOURS, n - 1), supported)
+    b, n = anchors.valid.shape
+    out, most = np.empty((b, n), np.bool_), max(min(NEIGHBOURS, n - 1), 0)
+    given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
+    arrays = zip(*(value.contiguous().numpy() for value in given), out, strict=True)
+    each(_inliers, [(*arguments, most) for arguments in arrays])
     return torch.from_numpy(out)
 
 
-@kernel
-def _supported(pixel, valid, ratio, noise, tie, order, most, out):
-    """One stream; ``order`` are its valid anchors by u."""
-    neighbour = np.empty((order.size, most), np.int64)
-    count = np.empty(order.size, np.int64)
-    distance = np.empty(most)
-    differ, total = np.empty(order.size * most), 0
-    for place in range(order.size):
-        count[place] = _nearest(pixel, tie, order, place, distance, neighbour[place])
-        for i in range(count[place]):
-            differ[total] = abs(ratio[order[place]] - ratio[neighbour[place, i]])
-            total += 1
-    quartile = _lower_quartile(differ[:total])
-    sigma2 = (quartile / LOWER_QUARTILE) * (quartile / LOWER_QUARTILE) + 2 * LEAST_SIGMA**2
-    for i in range(out.size):
-        out[i] = valid[i] and order.size <= SUPPORT
-    for place in range(order.size):
-        a, support = order[place], 0
-        for i in range(count[place]):
-            b = neighbour[place, i]
-            support += abs(ratio[a] - ratio[b]) <= SIMILAR_SIGMAS * math.sqrt(sigma2 + noise[a] + noise[b])
-        out[a] = out[a] or support >= SUPPORT
+def _inliers(
+    pixel: Floats, predicted: Floats, depth: Floats, variance: Floats, valid: Mask, out: Mask, most: int
+) -> None:
+    """One stream, N anchors, into ``out`` [N]."""
+    n = valid.size
+    neighbour, count, ratio = np.empty((n, most), np.int64), np.empty(n, np.int64), np.empty(n)
+    differ = np.empty(n * most)
+    total = _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ)
+    _support(variance, depth, valid, ratio, neighbour, count, _lower_quartile(differ[:total]), out)
 
 
-@part
-def _nearest(pixel, tie, order, place, distance, neighbour):
-    """The nearest anchors in the image, and how many there are: from the place in the order to both sides, until the
-    difference in u alone is farther than the farthest of them."""
-    a, n, most = order[place], 0, neighbour.size
-    for side in (-1, 1):
-        other = place + side
-        while 0 <= other < order.size:
-            b = order[other]
-            du, dv = pixel[a, 0] - pixel[b, 0], pixel[a, 1] - pixel[b, 1]
-            if n == most and du * du > distance[n - 1]:
-                break
-            apart = du * du + dv * dv + tie[b]
-            if n < most or apart < distance[n - 1]:
-                n = min(n + 1, most)
-                i = n - 1
-                while i > 0 and distance[i - 1] > apart:
-                    distance[i], neighbour[i] = distance[i - 1], neighbour[i - 1]
-                    i -= 1
-                distance[i], neighbour[i] = apart, b
-            other += side
-    return n
-
-
-@part
-def _lower_quartile(values):
+def _lower_quartile(values: Floats) -> float:
     """``torch.quantile(values, 0.25)``, 0 of no values."""
     if values.size == 0:
         return 0.0
     rank = 0.25 * (values.size - 1)
     below = int(rank)
-    part = np.partition(values, below)
-    low, high = part[below], part[below]
-    if below + 1 < values.size:
-        high = part[below + 1 :].min()
-    weight = rank - below
+    above = min(below + 1, values.size - 1)
+    part = np.partition(values, (below, above))
+    low, high, weight = float(part[below]), float(part[above]), rank - below
     return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
+
+
+def learn(
+    evidence: Evidence,
+    mixture_cam: GaussianMixture,
+    frame: FrameInput,
+    anchors: AnchorInput | None,
+    config: UfMStarConfig,
+) -> Learnt:
+    """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors; with the exact sum, shares are right to twice the
+    error of the regression's in the dtype of the evidence."""
+    if config.regression != "exact":
+        return learn_reference(evidence, mixture_cam, frame, anchors, config, distribute, inliers)
+    b, capacity, _ = evidence.component.shape
+    dtype = evidence.overall.dtype
+    # In float64 for every dtype, so that there is one kernel to compile.
+    real: Any = {"dtype": torch.float64}
+    component, beyond = torch.empty(b, capacity, 3, **real), torch.empty(b, capacity, 2, **real)
+    overall, stream, used = torch.empty(b, 3, **real), torch.empty(b, 2, **real), torch.zeros(b, dtype=torch.int64)
+    if anchors is None:
+        fields = [torch.empty(b, 0, dtype=torch.int64)] + [torch.empty(b, 0, dtype=torch.float64)] * 4
+        fields += [torch.empty(b, 0, dtype=torch.bool)]
+    else:
+        fields = [anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance]
+        fields += [inliers(anchors)]
+    mixture = (value.double() for value in (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight))
+    given = [*fields, frame.intrinsics.double(), *mixture, evidence.component.double(), evidence.overall.double()]
+    results = (component, overall, used[:, None], beyond, stream)
+    memory = 0.5 ** (1 / config.anchor_half_life)
+    settings = (
+        frame.size[1],
+        memory,
+        config.anchor_shrinkage,
+        config.prior_weight,
+        EPSILON[dtype],
+        dtype == torch.float32,
+    )
+    arrays = zip(*(value.contiguous().numpy() for value in given), strict=True)
+    out = zip(*(value.numpy() for value in results), strict=True)
+    each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
+    return Learnt(Evidence(component.to(dtype), overall.to(dtype)), used, beyond, stream)
+
+
+@kernel
+def _learn(
+    index, predicted, depth, variance, own, supported, K, mean, covariance, weight, before, overall_before, width,
+    memory, shrinkage, prior_weight, epsilon, single, component, overall, used, beyond, stream,
+):  # fmt: skip
+    """One stream: N anchors, K components."""
+    rows, sums = np.empty((supported.size, 3)), np.zeros((component.shape[0], 3))
+    used[0] = _rows(predicted, depth, variance, own, supported, rows)
+    if supported.size > 0:
+        mixture = (mean, covariance, weight)
+        _distribute(index, predicted, supported, rows, K, width, mixture, prior_weight, epsilon, sums)
+    fade = memory if used[0] > 0 else 1.0
+    for c in range(3):
+        overall[c] = _rounded(fade * overall_before[c] + _folded(rows[:, c]), single)
+    for c in range(2):
+        stream[c] = overall[c + 1] / (overall[0] + shrinkage)
+    for k in range(component.shape[0]):
+        for c in range(3):
+            component[k, c] = _rounded(fade * before[k, c] + sums[k, c], single)
+        for c in range(2):
+            beyond[k, c] = (component[k, c + 1] - component[k, 0] * stream[c]) / (component[k, 0] + shrinkage)
+
+
+@part
+def _rounded(value, single):
+    """A value as the state keeps it."""
+    return np.float64(np.float32(value)) if single else value
+
+
+@part
+def _rows(predicted, depth, variance, own, supported, rows):
+    """Write w (1, r, e) [N, 3] of the anchors, 0 where not supported; return how many are used."""
+    n = supported.size
+    squares, used, others = np.zeros(n), 0, -1
+    for i in range(n):
+        if supported[i]:
+            others += 1
+            r = depth[i] / predicted[i] - 1
+            squares[i] = r * r
+    total = _folded(squares)
+    others = max(others, 0)
+    for i in range(n):
+        rows[i, 0] = rows[i, 1] = rows[i, 2] = 0.0
+        if not supported[i]:
+            continue
+        r = depth[i] / predicted[i] - 1
+        claim = (variance[i] + own[i]) / (predicted[i] * predicted[i])
+        limit = 1.0
+        if others > 0:
+            limit = min(others, CLAIM) * max((total - squares[i]) / others, LEAST_SIGMA**2)
+        w = min(limit / max(claim, 2.2250738585072014e-308), 1.0)
+        w = w * w
+        rows[i, 0], rows[i, 1], rows[i, 2] = w, w * r, w * (r * r - claim)
+        used += w >= COUNTS
+    return used
+
+
+@part
+def _folded(values):
+    """The sum in the order of ``fixed_order.total``: halves of a length rounded up to a power of two meet."""
+    n = values.size
+    if n == 0:
+        return 0.0
+    values = values.copy()
+    while n > 1:
+        half = 1
+        while 2 * half < n:
+            half *= 2
+        for i in range(half, n):
+            values[i - half] += values[i]
+        n = half
+    return values[0]
+
+
+@part
+def _grid(pixel, chosen, mean_count):
+    """Cells over the chosen ones of N pixels [N, 2], about so many in each: their first corner and side [px], columns
+    and rows, where each cell starts in the order [cells + 1], and the order."""
+    low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
+    for i in range(chosen.size):
+        if chosen[i]:
+            count += 1
+            for j in range(2):
+                low[j], high[j] = min(low[j], pixel[i, j]), max(high[j], pixel[i, j])
+    if count == 0:
+        low[:], high[:] = 0.0, 0.0
+    wide, tall, share = high[0] - low[0], high[1] - low[1], mean_count / max(count, 1)
+    # Not smaller than on a line, so that there are no more cells than about anchors, wherever they lie.
+    side = max(math.sqrt(wide * tall * share), max(wide, tall) * share, 1e-6)
+    columns, rows = int(wide / side) + 1, int(tall / side) + 1
+    cell, start = np.empty(chosen.size, np.int64), np.zeros(columns * rows + 1, np.int64)
+    for i in range(chosen.size):
+        if chosen[i]:
+            column = min(int((pixel[i, 0] - low[0]) / side), columns - 1)
+            cell[i] = min(int((pixel[i, 1] - low[1]) / side), rows - 1) * columns + column
+            start[cell[i] + 1] += 1
+    for c in range(columns * rows):
+        start[c + 1] += start[c]
+    place, order = start.copy(), np.empty(count, np.int64)
+    for i in range(chosen.size):
+        if chosen[i]:
+            order[place[cell[i]]] = i
+            place[cell[i]] += 1
+    return low, side, columns, rows, start, order
+
+
+@kernel
+def _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ):
+    """Write log g/d of the valid anchors of N, their nearest ones [N, most] and how many these are; return the number
+    of differences of log g/d that are written to ``differ``."""
+    low, side, columns, rows, start, order = _grid(pixel, valid, _FEW)
+    ordered, distance, total = np.empty((order.size, 2)), np.empty(neighbour.shape[1]), 0
+    for place in range(order.size):
+        a = order[place]
+        ordered[place, 0], ordered[place, 1] = pixel[a, 0], pixel[a, 1]
+        ratio[a] = math.log(depth[a] / predicted[a])
+    if order.size <= SUPPORT:
+        return 0
+    for a in order:
+        count[a] = _nearest(
+            ordered, pixel[a, 0], pixel[a, 1], a, low, side, columns, rows, start, order, distance, neighbour
+        )
+        for i in range(count[a]):
+            differ[total] = abs(ratio[a] - ratio[neighbour[a, i]])
+            total += 1
+    return total
+
+
+@kernel
+def _support(variance, depth, valid, ratio, neighbour, count, quartile, out):
+    """Which of the valid anchors enough of their neighbours support; all of a few."""
+    sigma2, few = (quartile / LOWER_QUARTILE) * (quartile / LOWER_QUARTILE) + 2 * LEAST_SIGMA**2, 0
+    for a in range(valid.size):
+        few += valid[a]
+    for a in range(valid.size):
+        out[a] = valid[a]
+        if not valid[a] or few <= SUPPORT:
+            continue
+        support, noise = 0, variance[a] / (depth[a] * depth[a])
+        for i in range(count[a]):
+            b = neighbour[a, i]
+            allowed = sigma2 + noise + variance[b] / (depth[b] * depth[b])
+            support += abs(ratio[a] - ratio[b]) <= SIMILAR_SIGMAS * math.sqrt(allowed)
+        out[a] = support >= SUPPORT
+
+
+@part
+def _nearest(ordered, u_a, v_a, a, low, side, columns, rows, start, order, distance, neighbour):
+    """The anchors nearest to anchor a at (u_a, v_a), and how many there are: ring after ring of cells around its own,
+    until all beyond the ring are farther than the farthest of them. ``ordered`` [N, 2] are pixels in the grid's order.
+    """
+    u, v = (u_a - low[0]) / side, (v_a - low[1]) / side
+    column, row = min(int(u), columns - 1), min(int(v), rows - 1)
+    # [cells] From the anchor to the border of its cell; a billionth less for rounding.
+    margin = max(min(min(u - column, column + 1 - u), min(v - row, row + 1 - v)) - 1e-9, 0.0)
+    n, most = 0, neighbour.shape[1]
+    for ring in range(max(columns, rows)):
+        for y in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
+            step = 1 if abs(y - row) == ring else 2 * ring  # all of the first and the last row, else both ends
+            for x in range(column - ring, column + ring + 1, max(step, 1)):
+                if x < 0 or x >= columns:
+                    continue
+                for place in range(start[y * columns + x], start[y * columns + x + 1]):
+                    du, dv, b = u_a - ordered[place, 0], v_a - ordered[place, 1], order[place]
+                    apart = du * du + dv * dv + TIE * b
+                    if b != a and (n < most or apart < distance[n - 1]):
+                        n = min(n + 1, most)
+                        i = n - 1
+                        while i > 0 and distance[i - 1] > apart:
+                            distance[i], neighbour[a, i] = distance[i - 1], neighbour[a, i - 1]
+                            i -= 1
+                        distance[i], neighbour[a, i] = apart, b
+        beyond = (ring + margin) * side
+        if n == most and beyond * beyond > distance[n - 1]:
+            break
+    return n
+
+
+@part
+def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight, epsilon, sums):
+    """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
+
+    Left out is what adds less than eps/K of the prior or of the largest component to the denominator.
+    """
+    mean, covariance, weight = mixture
+    points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
+    for i in range(chosen.size):
+        u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
+        pixel[i, 0], pixel[i, 1] = u, v
+        points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
+    occupied, whitening, log_peak = prepare(mean, covariance, weight)
+    share = math.log(epsilon / max(occupied.size, 1))
+    boxes = _boxes(mean, covariance, occupied, log_peak, share + math.log(prior_weight))
+    start, order = _grid(pixel, chosen, _SOME)[4:]
+    near = _touched(points, order, np.arange(occupied.size), boxes)
+    fields, exponent, counted = np.empty((10, near.size)), np.empty(near.size), np.empty(near.size, np.int64)
+    for cell in range(start.size - 1):
+        if start[cell] == start[cell + 1]:
+            continue
+        kept = _touched(points, order[start[cell] : start[cell + 1]], near, boxes)
+        for i in range(kept.size):
+            for axis in range(3):
+                fields[axis, i] = mean[occupied[kept[i]], axis]
+            for entry in range(6):
+                fields[3 + entry, i] = whitening[kept[i], entry]
+            fields[9, i] = log_peak[kept[i]]
+        for place in range(start[cell], start[cell + 1]):
+            p = order[place]
+            _exponents(fields, kept.size, points[p, 0], points[p, 1], points[p, 2], exponent)
+            limit = math.log(prior_weight)
+            for i in range(kept.size):
+                limit = exponent[i] if exponent[i] > limit else limit
+            limit += share
+            n, evidence = 0, prior_weight
+            for i in range(kept.size):
+                counted[n] = i
+                n += exponent[i] >= limit
+            for j in range(n):
+                i = counted[j]
+                exponent[i] = math.exp(exponent[i])
+                evidence += exponent[i]
+            r0, r1, r2 = rows[p, 0] / evidence, rows[p, 1] / evidence, rows[p, 2] / evidence
+            for j in range(n):
+                i = counted[j]
+                k, density = occupied[kept[i]], exponent[i]
+                sums[k, 0] += density * r0
+                sums[k, 1] += density * r1
+                sums[k, 2] += density * r2
+
+
+@part
+def _exponents(fields, n, x, y, z, out):
+    """log of the densities of n components at a point."""
+    for i in range(n):
+        dx, dy, dz = x - fields[0, i], y - fields[1, i], z - fields[2, i]
+        y0, y1 = fields[3, i] * dx, fields[4, i] * dx + fields[5, i] * dy
+        y2 = fields[6, i] * dx + fields[7, i] * dy + fields[8, i] * dz
+        out[i] = fields[9, i] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)

@@ -8,12 +8,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.field_cpu import Floats
+from ufmstar_torch.kernels.compile_cpu import OPTIONS
+from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.model import Model
 
-compiled: Any = njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 # What is claimed may be NaN.
-with_nan: Any = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+with_nan: Any = njit(**OPTIONS, fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: int) -> Floats:
@@ -24,7 +24,7 @@ def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: in
     return np.where(count > 0, mean, mean.sum() / max(np.count_nonzero(count), 1)).ravel()
 
 
-@compiled
+@fast
 def _add_up(logs, valid, total, count):
     """Sums over the cells."""
     height, width = logs.shape
@@ -43,9 +43,20 @@ def _add_up(logs, valid, total, count):
 
 def features(logs: Floats, u: Floats, v: Floats, hats: int) -> Floats:
     """[N, F] of log d - m_0 [N] at u and v [N] from 0 to 1, as in ``ufmstar_torch.posterior.grid``."""
-    across, along = (np.maximum(1 - np.abs(x * (hats - 1) - np.arange(hats)[:, None]), 0) for x in (u, v))
-    products = (along[:, None] * across).reshape(hats * hats, -1)
-    return np.concatenate([[np.ones_like(logs), logs, 2 * u - 1, 2 * v - 1], products]).T.copy()
+    out = np.empty((len(logs), 4 + hats * hats))
+    _fill(logs, u, v, hats, out)
+    return out
+
+
+@fast
+def _fill(logs, u, v, hats, out):
+    for k in range(len(out)):
+        row = out[k]
+        row[0], row[1], row[2], row[3] = 1.0, logs[k], 2 * u[k] - 1, 2 * v[k] - 1
+        for i in range(hats):
+            across = max(1 - abs(u[k] * (hats - 1) - i), 0.0)
+            for j in range(hats):
+                row[4 + j * hats + i] = across * max(1 - abs(v[k] * (hats - 1) - j), 0.0)
 
 
 def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int64]) -> Floats:
@@ -55,7 +66,7 @@ def ranges(depth: NDArray[Any], valid: NDArray[np.bool_], index: NDArray[np.int6
     return np.log(out)
 
 
-@compiled
+@fast
 def _highest_over_lowest(depth, valid, index, out):
     height, width = depth.shape
     for k in range(len(index)):

@@ -12,5 +12,14 @@ from typing import Any
 from numba import njit
 from numba.extending import register_jitable
 
-kernel: Any = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+kernel: Any = njit(**OPTIONS)
 part: Any = register_jitable(error_model="numpy")
+
+# A part that allocates nothing; the kernel that calls it holds its arrays. numba counts the references of every view of
+# an array (``table[i]`` as an argument, say) by an atomic operation, which takes as long as some forty others; here
+# it is compiled out, and a function that allocates is refused.
+leaf: Any = register_jitable(error_model="numpy", _nrt=False)
+# A leaf in which multiply and add are joined where the processor can: one rounding less, not one more.
+contracted: Any = register_jitable(error_model="numpy", _nrt=False, fastmath={"contract"})

@@ -87,18 +87,26 @@ class Measured:
             become less with their number.
         agreed: [N] views that agree; 0 = not measured.
         contradicted: [N] views that do not.
-        across: [N, V] residual across the line [px], NaN where the patch does not show it.
-        across_noise: [N, V] its variance without errors of the poses [px^2].
-        differ: [N, V] squared difference from the views before, over its variance; NaN where there is none.
+        value: [N, V] inverse depth that each of them shows [1/m], NaN elsewhere, as in all that follow.
+        noise: [N, V] variance of the position along the line by the match alone [px^2].
+        along: [N, V, 2] direction (u, v) in which the point moves along the line.
+        speed: [N, V] how far it moves with the inverse depth [px m].
+        slope: [N, V] by how much an error of the position across the line moves the match along it.
+        across: [N, V] position across the line [px], NaN where the patch does not show it.
+        across_noise: [N, V] its variance by the match alone [px^2].
     """
 
     rho: NDArray[np.float64]
     variance: NDArray[np.float64]
     agreed: NDArray[np.int64]
     contradicted: NDArray[np.int64]
+    value: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    along: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    slope: NDArray[np.float64]
     across: NDArray[np.float64]
     across_noise: NDArray[np.float64]
-    differ: NDArray[np.float64]
 
 
 def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, search: Search) -> Measured:
@@ -111,17 +119,16 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
         search: see there.
     """
     n, v = len(pixel), len(views.image)
-    result = Measured(
-        *(np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)),
-        *(np.full((n, v), np.nan) for _ in range(3)),
-    )
+    rho, variance, agreed, contradicted = np.zeros(n), np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64)
+    each = np.full((n, v, 8), np.nan)
     numbers = (search.start, search.low, search.high, search.sigmas, search.least_score, search.rival, search.match)
     _measure(
         *(image, pixel, views.image, views.H, views.b, views.noise, numbers),
-        *(result.rho, result.variance, result.agreed, result.contradicted),
-        *(result.across, result.across_noise, result.differ),
+        *(rho, variance, agreed, contradicted, each),
     )
-    return result
+    value, noise, _, _, speed, slope, across, across_noise = np.moveaxis(each, 2, 0)
+    along = each[:, :, 2:4]
+    return Measured(rho, variance, agreed, contradicted, value, noise, along, speed, slope, across, across_noise)
 
 
 @compiled
@@ -142,9 +149,7 @@ def best_pixels(image, cell, pixel, strength):
 
 
 @compiled
-def _measure(
-    image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, contradicted, across, across_noise, differ
-):
+def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, contradicted, each):
     start, first_low, first_high, sigmas, least_score, least_rival, match = numbers
     template, patch = np.empty((SIDE + 2, SIDE + 2), np.float32), np.empty((SIDE, SIDE), np.float32)
     along_u, along_v = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.float32)
@@ -176,16 +181,17 @@ def _measure(
             g_ee, g_ep, g_pp, pixel_noise = out[1], out[2], out[3], match * 2 * (1 - out[5]) / (COUNT - 4)
             slope = g_ep / g_ee
             schur = g_pp - g_ep * slope
-            if schur > 0 and pixel_noise < SHOWS * SHOWS * schur:
-                across[n, k], across_noise[n, k] = -out[4] / schur, pixel_noise / schur
-            spread = (pixel_noise / g_ee + LEAST_MATCH + noise[k] * (1 + slope * slope)) / (speed * speed)
+            along = pixel_noise / g_ee + LEAST_MATCH
+            spread = (along + noise[k] * (1 + slope * slope)) / (speed * speed)
             value = _inverse_depth(x, y, z, b[k], place[0] + out[0] * eu, place[1] + out[0] * ev)
-            if not first:
-                differ[n, k] = (value - rho[n]) ** 2 / (spread + variance[n])
-                if differ[n, k] > sigmas * sigmas:
-                    contradicted[n] += 1
-                    continue
+            if not first and (value - rho[n]) ** 2 > sigmas * sigmas * (spread + variance[n]):
+                contradicted[n] += 1
+                continue
             agreed[n] += 1
+            each[n, k, 0], each[n, k, 1], each[n, k, 2], each[n, k, 3] = value, along, eu, ev
+            each[n, k, 4], each[n, k, 5] = speed, slope
+            if schur > 0 and pixel_noise < SHOWS * SHOWS * schur:
+                each[n, k, 6], each[n, k, 7] = -out[4] / schur, pixel_noise / schur
             variance[n] = spread if first else min(variance[n], spread)
             rho[n] = (rho[n] * weight + value / spread) / (weight + 1 / spread)
             weight += 1 / spread

@@ -14,14 +14,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ufmstar_torch.kernels.compile_cpu import OPTIONS, kernel, part
+
 WINDOW = 32
 # Right-hand sides: the features and y, and zeros to a multiple of four.
 RIGHT = 16
 _WIDTH = WINDOW + RIGHT
 
-compiled: Any = njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-# Distances are compared with infinity, which fast arithmetic leaves undefined.
-exactly: Any = njit(cache=True, nogil=True, error_model="numpy")
+# Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
+fast: Any = njit(**OPTIONS, fastmath=True)
 Floats = NDArray[np.float64]
 
 
@@ -57,18 +58,17 @@ class Observed(NamedTuple):
 def given(prior: Prior, observed: Observed, weight: Floats) -> Field:
     """As :meth:`ufmstar_torch.posterior.field.Field.given`."""
     n, F = len(prior.diagonal), len(prior.mean)
+    nodes, offset, coefficients = np.zeros((n, RIGHT)), np.empty(n), prior.mean.copy()
     diagonal, precision, right_side = prior.diagonal.copy(), prior.precision.copy(), np.zeros(F)
-    nodes = np.zeros((n, RIGHT))
     _gather(*observed, weight, prior.mean, diagonal, nodes, precision, right_side)
     solved, variance = solve(diagonal, prior.right, prior.down, nodes, prior.cols)
     _give_way(nodes, solved, precision, right_side)
-    covariance = np.linalg.inv(precision).astype(np.float64)
-    b = (covariance * right_side).sum(1)
-    response = solved[:, :F]
-    return Field(prior.mean + b, covariance, solved[:, F] - (response * b).sum(1), response, variance)
+    _invert(precision)
+    _back(precision, right_side, solved, coefficients, offset)
+    return Field(coefficients, precision, offset, solved[:, :F], variance)
 
 
-@compiled
+@fast
 def _gather(node, features, value, weight, mean, diagonal, nodes, precision, right_side):
     """The observations' part of what is prior to begin with: w at the diagonal of their nodes, w x and w (y - x b_0)
     at their right-hand sides, x w x^T and x w (y - x b_0) at the coefficients'."""
@@ -86,7 +86,7 @@ def _gather(node, features, value, weight, mean, diagonal, nodes, precision, rig
                 precision[f, g] += w * x[f] * x[g]
 
 
-@compiled
+@fast
 def _give_way(nodes, solved, precision, right_side):
     """The Schur complement: what the field explains of the observations is left out of the coefficients' part."""
     F = len(right_side)
@@ -99,6 +99,37 @@ def _give_way(nodes, solved, precision, right_side):
                     precision[f, g] -= x[f] * y[g]
 
 
+@fast
+def _invert(A):
+    """A positive definite matrix [F, F], in place, one pivot after the other (Gauss-Jordan)."""
+    for k in range(len(A)):
+        pivot = 1 / A[k, k]
+        A[k, k] = 1.0
+        for c in range(len(A)):
+            A[k, c] *= pivot
+        for r in range(len(A)):
+            if r != k:
+                times = A[r, k]
+                A[r, k] = 0.0
+                for c in range(len(A)):
+                    A[r, c] -= times * A[k, c]
+
+
+@fast
+def _back(covariance, right_side, solved, coefficients, offset):
+    """What the observations add to the coefficients, and the mean of the field."""
+    F = len(right_side)
+    b = np.zeros(F)
+    for f in range(F):
+        for g in range(F):
+            b[f] += covariance[f, g] * right_side[g]
+        coefficients[f] += b[f]
+    for i in range(len(offset)):
+        offset[i] = solved[i, F]
+        for f in range(F):
+            offset[i] -= solved[i, f] * b[f]
+
+
 def at(field: Field, node: NDArray[np.int64], features: Floats) -> tuple[Floats, Floats]:
     """As :meth:`ufmstar_torch.posterior.field.Field.at`."""
     mean, variance = field.offset[node], field.variance[node]
@@ -106,7 +137,7 @@ def at(field: Field, node: NDArray[np.int64], features: Floats) -> tuple[Floats,
     return mean, variance
 
 
-@compiled
+@fast
 def _add_coefficients(features, left, b, covariance, mean, variance):
     """x . b, and the variance of what is ``left`` of x."""
     F = len(b)
@@ -124,14 +155,12 @@ def solve(diagonal: Floats, right: Floats, down: Floats, columns: Floats, cols: 
     """A^-1 columns [n, RIGHT], and the diagonal of A^-1, as :func:`ufmstar_torch.posterior.field.solve`."""
     n = len(diagonal)
     factor, solved, variance = np.empty((n, _WIDTH)), np.empty((n, RIGHT)), np.empty(n)
-    window = np.zeros((WINDOW, _WIDTH))
-    _eliminate(diagonal, right, down, columns, cols, window, factor)
-    window[:] = 0
-    _covary(factor, window, np.empty(_WIDTH), solved, variance)
+    _eliminate(diagonal, right, down, columns, cols, np.zeros((WINDOW, _WIDTH)), factor)
+    _covary(factor, np.zeros((WINDOW, _WIDTH)), np.empty(_WIDTH), solved, variance)
     return solved, variance
 
 
-@compiled
+@fast
 def _eliminate(diagonal, right, down, columns, cols, window, factor):
     """Row j of the factor [n, 48] has the entries of the window's nodes at their places, then the right-hand sides."""
     n = len(diagonal)
@@ -154,7 +183,7 @@ def _eliminate(diagonal, right, down, columns, cols, window, factor):
             window[own, c] = 0.0
 
 
-@compiled
+@part
 def _enter(window, i, diagonal, right, down, columns, cols):
     """Node i with its links to those before it, at a place that is 0."""
     own, n = i % WINDOW, len(diagonal)
@@ -176,7 +205,7 @@ def _enter(window, i, diagonal, right, down, columns, cols):
         window[own, WINDOW + c] = columns[i, c]
 
 
-@compiled
+@fast
 def _covary(factor, window, out, solved, variance):
     """Backwards through the factor, of which the diagonal is overwritten."""
     for j in range(len(factor) - 1, -1, -1):
@@ -207,7 +236,7 @@ def distance(source: NDArray[np.bool_], right: Floats, down: Floats, cols: int, 
     return way
 
 
-@exactly
+@kernel
 def _sweep(way, right, down, cols):
     """Forth and back until nothing gets shorter."""
     n, shorter = len(way), True

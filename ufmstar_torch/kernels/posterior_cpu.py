@@ -35,7 +35,7 @@ def update(
     kept, depth, variance = (np.stack([result[i] for result in results]) for i in range(3))
     sums = [_Running.of(row) for row in kept]
     calibration = [r.ratios["calibration"] if r.below[_NAMES["calibration"]] > 0 else np.nan for r in sums]
-    unseen = [r.ratios["unseen"] for r in sums]
+    unseen = [r.growth for r in sums]
     outputs = [torch.from_numpy(x) for x in (depth, variance, np.array(calibration), np.array(unseen))]
     return torch.from_numpy(kept).to(packed.dtype), Posterior(*outputs)
 
@@ -50,10 +50,12 @@ class _Anchors(NamedTuple):
     variance: Floats
 
 
-def _anchors(anchors: AnchorInput | None, streams: int) -> list[_Anchors]:
+_NONE = _Anchors(np.empty((0, 2)), np.empty(0, np.int64), *(np.empty(0) for _ in range(3)))
+
+
+def _anchors(anchors: AnchorInput | None, streams: int) -> list[_Anchors | None]:
     if anchors is None:
-        zero = np.empty(0)
-        return [_Anchors(np.empty((0, 2)), np.empty(0, np.int64), zero, zero, zero)] * streams
+        return [None] * streams
     fields = (anchors.pixel, anchors.index, anchors.predicted, anchors.depth, anchors.variance)
     used = anchors.valid.numpy()
     return [_Anchors(*(x[b].numpy()[used[b]] for x in fields)) for b in range(streams)]
@@ -79,6 +81,10 @@ class _Running(NamedTuple):
             above, below, covariance = _VALUE * _WEIGHT, _WEIGHT, np.diag(MODEL.prior) ** 2
         ratios = np.where(below > 0, above / np.maximum(below, 1e-12), _VALUE).clip(_LEAST, _LARGEST)
         return cls(packed[0], packed[1], above, below, b, covariance, dict(zip(RATIOS, ratios.tolist(), strict=True)))
+
+    @property
+    def growth(self) -> float:
+        return MODEL.growth + self.ratios["unseen"]
 
     def added(self, sums: dict[str, tuple[float, float]]) -> tuple[Floats, Floats]:
         above, below = np.array([sums[name] for name in RATIOS]).T
@@ -133,6 +139,9 @@ class _Scene(NamedTuple):
         summed: Floats = np.bincount(node, values, len(self.grid.log_depth)).astype(np.float64)
         return summed[node]
 
+    def believed(self, near: _Near) -> Floats:
+        return 1 / (1 + near.noise / MODEL.weak**2)
+
 
 class _Near(NamedTuple):
     """The reference's ``_Near`` of one stream."""
@@ -143,11 +152,12 @@ class _Near(NamedTuple):
 
 
 def _of_stream(
-    packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any], anchors: _Anchors
+    packed: Floats, depth: NDArray[Any], valid: NDArray[np.bool_], claimed: NDArray[Any], given_: _Anchors | None
 ) -> tuple[Floats, NDArray[Any], NDArray[Any]]:
     """What is known after the frame; depth and variance."""
-    running, some = _Running.of(packed), len(anchors.depth) > 0
-    if not some and not running.frames:
+    running, anchors = _Running.of(packed), _NONE if given_ is None else given_
+    some = len(anchors.depth) > 0
+    if given_ is None and not running.frames:
         return packed, np.where(valid, depth, np.nan).astype(depth.dtype), claimed
     with np.errstate(all="ignore"):  # what is not valid is not read
         logs = np.log(depth)
@@ -155,13 +165,14 @@ def _of_stream(
     grid = _Grid.of(cell_means(logs, valid, rows, cols), rows, cols)
     scene = _scene(grid, depth, valid, anchors, running)
     field, weight, near = _fitted(scene)
-    share = _share(scene, weight * MODEL.evidence**2 >= 1)
+    away = _away(scene, weight * MODEL.evidence**2 >= 1)
     kept = _learnt(scene, field, weight, near, _relative(claimed, anchors), running) if some else packed
     node = np.arange(rows * cols)
     x = features(grid.log_depth - grid.mean, (node % cols + 0.5) / cols, (node // cols + 0.5) / rows, MODEL.hats)
     mean, variance = at(field, node, x)
     b = field.coefficients[:GLOBALS]
-    variance = variance + running.ratios["roughness"] + MODEL.common + share * running.ratios["unseen"]
+    variance = MODEL.inflation * _local(scene, near) * (variance + running.ratios["roughness"])
+    variance, share = variance + MODEL.common + away * running.growth, np.minimum(away / MODEL.far, 1)
     nodes = np.stack([grid.log_depth, mean - (x[:, :GLOBALS] * b).sum(1), variance, share], 1)
     return kept, *read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), MODEL)
 
@@ -169,7 +180,7 @@ def _of_stream(
 def _scene(
     grid: _Grid, depth: NDArray[Any], valid: NDArray[np.bool_], anchors: _Anchors, running: _Running
 ) -> _Scene:  # fmt: skip
-    (u, v), log_depth = ((anchors.pixel + 0.5) / depth.shape[::-1]).T, np.log(anchors.predicted)
+    (u, v), log_depth = ((anchors.pixel + 0.5) / depth.shape[::-1]).T.copy(), np.log(anchors.predicted)
     column, row = ((x * n).astype(np.int64).clip(0, n - 1) for x, n in ((u, grid.cols), (v, grid.rows)))
     x = features(log_depth - grid.mean, u, v, MODEL.hats)
     observed = Observed(row * grid.cols + column, x, np.log(anchors.depth) - log_depth)
@@ -210,11 +221,25 @@ def _pull(t: Floats) -> Floats:
     return np.where(small, 1 - 1.5 * t, -np.expm1(-safe) * np.exp(-safe) / safe)
 
 
-def _share(scene: _Scene, evidence: NDArray[np.bool_]) -> Floats:
+def _local(scene: _Scene, near: _Near) -> Floats:
+    each = scene.believed(near) / scene.counted(np.ones(len(near.noise)))
+    z2 = np.minimum(near.left_out**2 / near.total, MODEL.clip)
+    grid, reach = scene.grid, MODEL.near
+    padded = np.zeros((2, grid.rows + 2 * reach, grid.cols + 2 * reach))
+    for sums, values in zip(padded, (each * z2, each), strict=True):
+        nodes = np.bincount(scene.observed.node, values, grid.rows * grid.cols)
+        sums[reach:-reach, reach:-reach] = nodes.reshape(grid.rows, grid.cols)
+    columns = np.sum([padded[:, i : i + grid.rows] for i in range(2 * reach + 1)], 0)
+    around = np.sum([columns[:, :, i : i + grid.cols] for i in range(2 * reach + 1)], 0)
+    z2, weight = around.reshape(2, -1) + MODEL.alone
+    return z2 / weight
+
+
+def _away(scene: _Scene, evidence: NDArray[np.bool_]) -> Floats:
     grid = scene.grid
     source = np.zeros(len(grid.log_depth), np.bool_)
     source[scene.observed.node[evidence]] = True
-    return distance(source, grid.far_right, grid.far_down, grid.cols, MODEL.far) / MODEL.far
+    return distance(source, grid.far_right, grid.far_down, grid.cols, MODEL.limit)
 
 
 def _relative(claimed: NDArray[Any], anchors: _Anchors) -> Floats:
@@ -253,16 +278,16 @@ def _of_discs(
     held = held & (np.count_nonzero(rest) >= MODEL.left)
     field = given(scene.prior, scene.observed, weight * rest)
     mean, variance = at(field, scene.observed.node[held], scene.observed.features[held])
-    share, noise = _share(scene, rest)[scene.observed.node[held]], near.noise[held]
+    away, noise = _away(scene, rest)[scene.observed.node[held]], near.noise[held]
     tot, error = variance + noise, (scene.observed.value[held] - mean) ** 2
     square = np.minimum(error, MODEL.clip * tot) / MODEL.clipped
-    believed = np.zeros(len(weight))
-    believed[held] = 1 / (1 + noise / MODEL.weak**2)
+    believed = np.where(held, scene.believed(near), 0.0)
     area, claimed = (believed / np.maximum(scene.counted(believed), 1e-12))[held], claimed[held]
-    final = tot + MODEL.common + share * (running.ratios["unseen"] + claimed)
+    final = MODEL.inflation * variance + noise + MODEL.common + away * running.growth
+    final = final + np.minimum(away / MODEL.far, 1) * claimed
     sums = {
         "amplitude": (area * (square - noise) / tot, area * variance / tot / running.ratios["amplitude"]),
-        "unseen": (area * (square - tot - share * claimed) * share / tot, area * share**2 / tot),
+        "unseen": (area * (np.minimum(error, MODEL.square) - tot), area * away),
         "calibration": (area * error / final, area),
     }
     return {name: (float(above.sum()), float(below.sum())) for name, (above, below) in sums.items()}

@@ -16,18 +16,15 @@ from torch import Tensor
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
-from ufmstar_torch.kernels.regress_points_cpu import at_points, distribute_points, unprojected
-from ufmstar_torch.kernels.regress_tiles_cpu import exact
-from ufmstar_torch.kernels.threads_cpu import each
+from ufmstar_torch.kernels.regress_points_cpu import at_points
+from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at, in_view
+from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.regress import Regression
-from ufmstar_torch.regress import distribute as distribute_reference
+from ufmstar_torch.regress import Regression, regress_pixels
 
 # Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
-EPSILON = {torch.float32: 1e-7, torch.float64: 1e-14}
-
-_SHARE = 128 * 128  # pixels; below that a thread costs more than it saves
+EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
 
 
 def regress_image(
@@ -39,20 +36,36 @@ def regress_image(
     pixels: Tensor | None = None,
 ) -> Regression:
     """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors; every feature is a contiguous map."""
-    z, use, K = depth.detach().contiguous().numpy(), valid.contiguous().numpy(), _doubles(intrinsics)[0]
-    if pixels is not None:
-        index = pixels.contiguous().numpy()
-        points = np.empty((*index.shape, 3), z.dtype)
-        for b in range(len(index)):
-            unprojected(z[b], use[b], K[b], index[b], points[b])
-        return regress(mixture_cam, torch.from_numpy(points), config)
-    out = np.empty(z.shape, z.dtype)
-    features = np.empty((z.shape[0], mixture_cam.features.shape[2], *z.shape[1:]), z.dtype)
-    kernel, settings = _kernel(config, depth.dtype, exact, near_image)
-    shares = max(1, min(-(-torch.get_num_threads() // len(z)), z[0].size // _SHARE))
-    streams = zip(z, use, K, *_fields(mixture_cam), out, features, strict=True)
-    split = [(*given[:8], *settings, *given[8:], first, shares) for given in streams for first in range(shares)]
-    each(kernel, split)
+    return regress_maps(mixture_cam, torch.where(valid, depth.detach(), 0), intrinsics, config, pixels)
+
+
+def regress_maps(
+    mixture_cam: GaussianMixture,
+    depth: Tensor,
+    intrinsics: Tensor,
+    config: UfMStarConfig,
+    pixels: Tensor | None = None,
+) -> Regression:
+    """:func:`regress_image` of a depth that is positive where it is valid, and only there."""
+    if pixels is not None and config.regression != "exact":
+        return regress_pixels(mixture_cam, depth, intrinsics, depth > 0, config, pixels, regress)
+    z, K = depth.contiguous().numpy(), _doubles(intrinsics)[0]
+    shape = z.shape if pixels is None else tuple(pixels.shape)
+    out, features = np.empty(shape, z.dtype), np.empty((len(z), mixture_cam.features.shape[2], *shape[1:]), z.dtype)
+    shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
+    settings = _settings(config, depth.dtype)
+    kernel = near_image if config.regression != "exact" else exact if pixels is None else exact_at
+    calls: list[tuple[Any, ...]] = []
+    for b, fields in enumerate(zip(*_fields(mixture_cam), strict=True)):
+        if kernel is near_image:
+            calls += [(z[b], K[b], *fields, *settings, out[b], features[b], i, shares) for i in range(shares)]
+            continue
+        view = in_view(*fields, K[b], *z.shape[1:], *settings, z.dtype.type(0))
+        if kernel is exact:
+            calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
+        else:
+            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, fields[4], out[b], features[b]))
+    each(kernel, calls)
     return _regression(out, features)
 
 
@@ -61,21 +74,13 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
     add less than eps pi_0 / K to the denominator, so that the error is at most eps max(m_k, mu_0)."""
     x = points.detach().contiguous().numpy()
     out, features = np.empty(x.shape[:2], x.dtype), np.empty((len(x), mixture.features.shape[2], x.shape[1]), x.dtype)
-    kernel, settings = _kernel(config, points.dtype, at_points, near_points)
+    settings = _settings(config, points.dtype)
     streams = zip(x, *_fields(mixture), out, features, strict=True)
-    each(kernel, [(*given[:6], *settings, *given[6:]) for given in streams])
+    each(
+        at_points if config.regression == "exact" else near_points,
+        [(*given[:6], *settings, *given[6:]) for given in streams],
+    )
     return _regression(out, features)
-
-
-def distribute(mixture: GaussianMixture, points: Tensor, values: Tensor, config: UfMStarConfig) -> Tensor:
-    """As :func:`ufmstar_torch.regress.distribute`, for CPU tensors; shares are right to 1e-14."""
-    if config.regression != "exact":
-        return distribute_reference(mixture, points, values, config)
-    out = torch.zeros(*mixture.weight.shape, values.shape[2], dtype=torch.float64)
-    fields = _doubles(points, values, mixture.mean, mixture.covariance, mixture.weight)
-    settings = (config.prior_weight, EPSILON[torch.float64])
-    each(distribute_points, [(*given, *settings, o) for *given, o in zip(*fields, out.numpy(), strict=True)])
-    return out
 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
@@ -94,12 +99,12 @@ def _smooth(previous, current, alpha, memory, shown):
         shown[i] = now if now != now else memory[i]
 
 
-def _kernel(config: UfMStarConfig, dtype: torch.dtype, exact: Any, near: Any) -> tuple[Any, tuple[float, ...]]:
-    """The kernel of the configured sum, and its settings."""
+def _settings(config: UfMStarConfig, dtype: torch.dtype) -> tuple[float, ...]:
+    """What the kernel of the configured sum needs to know."""
     prior = (config.prior_weight, config.prior_mean)
     if config.regression == "exact":
-        return exact, (*prior, EPSILON[dtype])
-    return near, (*prior, config.neighbourhood_sigmas, config.near_radius, config.far_radius)
+        return (*prior, EPSILON[dtype])
+    return (*prior, config.neighbourhood_sigmas, config.near_radius, config.far_radius)
 
 
 def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:

@@ -12,7 +12,7 @@ from ufmstar_torch.kernels.regress_points_cpu import prepare
 
 @kernel
 def near_image(
-    depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
+    depth, K, mean, covariance, weight, m, features, prior_weight, prior_mean, sigmas, near, far, out, out_f,
     first, shares,
 ):  # fmt: skip
     """One stream, depth [H, W] into out [H, W] and out_f [F, H, W]; of the rows every ``shares``-th, from ``first``."""
@@ -20,7 +20,7 @@ def near_image(
     gaps, kept, sums = np.empty(index.size), np.empty(index.size, np.int64), np.empty(features.shape[1])
     for v in range(first, depth.shape[0], shares):
         for u in range(depth.shape[1]):
-            if valid[v, u]:
+            if depth[v, u] > 0:
                 z = np.float64(depth[v, u])
                 x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
                 out[v, u] = _point(
@@ -30,7 +30,7 @@ def near_image(
             else:
                 out[v, u] = np.nan
             for g in range(sums.size):
-                out_f[g, v, u] = sums[g] if valid[v, u] else np.nan
+                out_f[g, v, u] = sums[g] if depth[v, u] > 0 else np.nan
 
 
 @kernel

@@ -50,17 +50,6 @@ def _occupied(weight):
 
 
 @kernel
-def unprojected(depth, valid, K, pixels, points):
-    """Points [P, 3] of pixels [P] in the dtype of depth [H, W] (``camera.unproject_at``); NaN where not valid."""
-    real = depth.dtype.type
-    fx, fy, cx, cy = real(K[0, 0]), real(K[1, 1]), real(K[0, 2]), real(K[1, 2])
-    for i in range(pixels.size):
-        v, u = pixels[i] // depth.shape[1], pixels[i] % depth.shape[1]
-        z = depth[v, u] if valid[v, u] else real(np.nan)
-        points[i, 0], points[i, 1], points[i, 2] = (real(u) - cx) / fx * z, (real(v) - cy) / fy * z, z
-
-
-@kernel
 def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
     """Regress m [K] and features [K, F] at points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not
     finite."""
@@ -93,40 +82,6 @@ def at_points(points, mean, covariance, weight, m, features, prior_weight, prior
             out[p] = total / evidence if known - known == 0 else np.nan
             for g in range(sums.size):
                 out_f[g, p] = sums[g] / evidence if known - known == 0 else np.nan
-
-
-@kernel
-def distribute_points(points, values, mean, covariance, weight, prior_weight, epsilon, out):
-    """Add values [P, C] at points [P, 3] to the components [K, C] that explain them, by their shares; in the order of
-    the points."""
-    index, whitening, log_peak = prepare(mean, covariance, weight)
-    limit = math.log(epsilon * prior_weight / max(index.size, 1))
-    boxes = _boxes(mean, covariance, index, log_peak, limit)
-    everyone = np.arange(points.shape[0])
-    near = _touched(points, everyone, np.arange(index.size), boxes)
-    order, leaf = _by_place(points, everyone, near.size)
-    density, listed = np.empty((points.shape[0], near.size)), np.empty((points.shape[0], near.size), np.int32)
-    count, evidence = np.zeros(points.shape[0], np.int64), np.empty(points.shape[0])
-    for first in range(0, order.size, leaf):
-        kept = _touched(points, order[first : first + leaf], near, boxes)
-        for p in order[first : first + leaf]:
-            x, y, z = points[p, 0], points[p, 1], points[p, 2]
-            total, n = prior_weight, 0
-            for j in kept:
-                k, W = index[j], whitening[j]
-                dx, dy, dz = x - mean[k, 0], y - mean[k, 1], z - mean[k, 2]
-                y0, y1, y2 = W[0] * dx, W[1] * dx + W[2] * dy, W[3] * dx + W[4] * dy + W[5] * dz
-                exponent = log_peak[j] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
-                if exponent < limit:
-                    continue
-                density[p, n], listed[p, n] = math.exp(exponent), k
-                total += density[p, n]
-                n += 1
-            count[p], evidence[p] = n, total
-    for p in range(points.shape[0]):
-        for j in range(count[p]):
-            for c in range(values.shape[1]):
-                out[listed[p, j], c] += density[p, j] / evidence[p] * values[p, c]
 
 
 @part

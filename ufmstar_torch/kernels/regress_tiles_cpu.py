@@ -1,4 +1,4 @@
-"""The exact sum of the regression at every pixel on the CPU (numba), with culling in three levels.
+"""The exact sum of the regression at every pixel, or at some, on the CPU (numba), with culling in three levels.
 
 A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = pi_0 + sum_k w_k(x) of a point x.
 
@@ -18,8 +18,11 @@ and eps / 1000 max(m_k, mu_0) at a point that no component explains (every w_j <
 the *relative* error small there, where m_hat itself is small. What the arithmetic rounds off comes on top; the bounds
 contain their own rounding. tests/test_regress.py checks the bound.
 
-Points are taken relative to the nearest point of their tile, so that float32 loses nothing to the distance from the
-camera, nor to a far outlier in the tile. Densities are powers of two: log2(e)/2 is part of the whitening.
+Points are taken relative to an origin in the middle of their tile at the depth of its nearest pixel, and whitened
+offsets of the components from there in double precision, so that float32 loses nothing to the distance from the camera,
+nor to a far outlier in the tile. Densities are powers of two: log2(e)/2 is part of the whitening.
+
+A subset of the pixels takes the same way: a block's share of them, up to 64 at a time, is a tile.
 """
 
 from __future__ import annotations
@@ -31,20 +34,22 @@ import numpy as np
 from numba import types
 from numba.extending import overload, register_jitable
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf, part
 from ufmstar_torch.kernels.regress_points_cpu import prepare
 
-# Multiply and add joined where the processor can: one rounding less, not one more.
-contracted: Any = register_jitable(error_model="numpy", fastmath={"contract"})
+# Of finite numbers, so that least and greatest can be found several at a time.
+finite: Any = register_jitable(error_model="numpy", _nrt=False, fastmath={"nnan", "nsz"})
 
 _TILE = 8  # pixels
 _PIXELS = _TILE * _TILE
 _SIDE = 4  # tiles of a block
+_TILES = _SIDE * _SIDE
 _PRIOR = 1e-3  # share of the prior in a threshold
 _FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
+_TERMS = 9  # of a component, whatever the tile: whitening (6), log2 of the peak, m, last feature
 _LOG2_E = math.log2(math.e)
 # Rows of a tile's buffer, each of 64 numbers.
-_X, _Y, _Z, _EVIDENCE, _TOTAL, _FIRST, _SECOND = (i * _PIXELS for i in range(7))
+_X, _Y, _Z, _EVIDENCE, _TOTAL, _LAST, _FIRST, _SECOND = (i * _PIXELS for i in range(8))
 
 
 def exp2_(t):
@@ -61,9 +66,8 @@ def _exp2_overload(t):
         # 2^n 2^r with |r| <= 1/2 and the minimax polynomial of degree 5 (2.3e-7 relative with its rounding), as code
         # without branches, which the compiler turns into vector instructions.
         # Adding 1.5 2^23 rounds to an integer, in the last bits, from where a shift brings it to the exponent.
-        # Below 2^-100 it is 0: products with numbers too small for normal floats take a hundred times as long.
-        some = t > np.float32(-100.0)
-        t = t if some else np.float32(-100.0)
+        # Below 2^-100, and for NaN, it is 0: products with numbers too small for normal floats take a hundred times
+        # as long.
         n = np.float32(t + np.float32(12582912.0))
         r = t - (n - np.float32(12582912.0))
         p = np.float32(0.00132764718)
@@ -73,107 +77,204 @@ def _exp2_overload(t):
         p = p * r + np.float32(0.693146967)
         p = np.float32(p * r + np.float32(1.00000007))
         power = np.int32((n.view(np.int32) << np.int32(23)) + p.view(np.int32))
-        return power.view(np.float32) if some else np.float32(0.0)
+        return power.view(np.float32) if t > np.float32(-100.0) else np.float32(0.0)
 
     return exp2_32
 
 
 @kernel
-def exact(
-    depth, valid, K, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f, first, shares
-):
+def in_view(mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero):
+    """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
+
+    Returns:
+        Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n], the terms of the sum
+        [n, 9], and the settings (prior weight and mean, epsilon, log2 of the least threshold).
+    """
+    index, whitening, log_peak = prepare(mean, covariance, weight)
+    least = math.log2(_PRIOR * prior_weight)
+    limit = _limit(epsilon, index.size) + least
+    fields, constants = np.empty((index.size, _FIELDS)), np.empty((index.size, _TERMS), np.array(zero).dtype)
+    n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
+    packed = np.empty((_FIELDS, n), constants.dtype)
+    for i in range(_FIELDS):
+        for k in range(n):
+            packed[i, k] = fields[k, i]
+    return index[:n], fields, packed, constants, (prior_weight, prior_mean, epsilon, least)
+
+
+@kernel
+def exact(depth, K, view, features, out, out_f, first, shares):
     """One stream; of its blocks every ``shares``-th, from ``first`` on.
 
-    depth [H, W], valid [H, W], K [3, 3] and the mixture [K, ...] into out [H, W] and out_f [F, H, W]; NaN where not
-    valid.
+    depth [H, W], K [3, 3], what is in view (:func:`in_view`) and features [K, F] into out [H, W] and out_f [F, H, W];
+    NaN where the depth is not positive.
     """
     height, width = depth.shape
+    columns, rows = (width + _TILE - 1) // _TILE, (height + _TILE - 1) // _TILE
+    across, down = np.empty((columns, _PIXELS)), np.empty((rows, _PIXELS))
+    for i in range(columns * _PIXELS):
+        across[i // _PIXELS, i % _PIXELS] = (i // _PIXELS * _TILE + i % _TILE - K[0, 2]) / K[0, 0]
+    for i in range(rows * _PIXELS):
+        down[i // _PIXELS, i % _PIXELS] = (i // _PIXELS * _TILE + i % _PIXELS // _TILE - K[1, 2]) / K[1, 1]
+    _blocks(depth, across, down, view, features, _scratch(view[2], out_f), out, out_f, first, shares)
+
+
+@kernel
+def exact_at(depth, K, pixels, view, features, out, out_f):
+    """One stream at some pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
+    height, width = depth.shape
     side = _TILE * _SIDE
-    rows, columns = (height + side - 1) // side, (width + side - 1) // side
-    points, boxes = np.empty((_SIDE * _SIDE, 3, _PIXELS)), np.empty((_SIDE * _SIDE, 2, 3))
-    seen = np.empty(_SIDE * _SIDE, np.bool_)
-    buffer, sums = np.empty(7 * _PIXELS, out.dtype), np.empty((features.shape[1], _PIXELS), out.dtype)
-    coefficient, least = np.empty(22, out.dtype), math.log2(_PRIOR * prior_weight)
-    index, whitening, log_peak = prepare(mean, covariance, weight)
-    limit = _limit(epsilon, index.size) + least
-    index, fields = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit)
-    rays = _rays(K, height, width)
-    everyone, near = np.empty((_FIELDS, index.size), out.dtype), np.empty((_FIELDS, index.size), out.dtype)
-    bounds = np.empty((2, index.size), out.dtype)
-    in_block, in_tile = np.empty(index.size, np.int64), np.empty(index.size, np.int64)
-    for i in range(_FIELDS):
-        for k in range(index.size):
-            everyone[i, k] = fields[k, i]
-    for block in range(first, rows * columns, shares):
-        v0, u0 = block // columns * side, block % columns * side
-        if not _points(depth, valid, rays, v0, u0, points, boxes, seen):
-            _blank(v0, u0, side, out, out_f)
-            continue
-        low, high = _union(boxes, seen)
-        n = _cull(everyone, index.size, low, high, epsilon, least, bounds, in_block)
-        for i in range(_FIELDS):
-            for j in range(n):
-                near[i, j] = everyone[i, in_block[j]]
-        for tile in range(_SIDE * _SIDE):
-            v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
-            if not seen[tile]:
-                _blank(v, u, _TILE, out, out_f)
-                continue
-            count = _cull(near, n, boxes[tile, 0], boxes[tile, 1], epsilon, least, bounds, in_tile)
-            for j in range(count):
-                in_tile[j] = in_block[in_tile[j]]
-            _sum(
-                points[tile], boxes[tile, 0, 2], in_tile, count, index, fields, m, features,
-                prior_weight, prior_mean, buffer, sums, coefficient,
-            )  # fmt: skip
-            _finish(valid, v, u, buffer, sums, out, out_f)
+    columns, rows = (width + side - 1) // side, (height + side - 1) // side
+    begin, order = np.zeros(rows * columns + 1, np.int64), np.empty(pixels.size, np.int64)
+    _by_block(pixels, width, columns, begin, order)
+    rays = np.empty((2, _PIXELS))
+    _at_pixels(depth, K, pixels, begin, order, rays, view, features, _scratch(view[2], out_f), out, out_f)
 
 
 @part
+def _scratch(packed, out_f):
+    """Memory for the work on one block, of components ``packed`` [10, n]: the points [16, 192] of its tiles, their
+    boxes and origins [16, 9], depths, work on them, whether a tile has a pixel; buffer and sums of features;
+    fields, bounds and two lists of components."""
+    n, dtype = packed.shape[1], packed.dtype
+    return (
+        np.empty((_TILES, 3 * _PIXELS), dtype), np.empty((_TILES, 9)), np.empty(_PIXELS), np.empty((6, _PIXELS)),
+        np.empty(_TILES, np.bool_),
+        np.empty(8 * _PIXELS, dtype), np.empty((out_f.shape[0], _PIXELS), dtype),
+        np.empty((_FIELDS, n), dtype), np.empty((2, n), dtype), np.empty(n, np.int64), np.empty(n, np.int64),
+    )  # fmt: skip
+
+
+@leaf
+def _blocks(depth, across, down, view, features, scratch, out, out_f, first, shares):
+    """The blocks of an image, of which every ``shares``-th is done, from ``first`` on."""
+    points, boxes, z, work, seen, buffer, sums, near, bounds, in_block, in_tile = scratch
+    _, _, everyone, _, settings = view
+    side = _TILE * _SIDE
+    rows, columns = (depth.shape[0] + side - 1) // side, (depth.shape[1] + side - 1) // side
+    for block in range(first, rows * columns, shares):
+        v0, u0 = block // columns * side, block % columns * side
+        some = False
+        for tile in range(_TILES):
+            v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
+            seen[tile] = v < depth.shape[0] and u < depth.shape[1] and _depths(depth, v, u, z)
+            if seen[tile]:
+                some = True
+                _place(z, across, u // _TILE, down, v // _TILE, points, boxes, tile, work)
+            else:
+                _blank(v, u, out, out_f)
+        if not some:
+            continue
+        count = _cull(everyone, everyone.shape[1], _union(boxes, seen), settings, bounds, in_block)
+        for i in range(_FIELDS):
+            for j in range(count):
+                near[i, j] = everyone[i, in_block[j]]
+        for tile in range(_TILES):
+            if seen[tile]:
+                chosen = _cull(near, count, _box(boxes, tile), settings, bounds, in_tile)
+                for j in range(chosen):
+                    in_tile[j] = in_block[in_tile[j]]
+                _sum(points, boxes, tile, in_tile, chosen, view, features, buffer, sums)
+                _finish(depth, v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE, buffer, sums, out, out_f)
+
+
+@leaf
+def _by_block(pixels, width, columns, begin, order):
+    """Sort pixels by block, keeping their order within one: ``begin`` [blocks + 1] and ``order`` [n]."""
+    side = _TILE * _SIDE
+    for i in range(pixels.size):
+        begin[pixels[i] // width // side * columns + pixels[i] % width // side + 1] += 1
+    for block in range(1, begin.size):
+        begin[block] += begin[block - 1]
+    for i in range(pixels.size):
+        block = pixels[i] // width // side * columns + pixels[i] % width // side
+        order[begin[block]] = i
+        begin[block] += 1
+    for block in range(begin.size - 1, 0, -1):
+        begin[block] = begin[block - 1]
+    begin[0] = 0
+
+
+@leaf
+def _at_pixels(depth, K, pixels, begin, order, rays, view, features, scratch, out, out_f):
+    """The blocks of an image at some pixels."""
+    points, boxes, z, work, _, buffer, sums, _, bounds, kept, _ = scratch
+    _, _, everyone, _, settings = view
+    nan = out.dtype.type(np.nan)
+    for block in range(begin.size - 1):
+        for low in range(begin[block], begin[block + 1], _PIXELS):
+            high = min(low + _PIXELS, begin[block + 1])
+            for i in range(_PIXELS):
+                p = pixels[order[min(low + i, high - 1)]]
+                v, u = p // depth.shape[1], p % depth.shape[1]
+                rays[0, i], rays[1, i] = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+                z[i] = depth[v, u] if depth[v, u] > 0 else np.inf
+            if _nearest_instead(z):
+                _place(z, rays[:1], 0, rays[1:], 0, points, boxes, 0, work)
+                count = _cull(everyone, everyone.shape[1], _box(boxes, 0), settings, bounds, kept)
+                _sum(points, boxes, 0, kept, count, view, features, buffer, sums)
+                _averages(buffer, sums)
+            for i in range(high - low):
+                to = order[low + i]
+                use = depth[pixels[to] // depth.shape[1], pixels[to] % depth.shape[1]] > 0
+                out[to] = buffer[_TOTAL + i] if use else nan
+                for g in range(sums.shape[0]):
+                    out_f[g, to] = sums[g, i] if use else nan
+
+
+@leaf
 def _limit(epsilon, count):
     """log2 of the share of a lower bound that one component may add at one level, a little less for rounding."""
     return math.log2(epsilon / (3 * max(count, 1))) - 0.01
 
 
-@part
-def _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit):
-    """Index and fields [K, 10] of the components whose density can exceed 2^limit at a pixel of the image.
+@leaf
+def _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features):
+    """Write the fields of the components whose density can exceed 2^limit at a pixel of the image.
 
     The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
+    ``constants`` are the terms of the sum. The indices of these components move to the head of
+    ``index``; returns how many there are.
     """
-    fields, chosen = np.empty((index.size, _FIELDS)), np.empty(index.size, np.int64)
     scale, n = math.sqrt(0.5 * _LOG2_E), 0
     for k in range(index.size):
         square = 2 * (log_peak[k] - limit / _LOG2_E) * (1 + 1e-6)
-        if not _meets(mean[index[k]], covariance[index[k]], square, K, height, width):
+        if not _meets(mean, covariance, index[k], square, K, height, width):
             continue
         for i in range(3):
             fields[n, i] = mean[index[k], i]
         for i in range(6):
             fields[n, 3 + i] = whitening[k, i] * scale
         fields[n, 9] = log_peak[k] * _LOG2_E
-        chosen[n] = index[k]
+        for i in range(6):
+            constants[n, i] = fields[n, 3 + i]
+        constants[n, 6], constants[n, 7] = fields[n, 9], m[index[k]]
+        constants[n, 8] = features[index[k], features.shape[1] - 1] if features.shape[1] > 0 else 0.0
+        index[n] = index[k]
         n += 1
-    return chosen[:n], fields[:n]
+    return n
 
 
-@part
-def _meets(mu, S, square, K, height, width):
+@leaf
+def _meets(mean, covariance, k, square, K, height, width):
     """Whether the ellipsoid (x - mu)^T S^-1 (x - mu) = square can have a point in the view.
 
     Its silhouette lies between the planes x = s z (and y = s z) that touch it, (mu_x - s mu_z)^2 =
     square (S_xx - 2 s S_xz + s^2 S_zz): a quadratic equation in s. One that reaches z = 0 may be anywhere.
     """
-    least = 1e-14 * max(S[0, 0], S[1, 1], S[2, 2])  # as in prepare
-    szz = square * (S[2, 2] + least)
-    a = mu[2] * mu[2] - szz
-    if square <= 0 or (mu[2] < 0 and a > 1e-6 * szz):
+    sxx, syy, szz = covariance[k, 0, 0], covariance[k, 1, 1], covariance[k, 2, 2]
+    z = mean[k, 2]
+    least = 1e-14 * max(sxx, syy, szz)  # as in prepare
+    szz = square * (szz + least)
+    a = z * z - szz
+    if square <= 0 or (z < 0 and a > 1e-6 * szz):
         return False  # its peak is too low, or it lies behind the camera
     if a <= 1e-6 * szz:
         return True
     for axis in range(2):
-        half_b = mu[axis] * mu[2] - square * S[axis, 2]
-        root = math.sqrt(max(half_b * half_b - a * (mu[axis] * mu[axis] - square * (S[axis, axis] + least)), 0.0))
+        x, sx = mean[k, axis], covariance[k, axis, axis] + least
+        half_b = x * z - square * covariance[k, axis, 2]
+        root = math.sqrt(max(half_b * half_b - a * (x * x - square * sx), 0.0))
         root += 1e-9 * (abs(half_b) + root)
         p = (half_b - root) / a * K[axis, axis] + K[axis, 2]
         q = (half_b + root) / a * K[axis, axis] + K[axis, 2]
@@ -182,140 +283,164 @@ def _meets(mu, S, square, K, height, width):
     return True
 
 
-@part
-def _rays(K, height, width):
-    """x/z of every column and y/z of every row."""
-    across, down = np.empty(width), np.empty(height)
-    for u in range(width):
-        across[u] = (u - K[0, 2]) / K[0, 0]
-    for v in range(height):
-        down[v] = (v - K[1, 2]) / K[1, 1]
-    return across, down
+@leaf
+def _depths(depth, v0, u0, z):
+    """Depths [64] of a tile; that of its nearest pixel for one without, or outside of the image.
 
-
-@part
-def _points(depth, valid, rays, v_low, u_low, points, boxes, seen):
-    """Points [16, 3, 64] of the tiles of a block and their bounding boxes [16, 2, 3]; False where no pixel is valid.
-
-    A pixel that is not valid, or outside of the image, takes the place of a valid one; ``seen`` [16] is False for a
-    tile without any.
+    Returns False where no pixel has one.
     """
-    some = False
-    for tile in range(_SIDE * _SIDE):
-        v0, u0 = v_low + tile // _SIDE * _TILE, u_low + tile % _SIDE * _TILE
-        v1, u1 = min(v0 + _TILE, depth.shape[0]), min(u0 + _TILE, depth.shape[1])
-        seen[tile] = False
-        for v in range(v0, v1):
-            for u in range(u0, u1):
-                if valid[v, u] and not seen[tile]:
-                    seen[tile] = True
-                    z = np.float64(depth[v, u])
-                    first = (rays[0][u] * z, rays[1][v] * z, z)
-            if seen[tile]:
-                break
-        if seen[tile]:
-            some = True
-            _place(depth, valid, rays, v0, v1, u0, u1, first, points[tile], boxes[tile])
-    return some
-
-
-@part
-def _place(depth, valid, rays, v0, v1, u0, u1, first, points, box):
-    """The points [3, 64] of one tile and their bounding box [2, 3]; ``first`` is the point of its first valid pixel."""
-    x, y, z = points[0], points[1], points[2]
-    across, down = rays
-    x0, y0, z0 = first
-    x_low, y_low, z_low = first
-    x_high, y_high, z_high = first
-    if v1 - v0 < _TILE or u1 - u0 < _TILE:
+    if v0 + _TILE <= depth.shape[0] and u0 + _TILE <= depth.shape[1]:
+        for v in range(_TILE):  # a row as a slice: indices from 0 on need no test for negative ones
+            d, row = depth[v0 + v, u0 : u0 + _TILE], z[v * _TILE : (v + 1) * _TILE]
+            for u in range(_TILE):
+                row[u] = d[u] if d[u] > 0 else np.inf
+    else:
         for i in range(_PIXELS):
-            x[i], y[i], z[i] = x0, y0, z0
-    for v in range(v0, v1):
-        i = (v - v0) * _TILE
-        for u in range(u0, u1):
-            d = np.float64(depth[v, u])
-            ok = valid[v, u]
-            px, py, pz = across[u] * d if ok else x0, down[v] * d if ok else y0, d if ok else z0
-            x[i], y[i], z[i] = px, py, pz
-            x_low, x_high = px if px < x_low else x_low, px if px > x_high else x_high
-            y_low, y_high = py if py < y_low else y_low, py if py > y_high else y_high
-            z_low, z_high = pz if pz < z_low else z_low, pz if pz > z_high else z_high
-            i += 1
-    box[0, 0], box[0, 1], box[0, 2] = x_low, y_low, z_low
-    box[1, 0], box[1, 1], box[1, 2] = x_high, y_high, z_high
+            v, u = v0 + i // _TILE, u0 + i % _TILE
+            use = v < depth.shape[0] and u < depth.shape[1] and depth[v, u] > 0
+            z[i] = np.float64(depth[v, u]) if use else np.inf
+    return _nearest_instead(z)
 
 
-@part
+@finite
+def _nearest_instead(z):
+    """Put the least depth in place of infinity; False where all are infinite."""
+    a, b, c, d = z[0], z[1], z[2], z[3]
+    for i in range(4, _PIXELS, 4):  # four chains of comparisons, which do not wait for each other
+        a, b = z[i] if z[i] < a else a, z[i + 1] if z[i + 1] < b else b
+        c, d = z[i + 2] if z[i + 2] < c else c, z[i + 3] if z[i + 3] < d else d
+    least = min(min(a, b), min(c, d))
+    for i in range(_PIXELS):
+        z[i] = z[i] if z[i] < np.inf else least
+    return least < np.inf
+
+
+@leaf
+def _place(z, across, column, down, row, points, boxes, tile, work):
+    """The points [3, 64] of a tile, relative to its origin, its bounding box (low, high) and its origin.
+
+    ``work`` [6, 64] is scratch.
+    """
+    x, y = across[column], down[row]
+    for i in range(_PIXELS):
+        work[0, i] = x[i] * z[i]
+    for i in range(_PIXELS):
+        work[1, i] = y[i] * z[i]
+    for i in range(_PIXELS):
+        work[2, i] = z[i]
+    boxes[tile, 8] = z0 = _extremes(work, boxes, tile)
+    boxes[tile, 6] = x0 = 0.5 * (x[0] + x[_PIXELS - 1]) * z0
+    boxes[tile, 7] = y0 = 0.5 * (y[0] + y[_PIXELS - 1]) * z0
+    for i in range(_PIXELS):
+        points[tile, i] = x[i] * z[i] - x0
+    for i in range(_PIXELS):
+        points[tile, _PIXELS + i] = y[i] * z[i] - y0
+    for i in range(_PIXELS):
+        points[tile, 2 * _PIXELS + i] = z[i] - z0
+
+
+@finite
+def _extremes(work, boxes, tile):
+    """Least and greatest of three rows of 64 numbers, halved until few are left; returns the least of the last."""
+    for axis in range(3):
+        for i in range(_PIXELS):
+            work[3 + axis, i] = work[axis, i]
+        half = _PIXELS // 2
+        while half >= 4:
+            for i in range(half):
+                a, b = work[axis, i], work[axis, half + i]
+                work[axis, i] = a if a < b else b
+            for i in range(half):
+                a, b = work[3 + axis, i], work[3 + axis, half + i]
+                work[3 + axis, i] = a if a > b else b
+            half //= 2
+        low, high = work[axis, 0], work[3 + axis, 0]
+        for i in range(1, 4):
+            low, high = min(low, work[axis, i]), max(high, work[3 + axis, i])
+        boxes[tile, axis], boxes[tile, 3 + axis] = low, high
+    return boxes[tile, 2]
+
+
+@leaf
+def _box(boxes, tile):
+    """The least and the greatest corner of a tile's box."""
+    return boxes[tile, 0], boxes[tile, 1], boxes[tile, 2], boxes[tile, 3], boxes[tile, 4], boxes[tile, 5]
+
+
+@leaf
 def _union(boxes, seen):
     """The least and the greatest corner of the boxes of the tiles that are seen."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    a = b = c = np.inf
+    d = e = f = -np.inf
     for tile in range(seen.size):
         if seen[tile]:
-            for i in range(3):
-                low[i], high[i] = min(low[i], boxes[tile, 0, i]), max(high[i], boxes[tile, 1, i])
-    return low, high
+            a, b, c = min(a, boxes[tile, 0]), min(b, boxes[tile, 1]), min(c, boxes[tile, 2])
+            d, e, f = max(d, boxes[tile, 3]), max(e, boxes[tile, 4]), max(f, boxes[tile, 5])
+    return a, b, c, d, e, f
 
 
-@part
-def _blank(v_low, u_low, side, out, out_f):
-    """NaN at the pixels of a patch."""
-    for v in range(v_low, min(v_low + side, out.shape[0])):
-        for u in range(u_low, min(u_low + side, out.shape[1])):
-            out[v, u] = np.nan
+@leaf
+def _blank(v_low, u_low, out, out_f):
+    """NaN at the pixels of a tile."""
+    nan = out.dtype.type(np.nan)
+    for v in range(v_low, min(v_low + _TILE, out.shape[0])):
+        for u in range(u_low, min(u_low + _TILE, out.shape[1])):
+            out[v, u] = nan
             for g in range(out_f.shape[0]):
-                out_f[g, v, u] = np.nan
+                out_f[g, v, u] = nan
 
 
 @contracted
-def _bounds(packed, n, centre, half, slack, lower, upper):
-    """log2 of the bounds of n densities in the box centre +- half.
+def _bounds(packed, n, centre, half, slack, bounds):
+    """log2 of the lower and upper bounds [2, n] of n densities in the box centre +- half.
 
     ``slack`` times the coordinates bounds the rounding of the distances, and widens the box by it. Infinity and NaN,
     from a far outlier, keep a component and bound nothing.
     """
-    mx, my, mz, a, b, c = packed[0], packed[1], packed[2], packed[3], packed[4], packed[5]
-    d, e, f, peak = packed[6], packed[7], packed[8], packed[9]
     cx, cy, cz = centre
     hx, hy, hz = half
-    zero, least = slack - slack, peak.dtype.type(-1e30)
+    zero, least = slack - slack, packed.dtype.type(-1e30)
     for j in range(n):
-        dx, dy, dz = cx - mx[j], cy - my[j], cz - mz[j]
-        wx, wy, wz = hx + slack * abs(mx[j]), hy + slack * abs(my[j]), hz + slack * abs(mz[j])
-        y0, r0 = abs(a[j] * dx), a[j] * wx
-        y1, r1 = abs(b[j] * dx + c[j] * dy), abs(b[j]) * wx + c[j] * wy
-        y2, r2 = abs(d[j] * dx + e[j] * dy + f[j] * dz), abs(d[j]) * wx + abs(e[j]) * wy + f[j] * wz
+        dx, dy, dz = cx - packed[0, j], cy - packed[1, j], cz - packed[2, j]
+        wx, wy, wz = hx + slack * abs(packed[0, j]), hy + slack * abs(packed[1, j]), hz + slack * abs(packed[2, j])
+        a, b, c, d, e, f = packed[3, j], packed[4, j], packed[5, j], packed[6, j], packed[7, j], packed[8, j]
+        y0, r0 = abs(a * dx), a * wx
+        y1, r1 = abs(b * dx + c * dy), abs(b) * wx + c * wy
+        y2, r2 = abs(d * dx + e * dy + f * dz), abs(d) * wx + abs(e) * wy + f * wz
         p0, p1, p2 = y0 + r0, y1 + r1, y2 + r2
-        low = peak[j] - (p0 * p0 + p1 * p1 + p2 * p2)
-        lower[j] = low if low > least else least
+        low = packed[9, j] - (p0 * p0 + p1 * p1 + p2 * p2)
+        bounds[0, j] = low if low > least else least
         q0, q1, q2 = y0 - r0, y1 - r1, y2 - r2
         q0, q1, q2 = q0 if q0 > zero else zero, q1 if q1 > zero else zero, q2 if q2 > zero else zero
-        upper[j] = peak[j] - (q0 * q0 + q1 * q1 + q2 * q2)
+        bounds[1, j] = packed[9, j] - (q0 * q0 + q1 * q1 + q2 * q2)
 
 
-@part
-def _greatest(values, n, start):
-    """The greatest of ``start`` and n values without NaN."""
+@leaf
+def _greatest(bounds, n, start):
+    """The greatest of ``start`` and n lower bounds."""
     a = b = c = start  # four chains of comparisons, which do not wait for each other
     for j in range(0, n - 3, 4):
-        start = values[j] if values[j] > start else start
-        a = values[j + 1] if values[j + 1] > a else a
-        b = values[j + 2] if values[j + 2] > b else b
-        c = values[j + 3] if values[j + 3] > c else c
+        start = bounds[0, j] if bounds[0, j] > start else start
+        a = bounds[0, j + 1] if bounds[0, j + 1] > a else a
+        b = bounds[0, j + 2] if bounds[0, j + 2] > b else b
+        c = bounds[0, j + 3] if bounds[0, j + 3] > c else c
     for j in range(n - n % 4, n):
-        start = values[j] if values[j] > start else start
+        start = bounds[0, j] if bounds[0, j] > start else start
     return max(max(start, a), max(b, c))
 
 
-@part
-def _cull(packed, n, low, high, epsilon, least, bounds, kept):
-    """Write the packed components that matter in the box from low to high to ``kept``; return how many."""
+@leaf
+def _cull(packed, n, box, settings, bounds, kept):
+    """Write the packed components that matter in the box to ``kept``; return how many."""
     real = packed.dtype.type
+    x_low, y_low, z_low, x_high, y_high, z_high = box
+    _, _, epsilon, least = settings
     slack = real(16 * np.finfo(packed.dtype).eps)
-    cx, cy, cz = 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.5 * (low[2] + high[2])
-    hx, hy, hz = 0.5 * (high[0] - low[0]), 0.5 * (high[1] - low[1]), 0.5 * (high[2] - low[2])
+    cx, cy, cz = 0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high)
+    hx, hy, hz = 0.5 * (x_high - x_low), 0.5 * (y_high - y_low), 0.5 * (z_high - z_low)
     hx, hy, hz = hx + slack * (hx + abs(cx)), hy + slack * (hy + abs(cy)), hz + slack * (hz + abs(cz))
-    _bounds(packed, n, (real(cx), real(cy), real(cz)), (real(hx), real(hy), real(hz)), slack, bounds[0], bounds[1])
-    threshold = _greatest(bounds[0], n, real(least)) + _limit(epsilon, n)
+    _bounds(packed, n, (real(cx), real(cy), real(cz)), (real(hx), real(hy), real(hz)), slack, bounds)
+    threshold = _greatest(bounds, n, real(least)) + _limit(epsilon, n)
     count = 0
     for j in range(n):
         kept[count] = j
@@ -324,89 +449,99 @@ def _cull(packed, n, low, high, epsilon, least, bounds, kept):
 
 
 @contracted
-def _add_two(coefficient, buffer):
-    """Add two components to 64 points: their densities to the row of evidence, times m to that of the total.
-
-    coefficient: for each one the fields relative to the points' origin (10), and m.
-    """
-    ax, ay, az, a0, a1, a2 = (
-        coefficient[0], coefficient[1], coefficient[2], coefficient[3], coefficient[4], coefficient[5]
-    )  # fmt: skip
-    a3, a4, a5, a_peak, a_m = coefficient[6], coefficient[7], coefficient[8], coefficient[9], coefficient[10]
-    bx, by, bz, b0, b1, b2 = (
-        coefficient[11], coefficient[12], coefficient[13], coefficient[14], coefficient[15], coefficient[16]
-    )  # fmt: skip
-    b3, b4, b5, b_peak, b_m = coefficient[17], coefficient[18], coefficient[19], coefficient[20], coefficient[21]
+def _add_two(constants, k, a_offset, j, b_offset, b_peak, buffer):
+    """Add components k and j to 64 points: their densities to the row of evidence, times m to that of the total, and
+    times the last feature to that of the last."""
+    a0, a1, a2, a3, a4 = constants[k, 0], constants[k, 1], constants[k, 2], constants[k, 3], constants[k, 4]
+    a5, a_peak, a_m, a_f = constants[k, 5], constants[k, 6], constants[k, 7], constants[k, 8]
+    b0, b1, b2, b3, b4 = constants[j, 0], constants[j, 1], constants[j, 2], constants[j, 3], constants[j, 4]
+    b5, b_m, b_f = constants[j, 5], constants[j, 7], constants[j, 8]
+    ax, ay, az = a_offset
+    bx, by, bz = b_offset
     for i in range(_PIXELS):
         x, y, z = buffer[_X + i], buffer[_Y + i], buffer[_Z + i]
-        dx, dy, dz = x - ax, y - ay, z - az
-        y0, y1, y2 = a0 * dx, a1 * dx + a2 * dy, a3 * dx + a4 * dy + a5 * dz
-        p = exp2_(a_peak - (y0 * y0 + y1 * y1 + y2 * y2))
-        dx, dy, dz = x - bx, y - by, z - bz
-        y0, y1, y2 = b0 * dx, b1 * dx + b2 * dy, b3 * dx + b4 * dy + b5 * dz
-        q = exp2_(b_peak - (y0 * y0 + y1 * y1 + y2 * y2))
+        y0, y1, y2 = a0 * x + ax, a1 * x + (a2 * y + ay), a3 * x + (a4 * y + (a5 * z + az))
+        p = exp2_(((a_peak - y0 * y0) - y1 * y1) - y2 * y2)
+        y0, y1, y2 = b0 * x + bx, b1 * x + (b2 * y + by), b3 * x + (b4 * y + (b5 * z + bz))
+        q = exp2_(((b_peak - y0 * y0) - y1 * y1) - y2 * y2)
         buffer[_EVIDENCE + i] = buffer[_EVIDENCE + i] + (p + q)
-        buffer[_TOTAL + i] = buffer[_TOTAL + i] + (p * a_m + q * b_m)
+        buffer[_TOTAL + i] = (buffer[_TOTAL + i] + p * a_m) + q * b_m
+        buffer[_LAST + i] = (buffer[_LAST + i] + p * a_f) + q * b_f
         buffer[_FIRST + i] = p
         buffer[_SECOND + i] = q
 
 
 @contracted
-def _add_feature(first, second, buffer, row):
+def _add_feature(first, second, buffer, sums, g):
     """Add what two components' densities, as :func:`_add_two` left them, add to the sum of one feature."""
     for i in range(_PIXELS):
-        row[i] += buffer[_FIRST + i] * first + buffer[_SECOND + i] * second
+        sums[g, i] += buffer[_FIRST + i] * first + buffer[_SECOND + i] * second
 
 
-@part
-def _sum(points, least, chosen, count, index, fields, m, features, prior_weight, prior_mean, buffer, sums, coefficient):
-    """Evidence, total and sums of the features [F, 64] at the points of a tile, over ``chosen`` components.
-
-    ``least`` is the depth of the nearest point.
-    """
+@leaf
+def _sum(points, boxes, tile, chosen, count, view, features, buffer, sums):
+    """Evidence, total and sums of the features [F, 64] at the points of a tile, over ``chosen`` components."""
     real = buffer.dtype.type
-    nearest = _start(points, least, prior_weight, prior_mean, buffer, sums)
-    x, y, z = points[0, nearest], points[1, nearest], points[2, nearest]
-    for j in range(0, count, 2):
-        a, b = chosen[j], chosen[min(j + 1, count - 1)]
-        coefficient[0], coefficient[1], coefficient[2] = fields[a, 0] - x, fields[a, 1] - y, fields[a, 2] - z
-        coefficient[11], coefficient[12], coefficient[13] = fields[b, 0] - x, fields[b, 1] - y, fields[b, 2] - z
-        for i in range(3, _FIELDS):
-            coefficient[i], coefficient[11 + i] = fields[a, i], fields[b, i]
-        coefficient[10], coefficient[21] = m[index[a]], m[index[b]]
-        if j + 1 == count:
-            coefficient[20] = -1e4  # an odd one is not counted twice
-        _add_two(coefficient, buffer)
-        for g in range(sums.shape[0]):
-            _add_feature(real(features[index[a], g]), real(features[index[b], g]), buffer, sums[g])
-
-
-@part
-def _start(points, least, prior_weight, prior_mean, buffer, sums):
-    """Fill the buffer with the points relative to the nearest one, whose number is returned, and with the prior."""
-    nearest = 0
-    while nearest < _PIXELS - 1 and points[2, nearest] != least:
-        nearest += 1
-    x, y, z = points[0, nearest], points[1, nearest], points[2, nearest]
-    total = prior_weight * prior_mean
+    index, fields, _, constants, (prior_weight, prior_mean, _, _) = view
+    prior, total, last = real(prior_weight), real(prior_weight * prior_mean), sums.shape[0] - 1
+    for i in range(3 * _PIXELS):
+        buffer[_X + i] = points[tile, i]
     for i in range(_PIXELS):
-        buffer[_X + i], buffer[_Y + i], buffer[_Z + i] = points[0, i] - x, points[1, i] - y, points[2, i] - z
-        buffer[_EVIDENCE + i], buffer[_TOTAL + i] = prior_weight, total
-    for g in range(sums.shape[0]):
+        buffer[_EVIDENCE + i], buffer[_TOTAL + i], buffer[_LAST + i] = prior, total, real(0)
+    for g in range(last):
         for i in range(_PIXELS):
             sums[g, i] = 0
-    return nearest
+    x, y, z = boxes[tile, 6], boxes[tile, 7], boxes[tile, 8]
+    for j in range(0, count, 2):
+        a, b = chosen[j], chosen[min(j + 1, count - 1)]
+        peak = constants[b, 6] if j + 1 < count else real(-1e4)  # an odd one is not counted twice
+        _add_two(constants, a, _offset(fields, a, x, y, z, real), b, _offset(fields, b, x, y, z, real), peak, buffer)
+        for g in range(last):
+            _add_feature(real(features[index[a], g]), real(features[index[b], g]), buffer, sums, g)
+    if last >= 0:
+        for i in range(_PIXELS):
+            sums[last, i] = buffer[_LAST + i]
 
 
-@part
-def _finish(valid, v0, u0, buffer, sums, out, out_f):
-    """Write the averages of a tile; NaN where not valid."""
-    nan = out.dtype.type(np.nan)
+@leaf
+def _offset(fields, k, x, y, z, real):
+    """The whitened offset of (x, y, z) from the mean of component k."""
+    dx, dy, dz = x - fields[k, 0], y - fields[k, 1], z - fields[k, 2]
+    w0, w1 = fields[k, 3] * dx, fields[k, 4] * dx + fields[k, 5] * dy
+    return real(w0), real(w1), real(fields[k, 6] * dx + fields[k, 7] * dy + fields[k, 8] * dz)
+
+
+@leaf
+def _averages(buffer, sums):
+    """Divide total and features by the evidence."""
     for i in range(_PIXELS):
         buffer[_TOTAL + i] = buffer[_TOTAL + i] / buffer[_EVIDENCE + i]
-    for v in range(v0, min(v0 + _TILE, out.shape[0])):
-        for u in range(u0, min(u0 + _TILE, out.shape[1])):
-            i = (v - v0) * _TILE + u - u0
-            out[v, u] = buffer[_TOTAL + i] if valid[v, u] else nan
-            for g in range(sums.shape[0]):
-                out_f[g, v, u] = sums[g, i] / buffer[_EVIDENCE + i] if valid[v, u] else nan
+    for g in range(sums.shape[0]):
+        for i in range(_PIXELS):
+            sums[g, i] = sums[g, i] / buffer[_EVIDENCE + i]
+
+
+@leaf
+def _finish(depth, v0, u0, buffer, sums, out, out_f):
+    """Write the averages of a tile; NaN without a depth."""
+    _averages(buffer, sums)
+    _write(depth, v0, u0, buffer[_TOTAL : _TOTAL + _PIXELS], out)
+    for g in range(sums.shape[0]):
+        _write(depth, v0, u0, sums[g], out_f[g])
+
+
+@leaf
+def _write(depth, v0, u0, values, out):
+    """The values [64] of a tile into a map."""
+    nan = out.dtype.type(np.nan)
+    if v0 + _TILE <= out.shape[0] and u0 + _TILE <= out.shape[1]:
+        for v in range(_TILE):
+            to, d = out[v0 + v, u0 : u0 + _TILE], depth[v0 + v, u0 : u0 + _TILE]
+            row = values[v * _TILE : (v + 1) * _TILE]
+            for u in range(_TILE):
+                value = row[u]
+                to[u] = value if d[u] > 0 else nan
+    else:
+        for v in range(v0, min(v0 + _TILE, out.shape[0])):
+            for u in range(u0, min(u0 + _TILE, out.shape[1])):
+                out[v, u] = values[(v - v0) * _TILE + u - u0] if depth[v, u] > 0 else nan

@@ -1,12 +1,13 @@
 """SPGF on the CPU (numba): the same partitions as :mod:`ufmstar_torch.segment`, in well under a millisecond
 at 224 x 224.
 
-One thread per call and no shared state: calls from several Python threads run side by side (the GIL is
-released), and no thread pool stands in the way of fork.
+The rows of an image are segmented on all threads that torch may use, their segments fused on one.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,15 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.kernels.compile_cpu import kernel
-from ufmstar_torch.kernels.segment_image_cpu import segment_image, write_gaussians
+from ufmstar_torch.kernels.segment_image_cpu import (
+    SEGMENT,
+    SEGMENT_INT,
+    join_rows,
+    scan_rows,
+    write_gaussians,
+    write_labels,
+)
+from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
 
@@ -43,35 +52,59 @@ class _Limits(NamedTuple):
 
 def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, for CPU tensors, float64 inside."""
+    mixture, labels = fit(given, before_pruning=before_pruning)
+    return mixture, labels()
+
+
+def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Callable[[], Tensor]]:
+    """As :func:`segment`, with a function that writes the labels."""
     z = given.depth.contiguous().numpy()
-    absent = (z.shape[0], 1, 0)  # rows of no pixels stand for "not given"
+    streams, height, width = z.shape
+    absent = (streams, height, 0)  # rows of no pixels stand for "not given"
     use = np.empty(absent, np.bool_) if given.valid is None else given.valid.contiguous().numpy()
     spread = np.empty(absent, z.dtype) if given.variance is None else _array(given.variance)
     limits = _limits(given, before_pruning)
-    labels = np.empty(z.shape, np.int64)
-    result = []
+    room = height * given.segments_per_row
+    spans, owner = np.empty((streams, height, 2), np.int64), np.empty(z.shape, np.int32)
+    table, table_int = np.empty((streams, room, SEGMENT)), np.empty((streams, room, SEGMENT_INT), np.int64)
+    shares = shares_of_stream(streams, height * width)
+    rows = [height * i // shares for i in range(shares + 1)]
+    scans, joins = [], []
     for b, K in enumerate(given.intrinsics.tolist()):
         fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
         slope = given.config.slope(min(fx, fy))
-        bins = _depth_bins(0.5 * min(z.shape[2] / fx, z.shape[1] / fy), limits)
-        result.append(segment_image(z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, labels[b]))
-    return _mixture(result, given, labels), torch.from_numpy(labels)
+        bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
+        tables = spans[b], table[b], table_int[b]
+        for first, last in itertools.pairwise(rows):
+            scans.append(
+                (z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, owner[b])
+            )
+        joins.append((width, fy, cy, slope, bins[0], limits, *tables))
+    each(scan_rows, scans)
+    joined = each(join_rows, joins)
+    slots = [slot for *_, slot in joined]
+
+    def labels() -> Tensor:
+        out = np.empty(owner.shape, np.int64)
+        for b, slot in enumerate(slots):
+            write_labels(owner[b], slot, out[b])
+        return torch.from_numpy(out)
+
+    return _mixture([gaussians for *gaussians, _ in joined], given, labels), labels
 
 
-def _mixture(
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], given: SegmentInput, labels: np.ndarray
-) -> GaussianMixture:
+def _mixture(fits: list[list[np.ndarray]], given: SegmentInput, labels: Callable[[], Tensor]) -> GaussianMixture:
     """The kept Gaussians of all streams, padded to the largest."""
     dtype = np.float32 if given.dtype == torch.float32 else np.float64
-    b, k = len(found), max(1, *(kept.size for kept, _, _ in found))
+    b, k = len(fits), max(1, *(kept.size for kept, _, _ in fits))
     mean, covariance = np.zeros((b, k, 3), dtype), np.zeros((b, k, 3, 3), dtype)
     weight, count = np.zeros((b, k), dtype), np.zeros((b, k), np.int64)
-    for i, (kept, gaussians, whole) in enumerate(found):
+    for i, (kept, gaussians, whole) in enumerate(fits):
         write_gaussians(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
     if given.features is None:
         features = np.empty((b, k, 0), dtype)
     else:
-        features = _feature_means(_array(given.features), labels, weight)
+        features = _feature_means(_array(given.features), labels().numpy(), weight)
     fields = (mean, covariance, weight, np.zeros((b, k), dtype), count, features)
     return GaussianMixture(*map(torch.from_numpy, fields))
 

@@ -10,6 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.given import CheckKernel as AnchorCheckKernel
+from ufmstar_torch.anchors.given import check_values as check_anchor_values
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
@@ -71,6 +73,15 @@ def select_check(name: str, device_type: str) -> CheckKernel:
 
         return check.check_values
     return check_values
+
+
+def select_anchor_check(name: str, device_type: str) -> AnchorCheckKernel:
+    """The check of a frame's anchors; arguments and errors as :func:`select_step`."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import anchors_cpu
+
+        return anchors_cpu.check_values
+    return check_anchor_values
 
 
 def select_merge(name: str, device_type: str) -> MergeKernels:

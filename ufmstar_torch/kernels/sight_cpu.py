@@ -64,33 +64,46 @@ def sight(
     """
     n = len(point)
     pixel, depth, spread, shown = np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
-    camera = (np.ascontiguousarray(T_world_cam[:3, :3].T), np.ascontiguousarray(T_world_cam[:3, 3]))
-    _sight(image, point, pose, sigma, patch, *camera, K, np.linalg.inv(K), pixel, depth, spread, shown)
+    camera = (np.ascontiguousarray(K @ T_world_cam[:3, :3].T), np.ascontiguousarray(T_world_cam[:3, 3]))
+    _sight(image, point, pose, sigma, patch, *camera, np.linalg.inv(K), pixel, depth, spread, shown)
     return pixel, depth, spread, shown
 
 
 @compiled
-def _sight(image, point, pose, sigma, patch, R, centre, K, K_inverse, pixel, depth, spread, shown):
+def _sight(image, point, pose, sigma, patch, P, centre, K_inverse, pixel, depth, spread, shown):
     height, width = image.shape
     one = np.float32(1)
+    p, error, rotated, into = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(point)):
-        X = R @ (point[n] - centre)
-        if X[2] <= 1e-3:
+        for i in range(3):
+            p[i] = 0.0
+            for j in range(3):
+                p[i] += P[i, j] * (point[n, j] - centre[j])
+        z = p[2]  # the last row of K is (0, 0, 1)
+        if z <= 1e-3:
             continue
-        p = K @ X / X[2]
+        p /= z
         if not (MARGIN <= p[0] < width - MARGIN and MARGIN <= p[1] < height - MARGIN):
             continue
-        away = point[n] - pose[n, :3, 3]
-        before = away[0] * pose[n, 0, 2] + away[1] * pose[n, 1, 2] + away[2] * pose[n, 2, 2]
+        before = 0.0
+        for i in range(3):
+            before += (point[n, i] - pose[n, i, 3]) * pose[n, i, 2]
         # What a pixel of the view that measured it is here, and what its standard deviation is.
-        into = K @ R @ np.ascontiguousarray(pose[n, :3, :3]) @ K_inverse * (before / X[2])
+        for i in range(3):
+            error[i] = 0.0
+            for j in range(3):
+                error[i] += P[i, j] * (point[n, j] - pose[n, j, 3]) * sigma[n]
+                rotated[i, j] = P[i, 0] * pose[n, 0, j] + P[i, 1] * pose[n, 1, j] + P[i, 2] * pose[n, 2, j]
+        for i in range(3):
+            for j in range(3):
+                into[i, j] = 0.0
+                for k in range(3):
+                    into[i, j] += rotated[i, k] * K_inverse[k, j] * (before / z)
         a, b = into[0, 0] - p[0] * into[2, 0], into[0, 1] - p[0] * into[2, 1]
         c, d = into[1, 0] - p[1] * into[2, 0], into[1, 1] - p[1] * into[2, 1]
         determinant = a * d - b * c
-        error = R @ away * sigma[n]
-        shift = K @ error / X[2]
-        shift_u, shift_v = shift[0] - p[0] * shift[2], shift[1] - p[1] * shift[2]
-        pixel[n, 0], pixel[n, 1], depth[n], spread[n] = p[0], p[1], X[2], abs(error[2])
+        shift_u, shift_v = (error[0] - p[0] * error[2]) / z, (error[1] - p[1] * error[2]) / z
+        pixel[n, 0], pixel[n, 1], depth[n], spread[n] = p[0], p[1], z, abs(error[2])
         if not 1 / LARGEST_SCALE**2 < determinant < LARGEST_SCALE**2 or shift_u**2 + shift_v**2 > FARTHEST**2:
             continue
         far_u, far_v = (abs(a) + abs(b)) * -FIRST, (abs(c) + abs(d)) * -FIRST

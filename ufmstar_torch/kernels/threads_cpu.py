@@ -14,6 +14,8 @@ from typing import Any
 
 import torch
 
+_SHARE = 128 * 128  # pixels; below that a thread costs more than it saves
+
 
 def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
     """The results of ``function`` for every tuple of arguments, on as many threads as torch may use."""
@@ -26,6 +28,11 @@ def each(function: Callable[..., Any], arguments: Sequence[tuple[Any, ...]]) -> 
     others = {i: pool.submit(function, *arguments[i]) for i in range(len(arguments)) if i not in own}
     results = {i: function(*arguments[i]) for i in own} | {i: other.result() for i, other in others.items()}
     return [results[i] for i in range(len(arguments))]
+
+
+def shares_of_stream(streams: int, pixels: int) -> int:
+    """Into how many parts to divide the work on each of ``streams`` images of so many pixels."""
+    return max(1, min(-(-torch.get_num_threads() // streams), pixels // _SHARE))
 
 
 @functools.lru_cache(maxsize=2)

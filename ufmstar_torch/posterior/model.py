@@ -20,9 +20,16 @@ class Model(NamedTuple):
         hat: variance of a hat, times the amplitude.
         prior, drift: standard deviation of the coefficients of 1, log d, u and v before the first anchor, and of their
             change from frame to frame: those of the true error on tours.
+        inflation: by what factor the field's variance and the roughness are too small: anchors of one surface err
+            together.
         common: variance of y that all nodes share: the scale of the poses.
-        claimed: share of the variance that UfM* claims in that of a surface far from all evidence.
-        far: distance from evidence from which on a surface counts as unseen.
+        limit: largest distance from evidence that counts.
+        growth: variance of y by distance from evidence, beyond what held-out anchors show: they lie where there is
+            texture.
+        claimed, far: share of the variance that UfM* claims, from this distance on; less in proportion nearer.
+        square: largest y^2 of a held-out anchor in what is learnt of the growth: a factor of e^2.
+        near, alone: leave-one-out residuals count in a square of ``2 near + 1`` cells, together with this many anchors
+            of z^2 = 1.
         rounds, student: rounds of Student-t weights, and their degrees of freedom.
         nearer, farther: range of t, within which the weight of a weak anchor is evaluated.
         least_left: least share of 1 - w v, by which a residual is divided to leave its anchor out.
@@ -42,14 +49,20 @@ class Model(NamedTuple):
     edge: float = 2.0
     climb: float = 2.0
     smooth: float = 0.03
-    kappa: float = 2.0
+    kappa: float = 0.5
     hats: int = 3
     hat: float = 0.1**2
     prior: tuple[float, float, float, float] = (0.5, 0.45, 0.2, 0.2)
-    drift: tuple[float, float, float, float] = (0.12, 0.12, 0.08, 0.06)
+    drift: tuple[float, float, float, float] = (0.06, 0.06, 0.04, 0.03)
+    inflation: float = 1.7
     common: float = 0.03**2
-    claimed: float = 0.5
+    limit: float = 2.0
+    growth: float = 0.06
+    claimed: float = 0.25
     far: float = 0.6
+    square: float = 4.0
+    near: int = 2
+    alone: float = 2.0
     rounds: int = 2
     student: float = 4.0
     nearer: float = -0.7

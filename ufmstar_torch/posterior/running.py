@@ -2,8 +2,9 @@
 
 Everything here is learnt from anchors alone, in frames that have some: how far the network's error varies (amplitude),
 how much anchors and network differ from one pixel to the next (roughness), by what factor the anchors' variances are
-stated too small (noise), how far surfaces without evidence are off (unseen), and how well held-out anchors were
-predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do not decide.
+stated too small (noise), how fast the error grows with the distance from evidence (unseen), and how well held-out
+anchors were predicted (calibration). Each is a ratio of two sums that fade towards a prior, so that a few anchors do
+not decide.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from torch import Tensor
 
 from ufmstar_torch.posterior.model import GLOBALS, MODEL
 
-# (prior value, its weight in anchors, least, largest): amplitude 1, roughness (.05)^2, noise 1 and unseen as variances
-# of y relative to, or added to, those of the model; calibration as mean z^2, of which nothing is known before.
+# (prior value, its weight in anchors, least, largest). Amplitude and noise are factors of the model's variances;
+# roughness and unseen are variances of y, at a pixel and over a width of the image. Calibration is a mean z^2, of
+# which nothing is known before.
 RATIOS = {
     "amplitude": (1.0, 20.0, 0.1, 100.0),
     "roughness": (0.05**2, 60.0, 0.01**2, 0.2**2),
     "noise": (1.0, 60.0, 0.25, 16.0),
-    "unseen": (0.15, 1000.0, 0.0, 4.0),
+    "unseen": (0.05, 30.0, 0.0, 16.0),
     "calibration": (0.0, 0.0, 0.0, 1e6),
 }
 _MATRIX = GLOBALS * GLOBALS
@@ -73,6 +75,10 @@ class Running:
         below = self.below[name]
         ratio = torch.where(below > 0, self.above[name] / below.clamp_min(1e-12), torch.full_like(below, value))
         return ratio.clamp(least, largest)
+
+    def growth(self) -> Tensor:
+        """[B] variance of y a width of the image from evidence."""
+        return MODEL.growth + self.ratio("unseen")
 
     def added(self, name: str, above: Tensor, below: Tensor) -> tuple[Tensor, Tensor]:
         """The two sums of a ratio [B] after a frame with these [B]."""

@@ -16,14 +16,19 @@ prediction beyond the anchor, its part of n is divided by (1 - e^-t) e^-t / t, s
 near, and hardly what is too far. Two rounds of Student-t weights (5/(4 + z^2), z from the leave-one-out residual) take
 outliers out.
 
-Variance of y at a node: the field's, the roughness, a common .03^2 of the poses' scale, and where evidence is far
+Variance of y at a node:
 
-    share (unseen + V/(2 d^2)),     share = min(1, distance/.6),
+    local 1.7 (the field's + roughness) + .03^2 + distance (.06 + unseen) + min(1, distance/.6) V/(4 d^2).
 
-with V = M + A + E: a surface without evidence is as uncertain as held-out anchors show, and more where UfM* says so.
-The distance is geodesic, in widths of the image, and depth edges lengthen it. All amplitudes are learnt (``running``)
-from anchors of three discs that move over the image: the field is fitted without them, and they count by area and not
-by number, since corners cluster on what is well textured.
+``local`` is the mean z^2 of the leave-one-out residuals of the anchors in the cells around: the error is rougher on one
+surface than on another. The distance from evidence is geodesic, in widths of the image, and depth edges lengthen it: on
+tours the variance of the error grows in proportion to it. All amplitudes are learnt (``running``) from anchors of three
+discs that move over the image: the field is fitted without them, and they count by area and not by number, since
+corners cluster on what is well textured. ``unseen`` is what their squared error is beyond the rest, over their
+distance. V = M + A + E counts where evidence is far. .03^2 is the common scale of the poses.
+
+A stream that is given anchors of which none was valid so far has that variance without evidence, about the network's
+depth: nothing was measured, and nothing reads as certain. A stream without anchors is UfM*'s.
 """
 
 from __future__ import annotations
@@ -33,6 +38,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from ufmstar_torch.anchors.given import AnchorInput
 from ufmstar_torch.fixed_order import total
@@ -59,9 +65,9 @@ class Posterior:
 
     Attributes:
         depth: [B, H, W] [m]; as predicted before the first anchor. NaN where not valid.
-        variance: [B, H, W] [m^2]; UfM*'s before the first anchor.
+        variance: [B, H, W] [m^2]; UfM*'s where no anchors were ever given.
         calibration: [B] mean z^2 of held-out anchors lately: 1 = as predicted, more = too certain; NaN before any.
-        unseen: [B] variance of y that held-out anchors show where evidence is far.
+        unseen: [B] variance of y a width of the image from evidence.
     """
 
     depth: Tensor
@@ -108,6 +114,10 @@ class _Scene:
         nodes = torch.zeros_like(self.grid.log_depth).scatter_add(1, self.observed.node, kept)
         return torch.gather(nodes, 1, self.observed.node)
 
+    def believed(self, near: _Near) -> Tensor:
+        """[B, N] by how much an anchor counts for what is learnt: less the noisier it is, 0 where not valid."""
+        return torch.where(self.valid, 1 / (1 + near.noise / MODEL.weak**2), torch.zeros_like(near.noise))
+
 
 @dataclass(frozen=True)
 class _Near:
@@ -141,26 +151,29 @@ def update(
     Returns:
         What is known after the frame, and the posterior. A stream without a usable anchor keeps what it knew.
     """
+    given = anchors is not None
     anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
     running, grid, claimed_share = Running.of(packed), Grid.of(frame), MODEL.claimed * claimed.nan_to_num()
     scene = _Scene.of(grid, frame, anchors, running)
     field, weight, near = _fitted(scene)
-    share = _share(scene, anchors.valid & (weight * MODEL.evidence**2 >= 1))
+    away = _away(scene, anchors.valid & (weight * MODEL.evidence**2 >= 1))
+    share = (away / MODEL.far).clamp_max(1)
     after = _learnt(scene, field, weight, near, _relative(claimed_share, frame, anchors), running)
     features, b = grid.features(), field.coefficients
     mean, variance = field.at(torch.arange(features.shape[1], device=b.device).expand_as(share), features)
     offset = mean - (features[..., :GLOBALS] * b[:, None, :GLOBALS]).sum(-1)
-    variance = variance + running.ratio("roughness")[:, None] + MODEL.common + share * running.ratio("unseen")[:, None]
+    variance = MODEL.inflation * _local(scene, near) * (variance + running.ratio("roughness")[:, None])
+    variance = variance + MODEL.common + away * running.growth()[:, None]
     nodes = torch.stack([grid.log_depth, offset, variance, share], -1)
     depth, spread = read(frame.depth, frame.valid, claimed_share, nodes, b[:, :GLOBALS], grid.mean, grid.size)
     some = anchors.valid.any(1)
-    known = (some | (running.frames > 0))[:, None, None]
+    known = (some | (running.frames > 0) | given)[:, None, None]
     plain = torch.where(frame.valid, frame.depth, torch.nan)
     kept = torch.where(some[:, None], after.packed().to(packed.dtype), packed)
     now = Running.of(kept)
     calibration = torch.where(now.below["calibration"] > 0, now.ratio("calibration"), torch.nan)
     return kept, Posterior(
-        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.ratio("unseen")
+        torch.where(known, depth, plain), torch.where(known, spread, claimed), calibration, now.growth()
     )
 
 
@@ -226,11 +239,22 @@ def _pull(t: Tensor) -> Tensor:
     return torch.where(small, 1 - 1.5 * t, -torch.expm1(-safe) * torch.exp(-safe) / safe)
 
 
-def _share(scene: _Scene, evidence: Tensor) -> Tensor:
-    """[B, n] how far every node is from the anchors of the mask [B, N], 0 to 1."""
+def _local(scene: _Scene, near: _Near) -> Tensor:
+    """[B, n] mean z^2 of the leave-one-out residuals around every node."""
+    each = scene.believed(near) / scene.counted(torch.ones_like(near.noise)).clamp_min(1)
+    z2 = (near.left_out.square() / near.total).clamp_max(MODEL.clip)
+    nodes = torch.zeros(2, *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
+    nodes = nodes.scatter_add(2, scene.observed.node.expand(2, -1, -1), torch.stack([each * z2, each]))
+    side = 2 * MODEL.near + 1
+    around = avg_pool2d(nodes.unflatten(2, scene.grid.size), side, 1, MODEL.near, divisor_override=1).flatten(2)
+    return (around[0] + MODEL.alone) / (around[1] + MODEL.alone)
+
+
+def _away(scene: _Scene, evidence: Tensor) -> Tensor:
+    """[B, n] how far every node is from the anchors of the mask [B, N], in widths of the image."""
     grid = scene.grid
     source = torch.zeros_like(grid.log_depth).scatter_add(1, scene.observed.node, evidence.to(grid.log_depth)) > 0
-    return distance(source, grid.far_right, grid.far_down, grid.size[1], MODEL.far) / MODEL.far
+    return distance(source, grid.far_right, grid.far_down, grid.size[1], MODEL.limit)
 
 
 def _relative(claimed: Tensor, frame: FrameInput, anchors: AnchorInput) -> Tensor:
@@ -274,19 +298,20 @@ def _of_discs(
     held = held & (rest.sum(1, keepdim=True) >= MODEL.left)
     field = Field.given(scene.prior, scene.observed, weight * rest)
     mean, variance = field.at(scene.observed.node, scene.observed.features)
-    share = torch.gather(_share(scene, rest), 1, scene.observed.node)
+    away = torch.gather(_away(scene, rest), 1, scene.observed.node)
     tot = variance + near.noise
     error = (scene.observed.value - mean).square()
     square = torch.minimum(error, MODEL.clip * tot) / MODEL.clipped
-    believed = torch.where(held, 1 / (1 + near.noise / MODEL.weak**2), 0.0)
+    believed = torch.where(held, scene.believed(near), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
-    final = tot + MODEL.common + share * (running.ratio("unseen")[:, None] + claimed)
+    final = MODEL.inflation * variance + near.noise + MODEL.common + away * running.growth()[:, None]
+    final = final + (away / MODEL.far).clamp_max(1) * claimed
     return {
         "amplitude": (
             total(area * (square - near.noise) / tot, 1),
             total(area * variance / tot, 1) / running.ratio("amplitude"),
         ),
-        "unseen": (total(area * (square - tot - share * claimed) * share / tot, 1), total(area * share**2 / tot, 1)),
+        "unseen": (total(area * (error.clamp_max(MODEL.square) - tot), 1), total(area * away, 1)),
         "calibration": (total(area * error / final, 1), total(area, 1)),
     }
 

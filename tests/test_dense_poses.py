@@ -1,0 +1,176 @@
+"""Errors of poses and camera in dense evidence, and anchors beside edges: against NumPy loops and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle_dense
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ufmstar_torch.anchors.dense_poses import PoseErrors
+from ufmstar_torch.kernels.beside_cpu import beside
+from ufmstar_torch.kernels.dense_cpu import Measured, Views
+from ufmstar_torch.kernels.poses_cpu import Shown, linearised, solved
+
+K = np.array([[250.0, 0, 159.5], [0, 252.0, 119.5], [0, 0, 1]])
+SHARES = np.arange(3)
+
+
+def scene(seed, count=60, moved=0.3):
+    """Pixels, inverse depths and three views of them."""
+    rng = np.random.default_rng(seed)
+    pixel, rho = rng.uniform([10, 10], [310, 230], (count, 2)), rng.uniform(0.3, 1.2, count)
+    R = Rotation.from_rotvec(rng.normal(0, 0.05, (3, 3))).as_matrix()
+    t = rng.normal(0, moved, (3, 3)) * np.array([[0.2], [0.5], [1]])
+    return pixel, rho, Views(np.zeros((3, 240, 320), np.uint8), K @ R @ np.linalg.inv(K), t @ K.T, np.zeros(3))
+
+
+def lines(pixel, rho, views):
+    """Directions of the lines [N, V, 2] and speeds [N, V]."""
+    step = 1e-5
+    ends = np.array([
+        [oracle_dense.project(p, r + d, H, b) for H, b in zip(views.H, views.b, strict=True) for d in (-step, step)]
+        for p, r in zip(pixel, rho, strict=True)
+    ]).reshape(len(rho), 3, 2, 2)  # fmt: skip
+    way = (ends[:, :, 1] - ends[:, :, 0]) / (2 * step)
+    speed = np.linalg.norm(way, axis=-1)
+    return way / speed[..., None], speed
+
+
+def measured(pixel, rho, views, error, noise, rng):
+    """What a search finds where the poses and the camera are wrong by ``error`` [3, 10], with noise [px]."""
+    along, speed = lines(pixel, rho, views)
+    off = np.zeros((*speed.shape, 2))
+    for n, k in np.ndindex(speed.shape):
+        given = pixel[n], rho[n], views.H[k], views.b[k]
+        off[n, k] = oracle_dense.displaced(*given, K, error[k]) - oracle_dense.project(*given)
+    off = off + rng.normal(0, noise, off.shape)
+    normal = np.stack([-along[..., 1], along[..., 0]], -1)
+    value, same = rho[:, None] + (off * along).sum(-1) / speed, np.full(speed.shape, noise**2)
+    n = len(rho)
+    return Measured(
+        value.mean(1), np.ones(n), np.full(n, 3), np.zeros(n, np.int64), value, same, along, speed,
+        np.zeros(speed.shape), (off * normal).sum(-1), same,
+    )  # fmt: skip
+
+
+def test_derivatives_agree_with_differences():
+    pixel, rho, views = scene(0, 12)
+    along, _ = lines(pixel, rho, views)
+    slope = np.random.default_rng(1).normal(0, 0.5, along.shape[:2])
+    on_line, across = linearised(pixel, rho, along, slope, views, K)
+    for n in range(12):
+        for k in range(3):
+            J = oracle_dense.by_errors(pixel[n], rho[n], views.H[k], views.b[k], K)
+            e, p = along[n, k], np.array([-along[n, k, 1], along[n, k, 0]])
+            np.testing.assert_allclose(across[n, k], p @ J, rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(on_line[n, k], (e + slope[n, k] * p) @ J, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_and_depths_agree_with_the_whole_system(seed):
+    rng, n = np.random.default_rng(seed), 9
+    change, across_change = rng.normal(size=(2, n, 3, 10))
+    value, across = rng.normal(size=(2, n, 3))
+    variance, across_variance = rng.uniform(0.1, 2, (2, n, 3))
+    variance[rng.random((n, 3)) < 0.3] = np.inf
+    variance[:, 0] = 1
+    across_variance[rng.random((n, 3)) < 0.3] = np.inf
+    root = rng.normal(size=(22, 22))
+    given = change, value, variance, across_change, across, across_variance
+    prior = root @ root.T + np.eye(22), rng.normal(size=22)
+    solution = solved(Shown(*given), *prior)
+    error, covariance, rho, spread = oracle_dense.errors_and_depths(*given, *prior)
+    np.testing.assert_allclose(solution.error, error, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(solution.covariance, covariance, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(solution.rho, rho, rtol=1e-8, atol=1e-10)
+    assert (solution.common <= spread).all(), "the rest is by the match alone"
+
+
+def known(frames=1, seed=0, noise=0.05, **wrong):
+    """A filter after some frames with the same errors, its last result, and the truth."""
+    rng, errors = np.random.default_rng(seed), PoseErrors(3, 0.8)
+    for i in range(frames):
+        pixel, rho, views = scene([seed, i])
+        error = np.zeros((3, 10))
+        error[:, 6:] = wrong.get("camera", 0)
+        error[:, :6] = rng.normal(0, 1, (3, 6)) * np.repeat([wrong.get("turned", 0), wrong.get("moved", 0)], 3)
+        found = measured(pixel, rho, views, error, noise, rng)
+        errors.positions(K, 320, 2.0)
+        fit = errors.corrected(pixel, found, SHARES, views, K, 2.0)
+    return errors, found, fit, rho
+
+
+def test_wrong_poses_are_corrected_and_what_remains_is_stated():
+    better, normalised = [], []
+    for seed in range(8):
+        _, found, fit, rho = known(12, seed, turned=0.002, moved=0.004)
+        better.append(np.median(np.abs(fit.rho - rho)) / np.median(np.abs(found.rho - rho)))
+        normalised.append(np.median(np.abs(fit.rho - rho) / np.sqrt(fit.variance)) / 0.674)
+    assert np.median(better) < 0.6
+    assert 0.5 < np.median(normalised) < 2
+
+
+def test_exact_poses_stay_nearly_exact():
+    _, found, fit, rho = known(6)
+    assert np.median(np.abs(fit.rho - rho)) < 1.2 * np.median(np.abs(found.rho - rho))
+
+
+def test_a_wrong_camera_is_learnt():
+    errors, *_ = known(30, camera=np.array([0.004, 1.0, -0.8, 0.0]))
+    # The views' K is not corrected here: what is learnt is added up to where the prior holds it.
+    assert np.sign(errors.camera(K) - K)[[0, 0, 1], [0, 2, 2]].tolist() == [1, 1, -1]
+    assert errors.camera(K)[0, 0] > 1.002 * K[0, 0]
+
+
+def test_nothing_measured_leaves_what_is_believed_of_the_poses():
+    errors, found, *_ = known(3)
+    pixel, _, views = scene(5)
+    empty = Measured(*(np.full_like(x, np.nan) if x.dtype == float and x.ndim > 1 else np.zeros_like(x)
+                       for x in vars(found).values()))  # fmt: skip
+    before = errors.positions(K, 320, 2.0)
+    fit = errors.corrected(pixel, empty, SHARES, views, K, 2.0)
+    assert np.isinf(fit.variance).all()
+    np.testing.assert_allclose(errors.positions(K, 320, 2.0), before, rtol=1e-6)
+
+
+def test_a_saved_state_is_the_same():
+    one, *_ = known(3, turned=0.001)
+    other = PoseErrors(3, 0.8)
+    other.load_state(one.state())
+    for name, value in one.state().items():
+        np.testing.assert_array_equal(other.state()[name], value)
+
+
+def around(rho_right, rho_here):
+    """A gray step down the middle; anchors on a grid, the one in the middle on the step."""
+    image = np.full((120, 120), 60, np.uint8)
+    image[:, 61:] = 180
+    v, u = np.mgrid[5:120:10, 5:120:10]
+    pixel = np.stack([u.ravel(), v.ravel()], 1).astype(float)
+    rho = np.where(pixel[:, 0] > 60, rho_right, 1.0)
+    middle = int(np.flatnonzero((pixel == [65, 65]).all(1))[0])
+    pixel[middle], rho[middle] = (60.0, 65.0), rho_here
+    return image, pixel, rho, middle
+
+
+@pytest.mark.parametrize(("rho_here", "to"), [(2.0, 62.0), (1.0, 58.0)])
+def test_an_anchor_on_an_edge_moves_to_its_own_surface(rho_here, to):
+    image, pixel, rho, middle = around(2.0, rho_here)
+    surface, alone = beside(image, pixel, rho, np.full(len(rho), 1e-4), 10)
+    np.testing.assert_allclose(surface[middle], [to, 65], atol=1e-6)
+    assert (alone == 0).all()
+    flat = np.abs(pixel[:, 0] - 60) > 20
+    np.testing.assert_array_equal(surface[flat], pixel[flat])
+
+
+def test_an_anchor_that_stands_alone_gets_the_variance_of_the_oracle():
+    rng = np.random.default_rng(0)
+    image, pixel, rho, middle = around(1.0, 3.0)
+    rho = rho * rng.uniform(0.9, 1.1, len(rho))
+    variance = rng.uniform(1e-4, 1e-3, len(rho))
+    _, alone = beside(image, pixel, rho, variance, 10)
+    expected = [oracle_dense.alone(pixel, rho, variance, 10, n) for n in range(len(rho))]
+    np.testing.assert_allclose(alone, expected, rtol=1e-12)
+    assert alone[middle] > 0.5
+    assert (alone > 0).sum() == 1

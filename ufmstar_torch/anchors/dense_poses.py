@@ -1,0 +1,214 @@
+"""Errors of the poses and of the camera, from what all pixels of a frame show together.
+
+A keyframe's relative pose that is wrong by (w, s) moves the pixels of its whole image together, and so does a camera
+whose focal length, centre or distortion is wrong. Across the epipolar lines this shows at once; along them it shows
+where keyframes of other baselines and other pixels contradict it. To first order, with the errors d and the Jacobians
+of ``kernels.poses_cpu``,
+
+    value_k = rho + c_k d + noise,      across_k = a_k d + noise,
+
+where value_k is the inverse depth that keyframe k shows, and across_k where the patch lies across its line. The errors
+have a Gaussian prior. Their posterior, N(d, C), corrects the depths, and what no pixel shows of them remains in C:
+
+    rho = mean(value) - mean(c) d,      variance = own + mean(c) C mean(c)^T,
+
+means over the keyframes by their precisions. ``own`` is the variance by the match alone, the smallest of the
+keyframes': they share the patch. The prior follows: the variances of the poses' errors follow d^2 for each baseline, as
+far as the pixels show d, and those of the camera's errors are what earlier frames left of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ufmstar_torch.kernels.dense_cpu import Measured, Views
+from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, linearised, solved
+
+# Matches on which running estimates are based.
+_ENOUGH = 10
+# The median of the square of a standard normal variable.
+_MEDIAN_SQUARE = 0.4549
+# [px] Standard deviation of a position by errors of the poses before it is estimated, and the least one.
+_FIRST, _LEAST = 0.3, 0.003
+# [px] What errors of the poses leave of it.
+_FIRST_LEFT = 0.1
+# Correlation of the errors of two keyframes: half of each error is that of the present view.
+_SHARED = 0.5
+# Standard deviations of the camera's errors: the focal length as a share, its centre as a share of the width, and the
+# radial distortion. Frames share keyframes: each counts as a part of its information. What is learnt fades.
+_CAMERA, _PART, _FADES = (0.003, 0.003, 0.003, 0.01), 0.2, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Inverse depths of N pixels after the correction.
+
+    Attributes:
+        rho: [N] [1/m].
+        variance: [N] of it [1/m^2].
+    """
+
+    rho: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
+class PoseErrors:
+    """What is known of the errors of the poses and of the camera.
+
+    Args:
+        baselines: number of baselines that are told apart.
+        memory: share of the running estimates that remains after a frame.
+    """
+
+    def __init__(self, baselines: int, memory: float) -> None:
+        self._baselines, self._memory = baselines, memory
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._known = False
+        self._variance = np.zeros((self._baselines, 2))  # of w and s [rad^2, m^2]
+        self._left = np.full(self._baselines, _FIRST_LEFT**2)  # [px^2]
+        self._disagreement = 1.0
+        self._camera, self._covariance = np.zeros(CAMERA), np.eye(CAMERA)
+
+    def state(self) -> dict[str, Tensor]:
+        """A copy of all that is known, for :meth:`load_state`."""
+        held = {name: torch.tensor(getattr(self, attribute)) for name, attribute in _HELD.items()}
+        numbers = torch.tensor([self._known, self._disagreement], dtype=torch.float64)
+        return held | {"pose_numbers": numbers}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Go on where :meth:`state` was taken."""
+        for name, attribute in _HELD.items():
+            setattr(self, attribute, np.array(state[name].numpy()))
+        known, self._disagreement = state["pose_numbers"].tolist()
+        self._known = bool(known)
+
+    def positions(self, K: NDArray[np.float64], width: int, depth: float) -> NDArray[np.float64]:
+        """[baselines] variance of a position in a keyframe by all errors [px^2], at a depth [m], in an image ``width``
+        wide."""
+        f = K[0, 0]
+        if not self._known:
+            self._variance[:] = _FIRST**2 / 2 / f**2 * np.array([1, depth**2])
+            self._covariance = self._prior(width)
+            self._known = True
+        return self._left + f**2 * (self._variance @ [1, 1 / depth**2])
+
+    def camera(self, K: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[3, 3] the intrinsics K [3, 3] with what is known of their errors [px]."""
+        focal, u, v, _ = self._camera
+        return np.array([[K[0, 0] * (1 + focal), 0, K[0, 2] + u], [0, K[1, 1] * (1 + focal), K[1, 2] + v], [0, 0, 1]])
+
+    def corrected(
+        self,
+        pixel: NDArray[np.float64],
+        measured: Measured,
+        shares: NDArray[np.int64],
+        views: Views,
+        K: NDArray[np.float64],
+        depth: float,
+    ) -> Fit:
+        """Depths without the errors that the pixels show together. What is known of the errors follows.
+
+        Args:
+            pixel: [N, 2] (u, v).
+            measured: N pixels in V views.
+            shares: [V] to which baseline each view belongs.
+            views: V keyframes.
+            K: [3, 3] of :meth:`camera` [px], which the views have.
+            depth: median of the scene [m].
+        """
+        used = (measured.agreed >= 2)[:, None] & np.isfinite(measured.value)
+        shows = used & np.isfinite(measured.across)
+        speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
+        along = np.where(used[..., None], measured.along, 0.0)
+        on_line, across_change = linearised(pixel, measured.rho, along, slope, views, K)
+        left = self._left[shares]
+        own = np.where(used, (measured.noise + left * (1 + slope**2)) / speed**2, np.inf)
+        shown = Shown(
+            on_line / speed[..., None],
+            np.where(used, measured.value - measured.rho[:, None], 0.0),
+            own,
+            across_change,
+            np.where(shows, measured.across, 0.0),
+            np.where(shows, measured.across_noise + left, np.inf),
+        )
+        solution = solved(shown, *self._before(shares))
+        self._learn(solution.error, solution.covariance, shares, K, views.image.shape[2], depth)
+        self._learn_noise(solution.residual[used], solution.beside, measured.across_noise, shows, shares)
+        factor = max(self._disagreement, (1 + self._disagreement) / 2)  # half is the patch's, which all views share
+        variance = factor * own.min(1, initial=np.inf) + solution.common
+        return Fit(measured.rho + solution.rho, variance)
+
+    def _before(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Precision [S, S] and mean [S] of the errors of some keyframes and of the camera, S = 6 V + 4."""
+        sigma = np.sqrt(np.repeat(self._variance[shares], 3, axis=1))
+        alike = np.where(np.eye(len(shares)), 1.0, _SHARED)
+        poses = np.einsum("kl,kc,lc,cd->kcld", alike, sigma, sigma, np.eye(POSE))
+        n = POSE * len(shares)
+        precision = np.zeros((n + CAMERA, n + CAMERA))
+        precision[:n, :n] = np.linalg.inv(poses.reshape(n, n))
+        precision[n:, n:] = np.linalg.inv(self._covariance)
+        return precision, np.concatenate([np.zeros(n + 3), self._camera[3:]])  # K has the first three
+
+    def _learn(
+        self,
+        error: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        shares: NDArray[np.int64],
+        K: NDArray[np.float64],
+        width: int,
+        depth: float,
+    ) -> None:
+        remains = covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
+        square = np.square(error[:-CAMERA]).reshape(-1, 2, 3).sum(2)
+        least = np.square(_LEAST / K[0, 0]) * np.array([1, depth**2])
+        for share, left, each in zip(shares, remains, square, strict=True):
+            before = self._variance[share]
+            shown = 3 - left / before  # of the three numbers, what the pixels showed
+            step = (1 - self._memory) * (each - shown * before) / np.maximum(shown, 1)
+            self._variance[share] = np.maximum(before + step, least)
+        before, first = np.linalg.inv(self._covariance), np.linalg.inv(self._prior(width))
+        now = np.linalg.inv(covariance[-CAMERA:, -CAMERA:])
+        measured = error[-CAMERA:] + np.append(self._camera[:3], 0)
+        weighted = (1 - _PART) * before @ self._camera + _PART * now @ measured
+        self._covariance = np.linalg.inv((1 - _FADES) * ((1 - _PART) * before + _PART * now) + _FADES * first)
+        self._camera = self._covariance @ weighted * (1 - _FADES)
+
+    def _learn_noise(
+        self,
+        residual: NDArray[np.float64],
+        beside: NDArray[np.float64],
+        noise: NDArray[np.float64],
+        shows: NDArray[np.bool_],
+        shares: NDArray[np.int64],
+    ) -> None:
+        for column, share in enumerate(shares):
+            shown = shows[:, column]
+            if shown.sum() >= _ENOUGH:
+                left = np.median(beside[shown, column]) / _MEDIAN_SQUARE - np.median(noise[shown, column])
+                self._left[share] = self._faded(self._left[share], max(left, 0.0))
+        if len(residual) >= _ENOUGH:
+            self._disagreement = self._faded(self._disagreement, np.median(residual) / _MEDIAN_SQUARE)
+
+    def _prior(self, width: int) -> NDArray[np.float64]:
+        """[4, 4] covariance of the camera's errors before the first frame."""
+        return np.diag(np.square(np.array(_CAMERA) * [1, width, width, 1]))
+
+    def _faded(self, before: float, now: float) -> float:
+        return self._memory * before + (1 - self._memory) * float(now)
+
+
+_HELD = {
+    "pose_variance": "_variance",
+    "pose_left": "_left",
+    "camera_error": "_camera",
+    "camera_covariance": "_covariance",
+}

@@ -1,0 +1,102 @@
+"""What the anchors around an anchor say of it: on which side of an edge its surface is, and whether it stands alone.
+
+A pixel of large gradient lies on an edge of a thing. The patch is matched as a whole, but the pixel shows one surface
+or the other. Of the anchors around it, some have its depth: on their side of the edge is its surface.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.dense_cpu import compiled
+
+# Two anchors are alike within so many standard deviations of their difference, or this share of the inverse depth.
+_SIGMAS, _SHARE = 3.0, 0.05
+# An anchor with _SOME others around it, of which fewer than _FEW are alike, stands alone. On tours, _WRONG of those
+# have another depth: their squared error is that share of the squared difference from those around them.
+_SOME, _FEW, _WRONG = 4, 2, 0.25
+# A side is that of the surface where the mean directions of those alike and of the others differ by this much along the
+# gradient (2 = opposite); the pixel then moves to it by so many pixels.
+_APART, _INTO = 0.5, 2.0
+# Half width of the window of the gradient [px]; cells around an anchor's own that are asked.
+_HALF, _CELLS = 2, 2
+
+
+def beside(
+    image: NDArray[np.uint8],
+    pixel: NDArray[np.float64],
+    rho: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    cell: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where the surface of each anchor is, and how far it may be off.
+
+    Args:
+        image: [H, W] uint8.
+        pixel: [N, 2] (u, v), 3 px from the border or more.
+        rho: [N] [1/m].
+        variance: [N] of it [1/m^2].
+        cell: side of a cell [px]; of two anchors in a cell, the second one counts for others.
+
+    Returns:
+        [N, 2] pixels on the surface, and [N] the variance of ``rho`` to add [1/m^2]: 0 where it does not stand alone.
+    """
+    shape = (image.shape[0] // cell + 1, image.shape[1] // cell + 1)
+    moved, alone, lies_in = pixel.copy(), np.zeros(len(pixel)), np.full(shape, -1, np.int64)
+    _beside(image, pixel, rho, variance, cell, lies_in, moved, alone)
+    return moved, alone
+
+
+@compiled
+def _beside(image, pixel, rho, variance, cell, lies_in, moved, alone):
+    for n in range(len(pixel)):
+        lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
+    for n in range(len(pixel)):
+        u, v = pixel[n, 0], pixel[n, 1]
+        alike, other = np.zeros(2), np.zeros(2)
+        count_alike = count_other = 0
+        square = 0.0
+        row, column = int(v) // cell, int(u) // cell
+        for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, lies_in.shape[0])):
+            for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, lies_in.shape[1])):
+                m = lies_in[j, i]
+                if m < 0 or m == n:
+                    continue
+                du, dv, difference = pixel[m, 0] - u, pixel[m, 1] - v, (rho[m] - rho[n]) ** 2
+                over = 1 / max(np.sqrt(du * du + dv * dv), 1.0)
+                if difference < max(_SIGMAS**2 * (variance[n] + variance[m]), (_SHARE * rho[n]) ** 2):
+                    count_alike += 1
+                    alike[0] += du * over
+                    alike[1] += dv * over
+                else:
+                    count_other += 1
+                    other[0] += du * over
+                    other[1] += dv * over
+                    square += difference
+        if count_alike + count_other >= _SOME and count_alike < _FEW:
+            alone[n] = _WRONG * square / count_other
+        if count_alike == 0 or count_other == 0:
+            continue
+        eu, ev = _gradient(image, int(u + 0.5), int(v + 0.5))
+        apart = (alike[0] * eu + alike[1] * ev) / count_alike - (other[0] * eu + other[1] * ev) / count_other
+        if abs(apart) >= _APART:
+            moved[n, 0] += np.sign(apart) * _INTO * eu
+            moved[n, 1] += np.sign(apart) * _INTO * ev
+
+
+@compiled
+def _gradient(image, u, v):
+    """Direction of the gradient around a pixel, of either sign: the structure tensor's main axis. 0 without one."""
+    uu = uv = vv = 0.0
+    for j in range(v - _HALF, v + _HALF + 1):
+        for i in range(u - _HALF, u + _HALF + 1):
+            du = np.float64(image[j, i + 1]) - np.float64(image[j, i - 1])
+            dv = np.float64(image[j + 1, i]) - np.float64(image[j - 1, i])
+            uu += du * du
+            uv += du * dv
+            vv += dv * dv
+    if uu + vv == 0:
+        return 0.0, 0.0
+    angle = 0.5 * np.arctan2(2 * uv, uu - vv)
+    return np.cos(angle), np.sin(angle)

@@ -1,0 +1,241 @@
+"""Errors of the keyframes' poses and of the camera by least squares, for ``anchors.dense_poses``.
+
+On the CPU (numba). A point of the image, the ray n = K^-1 x, lies in a keyframe at q = R n + rho t, up to scale. With
+the errors (w, s) of the keyframe's pose and (f, cx, cy, k) of the camera it moves in the keyframe: q becomes
+q + w x q + rho s; f is a share of the focal length, cx and cy are pixels, and k is the coefficient of a radial
+distortion, x (1 + k r^2). ``tests/oracle_dense.py`` has the same by differences, and the equations with the depths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.dense_cpu import Views, compiled
+
+# Rounds of Student-t weights, and their degrees of freedom.
+ROUNDS, STUDENT = 3, 4.0
+
+# Numbers of a pose and of the camera.
+POSE, CAMERA = 6, 4
+EACH = POSE + CAMERA
+
+
+def linearised(
+    pixel: NDArray[np.float64],
+    rho: NDArray[np.float64],
+    along: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    views: Views,
+    K: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How the errors move the matches.
+
+    Args:
+        pixel: [N, 2] (u, v).
+        rho: [N] [1/m].
+        along: [N, V, 2] unit direction of the line in the view.
+        slope: [N, V] by how much an error across the line moves the match along it.
+        views: V of them.
+        K: [3, 3] [px].
+
+    Returns:
+        [N, V, 10] by the errors of the pose (rad, m) and of the camera (1, px, px, 1): of the position that a search
+        along the line returns [px], and of the position across the line [px].
+    """
+    shape = (*slope.shape, EACH)
+    on_line, across = np.zeros(shape), np.zeros(shape)
+    _linearised(pixel, rho, along, slope, views.H, views.b, K, np.linalg.inv(K), on_line, across)
+    return on_line, across
+
+
+@compiled
+def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
+    fx, fy = K[0, 0], K[1, 1]
+    moved = np.empty((2, EACH))
+    for k in range(len(H)):
+        R, t = K_inverse @ H[k] @ K, K_inverse @ b[k]
+        for n in range(len(pixel)):
+            x, y = (pixel[n, 0] - K[0, 2]) / fx, (pixel[n, 1] - K[1, 2]) / fy
+            z = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho[n] * t[2]
+            over = 1 / z
+            p = (R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho[n] * t[0]) * over
+            q = (R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho[n] * t[1]) * over
+            moved[0, 0], moved[0, 1], moved[0, 2] = -p * q * fx, (1 + p * p) * fx, -q * fx
+            moved[1, 0], moved[1, 1], moved[1, 2] = -(1 + q * q) * fy, p * q * fy, p * fy
+            per = rho[n] * over
+            moved[0, 3], moved[0, 4], moved[0, 5] = per * fx, 0.0, -p * per * fx
+            moved[1, 3], moved[1, 4], moved[1, 5] = 0.0, per * fy, -q * per * fy
+            # In the view, of the ray's x and y.
+            ux, uy = (R[0, 0] - p * R[2, 0]) * over * fx, (R[0, 1] - p * R[2, 1]) * over * fx
+            vx, vy = (R[1, 0] - q * R[2, 0]) * over * fy, (R[1, 1] - q * R[2, 1]) * over * fy
+            here, there = x * x + y * y, p * p + q * q
+            moved[0, 6], moved[1, 6] = p * fx - x * ux - y * uy, q * fy - x * vx - y * vy
+            moved[0, 7], moved[1, 7] = 1 - ux / fx, -vx / fx
+            moved[0, 8], moved[1, 8] = -uy / fy, 1 - vy / fy
+            moved[0, 9] = there * p * fx - here * (x * ux + y * uy)
+            moved[1, 9] = there * q * fy - here * (x * vx + y * vy)
+            eu, ev = along[n, k, 0], along[n, k, 1]
+            for c in range(EACH):
+                across[n, k, c] = eu * moved[1, c] - ev * moved[0, c]
+                on_line[n, k, c] = eu * moved[0, c] + ev * moved[1, c] + slope[n, k] * across[n, k, c]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What V views show of N pixels.
+
+    Attributes:
+        change: [N, V, 10] of ``value``, by the errors.
+        value: [N, V] inverse depth, from any origin of each pixel [1/m].
+        variance: [N, V] of it [1/m^2]; infinite where a view shows nothing.
+        across_change, across, across_variance: the same of the position across the line [px].
+    """
+
+    change: NDArray[np.float64]
+    value: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    across_change: NDArray[np.float64]
+    across: NDArray[np.float64]
+    across_variance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Errors and depths.
+
+    Attributes:
+        error: [6 V + 4] of the poses, one after the other, and of the camera.
+        covariance: [6 V + 4, 6 V + 4] of them.
+        rho: [N] inverse depth from its origin [1/m]; 0 where nothing is shown.
+        common: [N] variance of ``rho`` by the errors that remain [1/m^2].
+        residual: [N, V] square of what is left of ``value``, over its variance.
+        beside: [N, V] square of what is left of ``across`` [px^2].
+    """
+
+    error: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    common: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    beside: NDArray[np.float64]
+
+
+def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float64]) -> Solution:
+    """The most likely errors given a prior of mean ``start`` [6 V + 4] and precision [6 V + 4, 6 V + 4], the depths
+    eliminated, by ``ROUNDS`` rounds of Student-t weights."""
+    n, v = shown.value.shape
+    size = len(start)
+    error, covariance, mean_change = np.zeros(size), np.zeros((size, size)), np.zeros((n, size))
+    rho, common, residual, beside = np.zeros(n), np.zeros(n), np.zeros((n, v)), np.zeros((n, v))
+    _solved(
+        *(shown.change, shown.value, 1 / shown.variance),
+        *(shown.across_change, shown.across, 1 / shown.across_variance),
+        *(precision, precision @ start, error, covariance, mean_change, rho, common, residual, beside),
+    )
+    return Solution(error, covariance, rho, common, residual, beside)
+
+
+@compiled
+def _solved(
+    change, value, weight, across_change, across, across_weight,
+    precision, right, error, covariance, mean_change, rho, common, residual, beside,
+):  # fmt: skip
+    count, views, _ = change.shape
+    mean, size = np.zeros(count), len(right)
+    for turn in range(ROUNDS):
+        A, r = precision.copy(), right.copy()
+        student = 0.0 if turn == 0 else STUDENT
+        _equations(
+            *(change, value, weight, residual, across_change, across, across_weight, beside, student),
+            *(A, r, mean_change, mean),
+        )
+        _inverse(A, covariance)
+        error[:] = covariance @ r
+        for n in range(count):
+            rho[n] = mean[n]
+            for c in range(size):
+                rho[n] -= mean_change[n, c] * error[c]
+            for k in range(views):
+                left, left_across = value[n, k] - rho[n], across[n, k]
+                for c in range(EACH):
+                    by = error[POSE * k + c if c < POSE else POSE * (views - 1) + c]
+                    left -= change[n, k, c] * by
+                    left_across -= across_change[n, k, c] * by
+                residual[n, k], beside[n, k] = left * left * weight[n, k], left_across * left_across
+    for n in range(count):
+        for c in range(size):
+            total = 0.0
+            for d in range(size):
+                total += covariance[c, d] * mean_change[n, d]
+            common[n] += mean_change[n, c] * total
+
+
+@compiled
+def _equations(
+    change, value, weight, residual, across_change, across, across_weight, beside, student, A, r, mean_change, mean
+):
+    """Add the pixels to the normal equations A d = r; the means over the views, by their precisions, are written.
+    ``student`` = 0: each counts in full."""
+    count, views, _ = change.shape
+    size = POSE * views + CAMERA
+    place = np.empty(EACH, np.int64)
+    for n in range(count):
+        total = weighted = 0.0
+        row = mean_change[n]
+        row[:] = 0
+        for k in range(views):
+            w, a = weight[n, k], across_weight[n, k]
+            if w == 0 and a == 0:
+                continue
+            if student > 0:
+                w *= (student + 1) / (student + residual[n, k])
+                a *= (student + 1) / (student + beside[n, k] * a)
+            for c in range(EACH):
+                place[c] = POSE * k + c if c < POSE else POSE * (views - 1) + c
+            total += w
+            weighted += w * value[n, k]
+            for c in range(EACH):
+                by, by_across = w * change[n, k, c], a * across_change[n, k, c]
+                row[place[c]] += by
+                r[place[c]] += by * value[n, k] + by_across * across[n, k]
+                for d in range(c + 1):
+                    A[place[c], place[d]] += by * change[n, k, d] + by_across * across_change[n, k, d]
+        if total == 0:
+            continue
+        mean[n] = weighted / total
+        for c in range(size):
+            r[c] -= row[c] * mean[n]
+            by = row[c] / total
+            for d in range(c + 1):
+                A[c, d] -= by * row[d]
+        for c in range(size):
+            row[c] /= total
+
+
+@compiled
+def _inverse(A, inverse):
+    """Of a symmetric positive definite matrix, whose lower triangle is given and changed, by L L^T."""
+    size = len(A)
+    for j in range(size):
+        for i in range(j, size):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
+    lower = np.zeros((size, size))  # L^-1
+    for j in range(size):
+        lower[j, j] = 1 / A[j, j]
+        for i in range(j + 1, size):
+            total = 0.0
+            for k in range(j, i):
+                total += A[i, k] * lower[k, j]
+            lower[i, j] = -total / A[i, i]
+    for i in range(size):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, size):
+                total += lower[k, i] * lower[k, j]
+            inverse[i, j] = inverse[j, i] = total

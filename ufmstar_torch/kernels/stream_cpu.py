@@ -1,0 +1,69 @@
+"""The stages of a step between segmentation and regression, of one stream, as one compiled call each (numba)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.kernels.correspond_cpu import matches
+from ufmstar_torch.kernels.fuse_cpu import append, fuse_pairs
+from ufmstar_torch.kernels.rigid_cpu import move, relative
+
+
+@kernel
+def match(
+    first, present, mean, covariance, weight, mean_c, cov_c, weight_c, K, size, thresholds, mean_cam, covariance_cam
+):
+    """Step 3: M_(i-1) [K] into the camera frame, written to ``mean_cam`` and ``covariance_cam``, and its pairs with
+    C_i [C].
+
+    Args:
+        first, present: [4, 4] camera-to-world of the stream's first camera and of this one.
+        size: H, W.
+        thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
+
+    Returns:
+        The pairs c [P], k [P] and their overlap [P]; which segments are matched [C], and which are new [C]; the number
+        of new ones and that of the mixture's components.
+    """
+    move(relative(first, present), mean, covariance, weight, 0, np.empty(0, np.bool_), mean_cam, covariance_cam)
+    pi, occupied = np.empty(weight.size), 0
+    for k in range(weight.size):
+        pi[k] = weight[k]
+        occupied += weight[k] > 0
+    c, k, overlap = matches(mean_cam, covariance_cam, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
+    matched, new, created = np.zeros(weight_c.size, np.bool_), np.empty(weight_c.size, np.bool_), 0
+    for i in range(c.size):
+        matched[c[i]] = True
+    for i in range(new.size):
+        # What is nearer than the near plane could never be matched again: it is not remembered.
+        new[i] = weight_c[i] > 0 and mean_c[i, 2] > thresholds[2] and not matched[i]
+        created += new[i]
+    return c, k, overlap, matched, new, created, occupied
+
+
+@kernel
+def join(first, present, slots, segments, pairs, distance, new, occupied, weighted, epsilon, mean_cam, covariance_cam):
+    """Step 4 in place: fuse the pairs, append what is new, and bring into the camera frame what has changed.
+
+    Args:
+        first, present, mean_cam, covariance_cam: as :func:`match`.
+        slots: mean, covariance, weight, disagreement, count and features [K, ...] of the mixture.
+        segments: mean, covariance, weight and features [C, ...] of C_i.
+        pairs: c, k and overlap [P].
+        distance, weighted, epsilon: as :func:`fuse_pairs`.
+        new: [C] which segments to append, from slot ``occupied`` on.
+
+    Returns:
+        How many segments found no free slot.
+    """
+    mean_c, cov_c, weight_c, features_c = segments
+    moved, turned = np.zeros(mean_c.shape), np.zeros(cov_c.shape)
+    move(relative(present, first), mean_c, cov_c, weight_c, 0, np.empty(0, np.bool_), moved, turned)
+    changed = np.zeros(slots[2].size, np.bool_)
+    given = (moved, turned, weight_c, features_c)
+    fuse_pairs(*slots, *given, *pairs, distance, weighted, epsilon, changed)
+    dropped = append(*slots, *given, new, occupied)
+    mean, covariance, weight = slots[:3]
+    move(relative(first, present), mean, covariance, weight, occupied, changed, mean_cam, covariance_cam)
+    return dropped
