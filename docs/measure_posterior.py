@@ -157,8 +157,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=None, help="constants that are changed; default: all")
     arguments = parser.parse_args()
     every = list(recordings(arguments))
-    line("changed", *(f"{evidence}: {name}" for evidence in ("all", NEAR) for name in SHOWN))
-    line(*["---"] * (1 + 2 * len(SHOWN)))
+    if every:
+        line("changed", *(f"{evidence}: {name}" for evidence in ("all", NEAR) for name in SHOWN))
+        line(*["---"] * (1 + 2 * len(SHOWN)))
     for change in CHANGES if every else ():
         if change and arguments.only is not None and not set(change) & set(arguments.only):
             continue
@@ -166,6 +167,9 @@ def main() -> None:
         columns = ([row for of_kind in rows.values() for row in of_kind], rows[NEAR])
         means = (np.mean([row[name] for row in of]) for of in columns for name in SHOWN)
         line(", ".join(f"{k} {v}" for k, v in change.items()) or "as it is", *map(shown, means))
+    if arguments.clips:
+        line("sequence", "evidence", *SHOWN, "constant")
+        line(*["---"] * (3 + len(SHOWN)))
     for source in arguments.clips:
         taken = record(source, load_network("fastdepth", arguments.weights).eval(), (DENSE, CORNERS))
         for kind in (DENSE, CORNERS):

@@ -21,7 +21,7 @@ def test_the_floor_counts_maps_once_and_the_state_twice():
     depth, pose, K, _ = next(walks(2))
     ufm = UfMStar(UfMStarConfig(segment=SPGF, initial_capacity=8, max_components=8))
     out = ufm(depth.float(), pose, K)
-    maps = depth.numel() * (4 * 4 + 8)  # depth, V, M and s in float32, labels
+    maps = depth.numel() * 4 * 4  # depth, V, M and s in float32
     mixture = 2 * 8 * (4 * (3 + 9 + 1 + 1) + 8)
     rest = 2 * 16 * 8 + 2 * (1 + 8 + 8) + depth.numel() * 4 + 2 * 3 * 4  # pose, counters, moving average, evidence
     assert touched_bytes(depth.float(), out, ufm) == maps + 2 * (mixture + rest)

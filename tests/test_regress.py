@@ -7,8 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_gaussians import mixture
-from test_correspond import as_lists
+from random_gaussians import as_lists, mixture
 
 import oracle
 import scenes
@@ -257,6 +256,22 @@ def test_sample_is_seeded_uniform_and_valid():
     # Binomial(400, 0.2) per valid pixel: mean 80, sigma 8.
     assert (counts[:50] - 80).abs().max() < 5 * 8
     assert counts[50:].sum() == 0
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 5e-5)])
+def test_some_pixels_read_what_the_dense_map_reads(dtype, tolerance):
+    m, depth = crowded(7)
+    depth, valid = depth.to(dtype), depth > 0
+    valid[0, 20:24] = False
+    everywhere = regress_cpu.regress_image(m, depth, K, valid, EXACT)
+    for count in (1, 63, 700):  # a pixel, less than a tile, several in each of the image's blocks
+        order = torch.randperm(depth[0].numel(), generator=torch.Generator().manual_seed(count))[None, :count]
+        some = regress_cpu.regress_image(m, depth, K, valid, EXACT, order)
+        dense = everywhere.disagreement.flatten(1).gather(1, order)
+        torch.testing.assert_close(some.disagreement, dense, rtol=0, atol=tolerance, equal_nan=True)
+        features = everywhere.features.flatten(1, 2)[:, order[0]]
+        torch.testing.assert_close(some.features, features, rtol=0, atol=tolerance, equal_nan=True)
+    assert dense.isnan().any()
 
 
 def test_a_far_outlier_in_a_tile_spoils_no_neighbour():

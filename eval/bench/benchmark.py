@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.bench.timing import pinned_threads
+from ufmstar_torch.eval.bench.timing import most_threads, pinned_threads
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.bench.frames import FrameSource
@@ -125,7 +125,7 @@ def run_benchmark(options: BenchSettings, progress: Callable[[str], object] = la
         raise FileNotFoundError(f"--against {options.against} does not exist")
     report: dict[str, Any] = {**dict.fromkeys(_PARTS), "growth": [], "results": []}
     load = {"before": machine.load_average()}
-    threads = machine.available_cores() if options.threads is None else options.threads
+    threads = most_threads() if options.threads is None else options.threads
     report |= {
         "schema": 1,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -170,7 +170,7 @@ def _on_cpu(
             parts["peer"] = measure_peer(options.peer, source.frames(options.sizes[0], options.frames))
         if options.long is not None:
             parts["growth"] = _growth(options, config, source, progress)
-            parts["long_run"] = parts["growth"][0]
+            parts["long_run"] = next((run for run in parts["growth"] if run["world"] == "room"), None)
         if options.anchors is not None:
             parts["anchors"] = _anchors(options, config, source, progress)
     return parts

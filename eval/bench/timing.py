@@ -19,6 +19,7 @@ import torch
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synchronize
+from ufmstar_torch.eval.results.machine import available_cores
 
 F = TypeVar("F")
 
@@ -59,6 +60,12 @@ def pinned_threads(count: int, *, opencv: bool = False) -> Iterator[None]:
         for _, write in libraries:
             write(count)
         yield
+
+
+def most_threads() -> int:
+    """The cores of this process, or fewer where numba may start fewer threads (``NUMBA_NUM_THREADS``)."""
+    cores = available_cores()
+    return cores if find_spec("numba") is None else min(cores, import_module("numba").config.NUMBA_NUM_THREADS)
 
 
 class TimedCalls:

@@ -26,11 +26,11 @@ def check_values(
     fault, deviation = np.empty(b, np.int64), np.empty(b)
     given = (value.cpu().contiguous().numpy() for value in (pose, intrinsics))
     _cameras(*given, height, width, rotation_tolerance, FARTHEST, FOCAL_RANGE, POLAR_STEPS, T, K, fault, deviation)
-    depth = maps.depth.contiguous().numpy()
-    none = np.empty((b, 0, *depth.shape[1:]), depth.dtype)
-    mask = np.empty((b, 0, 0), np.bool_) if maps.mask is None else maps.mask.contiguous().numpy()
+    depth = maps.depth.contiguous().view(b, -1).numpy()
+    none = np.empty((b, 0, depth.shape[1]), depth.dtype)
+    mask = np.empty((b, 0), np.bool_) if maps.mask is None else maps.mask.contiguous().view(b, -1).numpy()
     A, E, features = (
-        none if value is None else value.detach().contiguous().view(b, -1, height, width).numpy()
+        none if value is None else value.detach().contiguous().view(b, -1, depth.shape[1]).numpy()
         for value in (maps.aleatoric, maps.epistemic, maps.features)
     )
     safe, use, counts = np.empty_like(depth), np.empty(depth.shape, np.bool_), np.empty((2, b), np.int64)
@@ -40,7 +40,9 @@ def check_values(
         counts[:, s] = _maps(depth[s], mask[s], A[s], E[s], features[s], fault[s] == 0, limits, safe[s], use[s])
 
     each(stream, [(s,) for s in range(b)])
-    tensors = map(torch.from_numpy, (safe, T, K, use, fault, deviation, counts[0], counts[1]))
+    shape = maps.depth.shape
+    maps_out = (safe.reshape(shape), T, K, use.reshape(shape))
+    tensors = map(torch.from_numpy, (*maps_out, fault, deviation, counts[0], counts[1]))
     safe_depth, T_safe, K_safe, valid, codes, deviations, beyond, out_of_range = tensors
     return FrameInput(
         safe_depth, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, valid, codes, deviations, beyond,
@@ -50,33 +52,35 @@ def check_values(
 
 @kernel
 def _maps(depth, mask, aleatoric, epistemic, features, fine, limits, safe, use):
-    """One stream: depth where valid and else 0, which pixels are valid, and how many are beyond or out of range."""
-    beyond = out_of_range = 0
+    """One stream [N]: depth where valid and else 0, which pixels are valid, and how many are beyond or out of range.
+
+    Few conditions a loop, which the compiler turns into vector instructions.
+    """
     farthest, low, high, largest = limits
-    for v in range(depth.shape[0]):
-        masked, n_beyond, n_out = mask.shape[0] > 0, 0, 0
-        for u in range(depth.shape[1]):
-            d = depth[v, u]
-            given = (d > 0) & (d < np.inf) & fine
-            if masked:
-                given = given & mask[v, u]
-            far = given & (d > farthest)
-            near = given & (d <= farthest)
-            ok = near & (d >= low) & (d <= high)
-            use[v, u] = ok
-            safe[v, u] = d if ok else depth.dtype.type(0)
-            n_beyond += far
-            n_out += near & (not ok)
-        for maps, least in ((aleatoric, depth.dtype.type(0)), (epistemic, depth.dtype.type(0)), (features, -largest)):
-            for f in range(maps.shape[0]):
-                for u in range(depth.shape[1]):
-                    ok = (maps[f, v, u] >= least) & (maps[f, v, u] <= largest)
-                    n_out += use[v, u] & (not ok)
-                    use[v, u] = use[v, u] & ok
-                    safe[v, u] = safe[v, u] if ok else depth.dtype.type(0)
-        beyond += n_beyond
-        out_of_range += n_out
-    return beyond, out_of_range
+    most, zero = min(farthest, high), depth.dtype.type(0)
+    for i in range(depth.size):
+        use[i] = (depth[i] >= low) & (depth[i] <= most) & fine
+    for i in range(mask.size):
+        use[i] = use[i] & mask[i]
+    for maps, least in ((aleatoric, zero), (epistemic, zero), (features, -largest)):
+        for f in range(maps.shape[0]):
+            for i in range(depth.size):
+                use[i] = use[i] & (maps[f, i] >= least) & (maps[f, i] <= largest)
+    kept = 0
+    for i in range(depth.size):
+        safe[i] = depth[i] if use[i] else zero
+        kept += use[i]
+    beyond = near = 0
+    if fine and kept < depth.size:
+        for i in range(depth.size):
+            d = depth[i]
+            given = (d > 0) & (d < np.inf)
+            if mask.size > 0:
+                given = given & mask[i]
+            beyond += given & (d > farthest)
+            near += given & (d <= farthest)
+        near -= kept
+    return beyond, near
 
 
 @kernel

@@ -27,27 +27,17 @@ A subset of the pixels takes the same way: a block's share of them, up to 64 at 
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 from numba import types
-from numba.extending import overload, register_jitable
+from numba.extending import overload
 
 from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf, part
-from ufmstar_torch.kernels.regress_points_cpu import prepare
-
-# Of finite numbers, so that least and greatest can be found several at a time.
-finite: Any = register_jitable(error_model="numpy", _nrt=False, fastmath={"nnan", "nsz"})
+from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull, pad
 
 _TILE = 8  # pixels
 _PIXELS = _TILE * _TILE
 _SIDE = 4  # tiles of a block
 _TILES = _SIDE * _SIDE
-_PRIOR = 1e-3  # share of the prior in a threshold
-_FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
-_TERMS = 9  # of a component, whatever the tile: whitening (6), log2 of the peak, m, last feature
-_LOG2_E = math.log2(math.e)
 # Rows of a tile's buffer, each of 64 numbers.
 _X, _Y, _Z, _EVIDENCE, _TOTAL, _LAST, _FIRST, _SECOND = (i * _PIXELS for i in range(8))
 
@@ -83,26 +73,6 @@ def _exp2_overload(t):
 
 
 @kernel
-def in_view(mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero):
-    """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
-
-    Returns:
-        Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n], the terms of the sum
-        [n, 9], and the settings (prior weight and mean, epsilon, log2 of the least threshold).
-    """
-    index, whitening, log_peak = prepare(mean, covariance, weight)
-    least = math.log2(_PRIOR * prior_weight)
-    limit = _limit(epsilon, index.size) + least
-    fields, constants = np.empty((index.size, _FIELDS)), np.empty((index.size, _TERMS), np.array(zero).dtype)
-    n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
-    packed = np.empty((_FIELDS, n), constants.dtype)
-    for i in range(_FIELDS):
-        for k in range(n):
-            packed[i, k] = fields[k, i]
-    return index[:n], fields, packed, constants, (prior_weight, prior_mean, epsilon, least)
-
-
-@kernel
 def exact(depth, K, view, features, out, out_f, first, shares):
     """One stream; of its blocks every ``shares``-th, from ``first`` on.
 
@@ -134,22 +104,22 @@ def exact_at(depth, K, pixels, view, features, out, out_f):
 @part
 def _scratch(packed, out_f):
     """Memory for the work on one block, of components ``packed`` [10, n]: the points [16, 192] of its tiles, their
-    boxes and origins [16, 9], depths, work on them, whether a tile has a pixel; buffer and sums of features;
+    boxes and origins [16, 9], depths, work on them, holes, whether a tile has a pixel; buffer and sums of features;
     fields, bounds and two lists of components."""
-    n, dtype = packed.shape[1], packed.dtype
+    n, dtype = packed.shape[1], packed.dtype  # padded
     return (
-        np.empty((_TILES, 3 * _PIXELS), dtype), np.empty((_TILES, 9)), np.empty(_PIXELS), np.empty((6, _PIXELS)),
-        np.empty(_TILES, np.bool_),
+        np.empty((_TILES, 3 * _PIXELS), dtype), np.empty((_TILES, 9)), np.empty(_PIXELS), np.empty((5, _PIXELS)),
+        np.empty((_TILES, _PIXELS), dtype), np.empty(_TILES, np.bool_),
         np.empty(8 * _PIXELS, dtype), np.empty((out_f.shape[0], _PIXELS), dtype),
-        np.empty((_FIELDS, n), dtype), np.empty((2, n), dtype), np.empty(n, np.int64), np.empty(n, np.int64),
+        np.empty((FIELDS, n), dtype), np.empty((2, n), dtype), np.empty(n, np.int64), np.empty(n, np.int64),
     )  # fmt: skip
 
 
 @leaf
 def _blocks(depth, across, down, view, features, scratch, out, out_f, first, shares):
     """The blocks of an image, of which every ``shares``-th is done, from ``first`` on."""
-    points, boxes, z, work, seen, buffer, sums, near, bounds, in_block, in_tile = scratch
-    _, _, everyone, _, settings = view
+    points, boxes, z, work, hole, seen, buffer, sums, near, bounds, in_block, in_tile = scratch
+    index, _, everyone, _, settings = view
     side = _TILE * _SIDE
     rows, columns = (depth.shape[0] + side - 1) // side, (depth.shape[1] + side - 1) // side
     for block in range(first, rows * columns, shares):
@@ -157,7 +127,7 @@ def _blocks(depth, across, down, view, features, scratch, out, out_f, first, sha
         some = False
         for tile in range(_TILES):
             v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
-            seen[tile] = v < depth.shape[0] and u < depth.shape[1] and _depths(depth, v, u, z)
+            seen[tile] = v < depth.shape[0] and u < depth.shape[1] and _depths(depth, v, u, z, hole, tile)
             if seen[tile]:
                 some = True
                 _place(z, across, u // _TILE, down, v // _TILE, points, boxes, tile, work)
@@ -165,17 +135,22 @@ def _blocks(depth, across, down, view, features, scratch, out, out_f, first, sha
                 _blank(v, u, out, out_f)
         if not some:
             continue
-        count = _cull(everyone, everyone.shape[1], _union(boxes, seen), settings, bounds, in_block)
-        for i in range(_FIELDS):
+        count = cull(everyone, index.size, _union(boxes, seen), settings, bounds, in_block)
+        for i in range(FIELDS):
             for j in range(count):
                 near[i, j] = everyone[i, in_block[j]]
+        pad(near, count)
         for tile in range(_TILES):
             if seen[tile]:
-                chosen = _cull(near, count, _box(boxes, tile), settings, bounds, in_tile)
+                chosen = cull(near, count, _box(boxes, tile), settings, bounds, in_tile)
                 for j in range(chosen):
                     in_tile[j] = in_block[in_tile[j]]
                 _sum(points, boxes, tile, in_tile, chosen, view, features, buffer, sums)
-                _finish(depth, v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE, buffer, sums, out, out_f)
+                _averages(buffer, sums, hole, tile)
+                v, u = v0 + tile // _SIDE * _TILE, u0 + tile % _SIDE * _TILE
+                _write(buffer[_TOTAL : _TOTAL + _PIXELS], v, u, out)
+                for g in range(sums.shape[0]):
+                    _write(sums[g], v, u, out_f[g])
 
 
 @leaf
@@ -198,8 +173,8 @@ def _by_block(pixels, width, columns, begin, order):
 @leaf
 def _at_pixels(depth, K, pixels, begin, order, rays, view, features, scratch, out, out_f):
     """The blocks of an image at some pixels."""
-    points, boxes, z, work, _, buffer, sums, _, bounds, kept, _ = scratch
-    _, _, everyone, _, settings = view
+    points, boxes, z, work, hole, _, buffer, sums, _, bounds, kept, _ = scratch
+    index, _, everyone, _, settings = view
     nan = out.dtype.type(np.nan)
     for block in range(begin.size - 1):
         for low in range(begin[block], begin[block + 1], _PIXELS):
@@ -208,103 +183,47 @@ def _at_pixels(depth, K, pixels, begin, order, rays, view, features, scratch, ou
                 p = pixels[order[min(low + i, high - 1)]]
                 v, u = p // depth.shape[1], p % depth.shape[1]
                 rays[0, i], rays[1, i] = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-                z[i] = depth[v, u] if depth[v, u] > 0 else np.inf
-            if _nearest_instead(z):
+                z[i] = depth[v, u]
+            some = _without_holes(z, hole, 0)
+            if some:
                 _place(z, rays[:1], 0, rays[1:], 0, points, boxes, 0, work)
-                count = _cull(everyone, everyone.shape[1], _box(boxes, 0), settings, bounds, kept)
+                count = cull(everyone, index.size, _box(boxes, 0), settings, bounds, kept)
                 _sum(points, boxes, 0, kept, count, view, features, buffer, sums)
-                _averages(buffer, sums)
+                _averages(buffer, sums, hole, 0)
             for i in range(high - low):
-                to = order[low + i]
-                use = depth[pixels[to] // depth.shape[1], pixels[to] % depth.shape[1]] > 0
-                out[to] = buffer[_TOTAL + i] if use else nan
+                out[order[low + i]] = buffer[_TOTAL + i] if some else nan
                 for g in range(sums.shape[0]):
-                    out_f[g, to] = sums[g, i] if use else nan
+                    out_f[g, order[low + i]] = sums[g, i] if some else nan
+
+
+# Loops run over all 64 pixels where they can: the compiler turns those into vector instructions, and unrolls one over a
+# row of eight.
 
 
 @leaf
-def _limit(epsilon, count):
-    """log2 of the share of a lower bound that one component may add at one level, a little less for rounding."""
-    return math.log2(epsilon / (3 * max(count, 1))) - 0.01
-
-
-@leaf
-def _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features):
-    """Write the fields of the components whose density can exceed 2^limit at a pixel of the image.
-
-    The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
-    ``constants`` are the terms of the sum. The indices of these components move to the head of
-    ``index``; returns how many there are.
-    """
-    scale, n = math.sqrt(0.5 * _LOG2_E), 0
-    for k in range(index.size):
-        square = 2 * (log_peak[k] - limit / _LOG2_E) * (1 + 1e-6)
-        if not _meets(mean, covariance, index[k], square, K, height, width):
-            continue
-        for i in range(3):
-            fields[n, i] = mean[index[k], i]
-        for i in range(6):
-            fields[n, 3 + i] = whitening[k, i] * scale
-        fields[n, 9] = log_peak[k] * _LOG2_E
-        for i in range(6):
-            constants[n, i] = fields[n, 3 + i]
-        constants[n, 6], constants[n, 7] = fields[n, 9], m[index[k]]
-        constants[n, 8] = features[index[k], features.shape[1] - 1] if features.shape[1] > 0 else 0.0
-        index[n] = index[k]
-        n += 1
-    return n
-
-
-@leaf
-def _meets(mean, covariance, k, square, K, height, width):
-    """Whether the ellipsoid (x - mu)^T S^-1 (x - mu) = square can have a point in the view.
-
-    Its silhouette lies between the planes x = s z (and y = s z) that touch it, (mu_x - s mu_z)^2 =
-    square (S_xx - 2 s S_xz + s^2 S_zz): a quadratic equation in s. One that reaches z = 0 may be anywhere.
-    """
-    sxx, syy, szz = covariance[k, 0, 0], covariance[k, 1, 1], covariance[k, 2, 2]
-    z = mean[k, 2]
-    least = 1e-14 * max(sxx, syy, szz)  # as in prepare
-    szz = square * (szz + least)
-    a = z * z - szz
-    if square <= 0 or (z < 0 and a > 1e-6 * szz):
-        return False  # its peak is too low, or it lies behind the camera
-    if a <= 1e-6 * szz:
-        return True
-    for axis in range(2):
-        x, sx = mean[k, axis], covariance[k, axis, axis] + least
-        half_b = x * z - square * covariance[k, axis, 2]
-        root = math.sqrt(max(half_b * half_b - a * (x * x - square * sx), 0.0))
-        root += 1e-9 * (abs(half_b) + root)
-        p = (half_b - root) / a * K[axis, axis] + K[axis, 2]
-        q = (half_b + root) / a * K[axis, axis] + K[axis, 2]
-        if max(p, q) < -1 or min(p, q) > (width if axis == 0 else height):
-            return False
-    return True
-
-
-@leaf
-def _depths(depth, v0, u0, z):
-    """Depths [64] of a tile; that of its nearest pixel for one without, or outside of the image.
-
-    Returns False where no pixel has one.
-    """
+def _depths(depth, v0, u0, z, hole, tile):
+    """Depths [64] of a tile as :func:`_without_holes` leaves them; False where no pixel has one."""
     if v0 + _TILE <= depth.shape[0] and u0 + _TILE <= depth.shape[1]:
-        for v in range(_TILE):  # a row as a slice: indices from 0 on need no test for negative ones
-            d, row = depth[v0 + v, u0 : u0 + _TILE], z[v * _TILE : (v + 1) * _TILE]
+        for v in range(_TILE):  # rows as slices: indices from 0 on need no test for negative ones
+            given, row = depth[v0 + v, u0 : u0 + _TILE], z[v * _TILE : (v + 1) * _TILE]
             for u in range(_TILE):
-                row[u] = d[u] if d[u] > 0 else np.inf
+                row[u] = given[u]
     else:
         for i in range(_PIXELS):
             v, u = v0 + i // _TILE, u0 + i % _TILE
-            use = v < depth.shape[0] and u < depth.shape[1] and depth[v, u] > 0
-            z[i] = np.float64(depth[v, u]) if use else np.inf
-    return _nearest_instead(z)
+            z[i] = depth[v, u] if v < depth.shape[0] and u < depth.shape[1] else 0
+    return _without_holes(z, hole, tile)
 
 
-@finite
-def _nearest_instead(z):
-    """Put the least depth in place of infinity; False where all are infinite."""
+@leaf
+def _without_holes(z, hole, tile):
+    """Put the least positive depth in place of what is not positive, where ``hole`` [..., 64] becomes NaN and else 0;
+    False where nothing is positive."""
+    zero, nan = hole.dtype.type(0), hole.dtype.type(np.nan)
+    for i in range(_PIXELS):
+        z[i] = z[i] if z[i] > 0 else np.inf
+    for i in range(_PIXELS):
+        hole[tile, i] = zero if z[i] < np.inf else nan
     a, b, c, d = z[0], z[1], z[2], z[3]
     for i in range(4, _PIXELS, 4):  # four chains of comparisons, which do not wait for each other
         a, b = z[i] if z[i] < a else a, z[i + 1] if z[i + 1] < b else b
@@ -319,7 +238,7 @@ def _nearest_instead(z):
 def _place(z, across, column, down, row, points, boxes, tile, work):
     """The points [3, 64] of a tile, relative to its origin, its bounding box (low, high) and its origin.
 
-    ``work`` [6, 64] is scratch.
+    ``work`` [5, 64] is scratch.
     """
     x, y = across[column], down[row]
     for i in range(_PIXELS):
@@ -328,37 +247,34 @@ def _place(z, across, column, down, row, points, boxes, tile, work):
         work[1, i] = y[i] * z[i]
     for i in range(_PIXELS):
         work[2, i] = z[i]
-    boxes[tile, 8] = z0 = _extremes(work, boxes, tile)
-    boxes[tile, 6] = x0 = 0.5 * (x[0] + x[_PIXELS - 1]) * z0
-    boxes[tile, 7] = y0 = 0.5 * (y[0] + y[_PIXELS - 1]) * z0
-    for i in range(_PIXELS):
-        points[tile, i] = x[i] * z[i] - x0
-    for i in range(_PIXELS):
-        points[tile, _PIXELS + i] = y[i] * z[i] - y0
-    for i in range(_PIXELS):
-        points[tile, 2 * _PIXELS + i] = z[i] - z0
-
-
-@finite
-def _extremes(work, boxes, tile):
-    """Least and greatest of three rows of 64 numbers, halved until few are left; returns the least of the last."""
     for axis in range(3):
-        for i in range(_PIXELS):
-            work[3 + axis, i] = work[axis, i]
-        half = _PIXELS // 2
-        while half >= 4:
-            for i in range(half):
-                a, b = work[axis, i], work[axis, half + i]
-                work[axis, i] = a if a < b else b
-            for i in range(half):
-                a, b = work[3 + axis, i], work[3 + axis, half + i]
-                work[3 + axis, i] = a if a > b else b
-            half //= 2
-        low, high = work[axis, 0], work[3 + axis, 0]
-        for i in range(1, 4):
-            low, high = min(low, work[axis, i]), max(high, work[3 + axis, i])
-        boxes[tile, axis], boxes[tile, 3 + axis] = low, high
-    return boxes[tile, 2]
+        boxes[tile, axis], boxes[tile, 3 + axis] = _extremes(work[axis], work[3], work[4])
+    x0, y0, z0 = 0.5 * (x[0] + x[_PIXELS - 1]), 0.5 * (y[0] + y[_PIXELS - 1]), boxes[tile, 2]
+    x0, y0 = x0 * z0, y0 * z0
+    boxes[tile, 6], boxes[tile, 7], boxes[tile, 8] = x0, y0, z0
+    for i in range(_PIXELS):
+        points[tile, i] = work[0, i] - x0
+    for i in range(_PIXELS):
+        points[tile, _PIXELS + i] = work[1, i] - y0
+    for i in range(_PIXELS):
+        points[tile, 2 * _PIXELS + i] = work[2, i] - z0
+
+
+@leaf
+def _extremes(values, low, high):
+    """The least and the greatest of 64 numbers, sixteen comparisons at a time."""
+    for i in range(16):
+        low[i] = high[i] = values[i]
+    for first in range(16, _PIXELS, 16):
+        row = values[first : first + 16]
+        for i in range(16):
+            low[i] = row[i] if row[i] < low[i] else low[i]
+        for i in range(16):
+            high[i] = row[i] if row[i] > high[i] else high[i]
+    least, most = low[0], high[0]
+    for i in range(1, 16):
+        least, most = low[i] if low[i] < least else least, high[i] if high[i] > most else most
+    return least, most
 
 
 @leaf
@@ -388,64 +304,6 @@ def _blank(v_low, u_low, out, out_f):
             out[v, u] = nan
             for g in range(out_f.shape[0]):
                 out_f[g, v, u] = nan
-
-
-@contracted
-def _bounds(packed, n, centre, half, slack, bounds):
-    """log2 of the lower and upper bounds [2, n] of n densities in the box centre +- half.
-
-    ``slack`` times the coordinates bounds the rounding of the distances, and widens the box by it. Infinity and NaN,
-    from a far outlier, keep a component and bound nothing.
-    """
-    cx, cy, cz = centre
-    hx, hy, hz = half
-    zero, least = slack - slack, packed.dtype.type(-1e30)
-    for j in range(n):
-        dx, dy, dz = cx - packed[0, j], cy - packed[1, j], cz - packed[2, j]
-        wx, wy, wz = hx + slack * abs(packed[0, j]), hy + slack * abs(packed[1, j]), hz + slack * abs(packed[2, j])
-        a, b, c, d, e, f = packed[3, j], packed[4, j], packed[5, j], packed[6, j], packed[7, j], packed[8, j]
-        y0, r0 = abs(a * dx), a * wx
-        y1, r1 = abs(b * dx + c * dy), abs(b) * wx + c * wy
-        y2, r2 = abs(d * dx + e * dy + f * dz), abs(d) * wx + abs(e) * wy + f * wz
-        p0, p1, p2 = y0 + r0, y1 + r1, y2 + r2
-        low = packed[9, j] - (p0 * p0 + p1 * p1 + p2 * p2)
-        bounds[0, j] = low if low > least else least
-        q0, q1, q2 = y0 - r0, y1 - r1, y2 - r2
-        q0, q1, q2 = q0 if q0 > zero else zero, q1 if q1 > zero else zero, q2 if q2 > zero else zero
-        bounds[1, j] = packed[9, j] - (q0 * q0 + q1 * q1 + q2 * q2)
-
-
-@leaf
-def _greatest(bounds, n, start):
-    """The greatest of ``start`` and n lower bounds."""
-    a = b = c = start  # four chains of comparisons, which do not wait for each other
-    for j in range(0, n - 3, 4):
-        start = bounds[0, j] if bounds[0, j] > start else start
-        a = bounds[0, j + 1] if bounds[0, j + 1] > a else a
-        b = bounds[0, j + 2] if bounds[0, j + 2] > b else b
-        c = bounds[0, j + 3] if bounds[0, j + 3] > c else c
-    for j in range(n - n % 4, n):
-        start = bounds[0, j] if bounds[0, j] > start else start
-    return max(max(start, a), max(b, c))
-
-
-@leaf
-def _cull(packed, n, box, settings, bounds, kept):
-    """Write the packed components that matter in the box to ``kept``; return how many."""
-    real = packed.dtype.type
-    x_low, y_low, z_low, x_high, y_high, z_high = box
-    _, _, epsilon, least = settings
-    slack = real(16 * np.finfo(packed.dtype).eps)
-    cx, cy, cz = 0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high)
-    hx, hy, hz = 0.5 * (x_high - x_low), 0.5 * (y_high - y_low), 0.5 * (z_high - z_low)
-    hx, hy, hz = hx + slack * (hx + abs(cx)), hy + slack * (hy + abs(cy)), hz + slack * (hz + abs(cz))
-    _bounds(packed, n, (real(cx), real(cy), real(cz)), (real(hx), real(hy), real(hz)), slack, bounds)
-    threshold = _greatest(bounds, n, real(least)) + _limit(epsilon, n)
-    count = 0
-    for j in range(n):
-        kept[count] = j
-        count += bounds[1, j] > threshold
-    return count
 
 
 @contracted
@@ -512,36 +370,24 @@ def _offset(fields, k, x, y, z, real):
 
 
 @leaf
-def _averages(buffer, sums):
-    """Divide total and features by the evidence."""
+def _averages(buffer, sums, hole, tile):
+    """Divide total and features by the evidence; NaN where there is a hole."""
     for i in range(_PIXELS):
-        buffer[_TOTAL + i] = buffer[_TOTAL + i] / buffer[_EVIDENCE + i]
+        buffer[_TOTAL + i] = buffer[_TOTAL + i] / buffer[_EVIDENCE + i] + hole[tile, i]
     for g in range(sums.shape[0]):
         for i in range(_PIXELS):
-            sums[g, i] = sums[g, i] / buffer[_EVIDENCE + i]
+            sums[g, i] = sums[g, i] / buffer[_EVIDENCE + i] + hole[tile, i]
 
 
 @leaf
-def _finish(depth, v0, u0, buffer, sums, out, out_f):
-    """Write the averages of a tile; NaN without a depth."""
-    _averages(buffer, sums)
-    _write(depth, v0, u0, buffer[_TOTAL : _TOTAL + _PIXELS], out)
-    for g in range(sums.shape[0]):
-        _write(depth, v0, u0, sums[g], out_f[g])
-
-
-@leaf
-def _write(depth, v0, u0, values, out):
+def _write(values, v0, u0, out):
     """The values [64] of a tile into a map."""
-    nan = out.dtype.type(np.nan)
     if v0 + _TILE <= out.shape[0] and u0 + _TILE <= out.shape[1]:
         for v in range(_TILE):
-            to, d = out[v0 + v, u0 : u0 + _TILE], depth[v0 + v, u0 : u0 + _TILE]
-            row = values[v * _TILE : (v + 1) * _TILE]
+            to, row = out[v0 + v, u0 : u0 + _TILE], values[v * _TILE : (v + 1) * _TILE]
             for u in range(_TILE):
-                value = row[u]
-                to[u] = value if d[u] > 0 else nan
+                to[u] = row[u]
     else:
         for v in range(v0, min(v0 + _TILE, out.shape[0])):
             for u in range(u0, min(u0 + _TILE, out.shape[1])):
-                out[v, u] = values[(v - v0) * _TILE + u - u0] if depth[v, u] > 0 else nan
+                out[v, u] = values[(v - v0) * _TILE + u - u0]

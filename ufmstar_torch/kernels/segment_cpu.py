@@ -7,7 +7,7 @@ The rows of an image are segmented on all threads that torch may use, their segm
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,14 +15,8 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.kernels.compile_cpu import kernel
-from ufmstar_torch.kernels.segment_image_cpu import (
-    SEGMENT,
-    SEGMENT_INT,
-    join_rows,
-    scan_rows,
-    write_gaussians,
-    write_labels,
-)
+from ufmstar_torch.kernels.segment_image_cpu import join_rows, write_gaussians, write_labels
+from ufmstar_torch.kernels.segment_rows_cpu import SEGMENT, SEGMENT_INT, scan_rows
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput
@@ -50,14 +44,37 @@ class _Limits(NamedTuple):
     min_rows: int
 
 
+Fit = tuple[np.ndarray, np.ndarray, np.ndarray]  # kept, gaussians and whole, as :func:`join_rows` returns them
+
+
 def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Tensor]:
     """As :func:`ufmstar_torch.segment.segment`, for CPU tensors, float64 inside."""
-    mixture, labels = fit(given, before_pruning=before_pruning)
-    return mixture, labels()
+    fits, labels = fit(given, before_pruning=before_pruning)
+    dtype = np.float32 if given.dtype == torch.float32 else np.float64
+    b, k = len(fits), most_gaussians(fits)
+    mean, covariance = np.zeros((b, k, 3), dtype), np.zeros((b, k, 3, 3), dtype)
+    weight, count = np.zeros((b, k), dtype), np.zeros((b, k), np.int64)
+    for i, (kept, gaussians, whole) in enumerate(fits):
+        write_gaussians(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
+    features = feature_means(given, labels, weight)
+    fields = (mean, covariance, weight, np.zeros((b, k), dtype), count, features)
+    return GaussianMixture(*map(torch.from_numpy, fields)), labels()
 
 
-def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianMixture, Callable[[], Tensor]]:
-    """As :func:`segment`, with a function that writes the labels."""
+def most_gaussians(fits: Sequence[Fit]) -> int:
+    """The slots of a mixture for all streams, at least 1."""
+    return max(1, *(kept.size for kept, _, _ in fits))
+
+
+def feature_means(given: SegmentInput, labels: Callable[[], Tensor], weight: np.ndarray) -> np.ndarray:
+    """Means [B, K, F] of the features over the pixels of each Gaussian, in the dtype of ``weight`` [B, K]."""
+    if given.features is None:
+        return np.empty((*weight.shape, 0), weight.dtype)
+    return _feature_means(_array(given.features), labels().numpy(), weight)
+
+
+def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit], Callable[[], Tensor]]:
+    """The Gaussians of :func:`segment`, stream by stream, and a function that writes the labels."""
     z = given.depth.contiguous().numpy()
     streams, height, width = z.shape
     absent = (streams, height, 0)  # rows of no pixels stand for "not given"
@@ -90,23 +107,7 @@ def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[GaussianM
             write_labels(owner[b], slot, out[b])
         return torch.from_numpy(out)
 
-    return _mixture([gaussians for *gaussians, _ in joined], given, labels), labels
-
-
-def _mixture(fits: list[list[np.ndarray]], given: SegmentInput, labels: Callable[[], Tensor]) -> GaussianMixture:
-    """The kept Gaussians of all streams, padded to the largest."""
-    dtype = np.float32 if given.dtype == torch.float32 else np.float64
-    b, k = len(fits), max(1, *(kept.size for kept, _, _ in fits))
-    mean, covariance = np.zeros((b, k, 3), dtype), np.zeros((b, k, 3, 3), dtype)
-    weight, count = np.zeros((b, k), dtype), np.zeros((b, k), np.int64)
-    for i, (kept, gaussians, whole) in enumerate(fits):
-        write_gaussians(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
-    if given.features is None:
-        features = np.empty((b, k, 0), dtype)
-    else:
-        features = _feature_means(_array(given.features), labels().numpy(), weight)
-    fields = (mean, covariance, weight, np.zeros((b, k), dtype), count, features)
-    return GaussianMixture(*map(torch.from_numpy, fields))
+    return [(kept, gaussians, whole) for kept, gaussians, whole, _ in joined], labels
 
 
 def _array(value: Tensor) -> np.ndarray:

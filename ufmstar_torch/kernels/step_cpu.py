@@ -7,8 +7,9 @@ of threads changes a bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,11 +24,10 @@ from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.anchors_cpu import learn
-from ufmstar_torch.kernels.fuse_cpu import floored
 from ufmstar_torch.kernels.regress_cpu import regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
-from ufmstar_torch.kernels.segment_cpu import fit
-from ufmstar_torch.kernels.stream_cpu import join, match
+from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
+from ufmstar_torch.kernels.stream_cpu import describe, join, match
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
@@ -37,6 +37,7 @@ from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import StepObserver, after_frame, after_regress, frame_statistics
 
 Floats = NDArray[np.floating[Any]]
+_NAMES = tuple(field.name for field in fields(GaussianMixture))
 
 
 class _Slots(NamedTuple):
@@ -46,26 +47,27 @@ class _Slots(NamedTuple):
     covariance: Floats
     weight: Floats
     disagreement: Floats
-    count: NDArray[np.int64]
+    observations: NDArray[np.int64]
     features: Floats
 
     @classmethod
     def of(cls, state: UfMStarState | GaussianMixture) -> _Slots:
-        return cls(*(getattr(state, name).detach().contiguous().numpy() for name in cls._fields))
+        return cls(*(getattr(state, name).detach().contiguous().numpy() for name in _NAMES))
 
     def stream(self, b: int) -> tuple[NDArray[Any], ...]:
         return tuple([value[b] for value in self])
 
 
 class _Pairs(NamedTuple):
-    """The matched pairs [P] of one stream; which segments [C] are matched, and new; how many are new, and how many
-    components the mixture had."""
+    """The matched pairs [P] of one stream; which segments [C] are new; how many segments there are, how many of them
+    are matched, how many new, and how many components the mixture had."""
 
     c: NDArray[np.int64]
     k: NDArray[np.int64]
     overlap: NDArray[np.float64]
-    matched: NDArray[np.bool_]
     new: NDArray[np.bool_]
+    found: int
+    matched: int
     created: int
     occupied: int
 
@@ -126,7 +128,7 @@ def step(
         dropped = each(join, joining)
     stage("fuse")
 
-    mixture = {name: torch.from_numpy(value) for name, value in slots._asdict().items()}
+    mixture = {name: torch.from_numpy(value) for name, value in zip(_NAMES, slots, strict=True)}
     moved = GaussianMixture(
         torch.from_numpy(mean_cam), torch.from_numpy(covariance_cam), mixture["weight"].double(),
         mixture["disagreement"].double(), mixture["count"], mixture["features"].double(),
@@ -147,7 +149,7 @@ def step(
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, smooth_maps
         )
-    counts = _counts(frame, segments, pairs, np.array(dropped), measured)
+    counts = _counts(frame, pairs, dropped, measured)
     counts |= {"anchors": torch.zeros_like(used) if anchors is None else anchors.valid.sum(1), "anchors_used": used}
     updated = after_frame(state, frame, mixture, torch.from_numpy(first), smoothed, evidence)
     out = StepOutput(
@@ -165,15 +167,20 @@ def _segment(
     frame: FrameInput, config: UfMStarConfig, stored: torch.dtype, kernel: Callable[[str], AbstractContextManager]
 ) -> tuple[GaussianMixture, Callable[[], Tensor]]:
     """Step 2: C_i in the camera frame, float64, its covariances lifted to the floor that the reference states."""
+    given = SegmentInput.of_frame(frame, config)
     with kernel("spgf"):
-        raw, labels = fit(SegmentInput.of_frame(frame, config))
-    mixture = raw.to(torch.float64)
-    covariance = torch.zeros_like(mixture.covariance)
-    epsilon = 8 * torch.finfo(stored).eps
-    arrays = (value.numpy() for value in (mixture.mean, mixture.covariance, mixture.weight, covariance))
-    for K, mean, cov, weight, out in zip(frame.intrinsics.tolist(), *arrays, strict=True):
-        floored(mean, cov, weight, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon, out)
-    return mixture.replace(covariance=covariance), labels
+        fits, labels = fit(given)
+    rounding = np.float32 if given.dtype == torch.float32 else np.float64
+    b, n = len(fits), most_gaussians(fits)
+    mean, covariance, weight, zero = np.zeros((b, n, 3)), np.zeros((b, n, 3, 3)), np.zeros((b, n)), np.zeros((b, n))
+    count, rounded = np.zeros((b, n), np.int64), np.empty(13 * n, rounding)
+    scratch = rounded[: 3 * n].reshape(n, 3), rounded[3 * n : 12 * n].reshape(n, 3, 3), rounded[12 * n :]
+    epsilon = 8 * float(torch.finfo(stored).eps)
+    for i, K in enumerate(frame.intrinsics.tolist()):
+        written = (mean[i], covariance[i], weight[i], count[i])
+        describe(fits[i], scratch, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon, *written)
+    features = feature_means(given, labels, weight.astype(rounding)).astype(np.float64)
+    return GaussianMixture(*map(torch.from_numpy, (mean, covariance, weight, zero, count, features))), labels
 
 
 def _capacity(present: int, needed: int, limit: int | None) -> int:
@@ -191,24 +198,21 @@ def _grown(value: NDArray[Any], capacity: int) -> NDArray[Any]:
     return out
 
 
-def _counts(
-    frame: FrameInput, segments: _Slots, pairs: list[_Pairs], dropped: NDArray[np.int64], measured: Tensor
-) -> dict[str, Tensor]:
+def _counts(frame: FrameInput, pairs: list[_Pairs], dropped: list[int], measured: Tensor) -> dict[str, Tensor]:
     """The statistics [B] that the step counts itself."""
-
-    def of_streams(values: Iterable[NDArray[Any]]) -> NDArray[np.int64]:
-        return np.array([np.count_nonzero(value) for value in values], np.int64)
-
-    found, matched = of_streams(segments.weight), of_streams(p.matched for p in pairs)
-    new, occupied = np.array([(p.created, p.occupied) for p in pairs], np.int64).T
-    counts = {
-        "components": occupied + new - dropped,
-        "segments": found,
-        "matched": matched,
-        "pairs": np.array([p.c.size for p in pairs], np.int64),
-        "new": new - dropped,
-        "dropped": dropped + found - matched - new,  # too near, or without a slot
-        "valid_pixels": of_streams(frame.valid.numpy()),
-        "unmeasured": of_streams(measured.numpy() < unmeasured.HALF),
-    }
-    return {name: torch.from_numpy(value) for name, value in counts.items()}
+    valid, unseen = frame.valid.numpy(), measured.numpy() < unmeasured.HALF
+    rows = [
+        (
+            pair.occupied + pair.created - lost,
+            pair.found,
+            pair.matched,
+            pair.c.size,
+            pair.created - lost,
+            lost + pair.found - pair.matched - pair.created,  # without a slot, or too near
+            np.count_nonzero(valid[b]),
+            np.count_nonzero(unseen[b]),
+        )
+        for b, (pair, lost) in enumerate(zip(pairs, dropped, strict=True))
+    ]
+    names = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured")
+    return dict(zip(names, torch.tensor(rows, dtype=torch.int64).unbind(1), strict=True))

@@ -6,8 +6,26 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.correspond_cpu import matches
-from ufmstar_torch.kernels.fuse_cpu import append, fuse_pairs
+from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
 from ufmstar_torch.kernels.rigid_cpu import move, relative
+from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
+
+
+@kernel
+def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, weight, count):
+    """Step 2's segments (``segment_cpu.fit``) as slots [C, ...] in float64, their covariances lifted to the floor that
+    the reference states (:func:`floored`).
+
+    ``rounded`` are mean, covariance and weight [C, ...] in the dtype to which the values are rounded before.
+    """
+    kept, gaussians, whole = fit
+    write_gaussians(kept, gaussians, whole, *rounded, count)
+    m, c, pi = rounded
+    for i in range(kept.size):
+        weight[i] = pi[i]
+        for axis in range(3):
+            mean[i, axis] = m[i, axis]
+    floored(m[: kept.size], c, pi[: kept.size], near, focal, widening, epsilon, covariance)
 
 
 @kernel
@@ -23,8 +41,8 @@ def match(
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
 
     Returns:
-        The pairs c [P], k [P] and their overlap [P]; which segments are matched [C], and which are new [C]; the number
-        of new ones and that of the mixture's components.
+        The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
+        of them are matched, how many new, and how many components the mixture had.
     """
     move(relative(first, present), mean, covariance, weight, 0, np.empty(0, np.bool_), mean_cam, covariance_cam)
     pi, occupied = np.empty(weight.size), 0
@@ -32,14 +50,16 @@ def match(
         pi[k] = weight[k]
         occupied += weight[k] > 0
     c, k, overlap = matches(mean_cam, covariance_cam, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
-    matched, new, created = np.zeros(weight_c.size, np.bool_), np.empty(weight_c.size, np.bool_), 0
+    new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
-        matched[c[i]] = True
+        new[c[i]] = False
     for i in range(new.size):
+        found += weight_c[i] > 0
+        matched += not new[i]
         # What is nearer than the near plane could never be matched again: it is not remembered.
-        new[i] = weight_c[i] > 0 and mean_c[i, 2] > thresholds[2] and not matched[i]
+        new[i] = new[i] and weight_c[i] > 0 and mean_c[i, 2] > thresholds[2]
         created += new[i]
-    return c, k, overlap, matched, new, created, occupied
+    return c, k, overlap, new, found, matched, created, occupied
 
 
 @kernel
