@@ -1,15 +1,15 @@
 """Components that the present frame cannot reach, in files instead of memory (``config.spill``), an extension.
 
-After a frame with more than ``config.max_components`` components, those that it could not reach are written out, the
-farthest first, in pages of neighbours, until three quarters of the limit are left. Before a frame, every page that it
-may reach is read back. A component is within reach of a frame where
+After a frame with more than ``config.max_components`` components, those in cubes that it could not reach are written
+out, the farthest first, a page for each cube, until three quarters of the limit are left. Before a frame, every page
+that it may reach is read back. A component is within reach of a frame where
 
 - its mean may project into the image, at any depth beyond the near plane: then it can match (``correspond``); or
 - its density may exceed 1e-9 of the prior's weight at a point of the depth map: then the regression reads it.
 
 Both are decided by axis-aligned boxes against the planes of the viewing pyramid, which can only say "reached" too
 often. So matching and fusion are those of a mixture that was never written out, to the last bit, and the map differs by
-rounding; components stand in another order. What lies within reach of one frame is kept even beyond the limit.
+rounding; components stand in another order. What lies in cubes within reach of one frame is kept even beyond the limit.
 
 The work of a frame depends on what is in memory and what it reads back: pages are looked up in a tree of boxes
 (``spill_index``), and a journal keeps what changed (``spill_store``). Streams are independent; each has its own limit
@@ -37,10 +37,7 @@ from ufmstar_torch.state import UfMStarState
 
 MEMORY = "memory"
 _COLUMNS = ("mean", "covariance", "weight", "disagreement", "count", "features", "evidence")
-_CUBE = 4.0  # [m] edge of the cubes whose components go together
-_CUBES = round(CELL / _CUBE)
-_SPREAD = np.array([0, 1, 8, 9, 64, 65, 72, 73])  # the bits of 0 to 7, two places between them
-_PAGE = 64  # components from which on a page is full
+_CUBE = CELL / 8  # [m] edge of the cubes whose components share a page
 _KEPT = 0.75  # share of the limit that is left after writing out
 _NEGLIGIBLE = 1e-9  # density at a point, in units of the prior's weight
 
@@ -208,40 +205,18 @@ def _parted(
 ) -> tuple[NDArray, list[tuple[NDArray, NDArray]]]:
     """The rows that stay, and those of every page that goes, with their boxes."""
     boxes = _boxes(rows, config)
-    free = np.flatnonzero(~_view(state, frame, b, config).reaches(boxes))
-    cubes, member, count = _cubes(rows[free, :3])
-    camera = torch.linalg.inv(state.T_world_first[b]) @ frame.T_world_cam[b].to(state.T_world_first)
-    distance = np.linalg.norm((cubes + 0.5) * _CUBE - camera[:3, 3].cpu().numpy(), axis=1)
-    farthest = np.argsort(-distance, kind="stable")
-    left = len(rows) - np.cumsum(count[farthest]) + count[farthest]  # components when it is a cube's turn
-    page = _packed(cubes, count, farthest[left > _KEPT * limit])[member]
-    order = np.argsort(page, kind="stable")
-    parts = np.split(free[order], np.searchsorted(page[order], np.arange(page.max(initial=-1) + 1)))
-    stays = np.ones(len(rows), np.bool_)
-    stays[free[page >= 0]] = False
-    return rows[stays], [(rows[part], boxes[part]) for part in parts[1:]]
-
-
-def _cubes(means: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Of points [n, 3] the cubes [q, 3] in which they lie, cell by cell and neighbours next to each other; the number
-    of each point's cube [n]; and how many points each cube has [q]."""
-    cube = np.floor(means / _CUBE).astype(np.int64)
-    cell, inner = (cube // _CUBES) % 2**18, _SPREAD[cube % _CUBES]  # cells repeat after 8,000 km
-    key = (cell @ [2**36, 2**18, 1]) * _CUBES**3 + inner @ [4, 2, 1]
+    cube = np.floor(rows[:, :3] / _CUBE).astype(np.int64)
+    key = cube % 2**21 @ [2**42, 2**21, 1]  # the same again after 8,000 km
     _, first, member, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
-    return cube[first], member, count
-
-
-def _packed(cubes: NDArray, count: NDArray, going: NDArray) -> NDArray:
-    """[q] the page of every cube that goes, -1 for the others. Cubes of one cell share a page until it is full."""
-    page, going = np.full(len(cubes), -1), np.sort(going)
-    last, size, number = None, _PAGE, -1
-    for cube, cell in zip(going.tolist(), (cubes[going] // _CUBES).tolist(), strict=True):
-        if size >= _PAGE or cell != last:
-            last, size, number = cell, 0, number + 1
-        page[cube] = number
-        size += count[cube]
-    return page
+    reached = np.bincount(member, _view(state, frame, b, config).reaches(boxes)) > 0
+    camera = torch.linalg.inv(state.T_world_first[b]) @ frame.T_world_cam[b].to(state.T_world_first)
+    distance = np.linalg.norm((cube[first] + 0.5) * _CUBE - camera[:3, 3].cpu().numpy(), axis=1)
+    farthest = np.argsort(np.where(reached, 0, -distance), kind="stable")[: np.count_nonzero(~reached)]
+    left = len(rows) - np.cumsum(count[farthest]) + count[farthest]  # components when it is a cube's turn
+    parts = [np.flatnonzero(member == cube) for cube in farthest[left > _KEPT * limit]]
+    stays = np.ones(len(rows), np.bool_)
+    stays[np.concatenate([np.empty(0, np.int64), *parts])] = False
+    return rows[stays], [(rows[part], boxes[part]) for part in parts]
 
 
 def _rows(state: UfMStarState, b: int) -> NDArray:

@@ -170,7 +170,7 @@ def _on_cpu(
             parts["peer"] = measure_peer(options.peer, source.frames(options.sizes[0], options.frames))
         if options.long is not None:
             parts["growth"] = _growth(options, config, source, progress)
-            parts["long_run"] = parts["growth"][0]
+            parts["long_run"] = next((run for run in parts["growth"] if run["world"] == "room"), None)
         if options.anchors is not None:
             parts["anchors"] = _anchors(options, config, source, progress)
     return parts

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -17,7 +20,9 @@ from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import FastDepth, Preprocess
 
+Floats = NDArray[np.float64]
 _PITCH = np.array([7.2, 3.0, 7.2])  # from one room of a building to the next [m]
+_ENDLESS = 10**12  # frames
 
 
 class PosedDepth(NamedTuple):
@@ -51,21 +56,20 @@ class FrameSource(Protocol):
         """What it is, for the report."""
 
 
-@dataclass(frozen=True)
-class RenderedRoom:
-    """Frames of a room with things in it, whose depth flickers as a network's does.
+@dataclass(frozen=True, kw_only=True)
+class _Rendered(ABC):
+    """Frames whose depth flickers as a network's does, without an end.
 
     Attributes:
-        boxes: number of things.
-        period: frames per turn of the camera.
         flicker: standard deviation of the smooth relative error of the depth.
-        seed: of the room and of the flicker.
+        seed: of what is rendered and of the flicker.
+        max_depth: what lies farther has no depth [m].
     """
 
-    boxes: int = 40
-    period: int = 100
+    KIND: ClassVar[str]
     flicker: float = 0.03
     seed: int = 0
+    max_depth: float = math.inf
 
     @property
     def available(self) -> int | None:
@@ -74,90 +78,84 @@ class RenderedRoom:
 
     def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
         """The first ``count`` frames at size x size pixels."""
-        room = synthetic.BoxRoom.furnished(self.boxes, self.seed)
-        K = synthetic.intrinsics(size, size)
-        rng = np.random.default_rng(self.seed)
-        for T in synthetic.walk(count, self.period):
+        K, rng = synthetic.intrinsics(size, size), np.random.default_rng(self.seed)
+        for room, T, origin in itertools.islice(self._views(), count):
             depth = synthetic.flicker(synthetic.render(room, T, K, size, size), self.flicker, rng)
+            depth = np.where(depth <= self.max_depth, depth, 0.0)
+            T[:3, 3] += origin
             yield PosedDepth(torch.from_numpy(depth).float()[None], torch.from_numpy(T), torch.from_numpy(K))
 
     def describe(self) -> dict[str, object]:
         """The settings, for the report."""
-        return {"kind": "rendered room", **asdict(self)}
+        settings = {name: value for name, value in asdict(self).items() if value != math.inf}
+        return {"kind": f"rendered {self.KIND}", **settings}
+
+    @abstractmethod
+    def _views(self) -> Iterator[tuple[synthetic.BoxRoom, Floats, Floats]]:
+        """What each frame sees, the camera's pose [4, 4] in it, and where its origin lies in the world [3] [m]."""
 
 
-@dataclass(frozen=True)
-class RenderedBuilding:
-    """Frames of furnished rooms, four on a floor, in each of which the camera turns once; after the last one, again
-    from the first.
+@dataclass(frozen=True, kw_only=True)
+class RenderedRoom(_Rendered):
+    """A room with things in it, in which the camera turns.
+
+    Attributes:
+        boxes: number of things.
+        period: frames per turn of the camera.
+    """
+
+    KIND: ClassVar[str] = "room"
+    boxes: int = 40
+    period: int = 100
+
+    def _views(self) -> Iterator[tuple[synthetic.BoxRoom, Floats, Floats]]:
+        room = synthetic.BoxRoom.furnished(self.boxes, self.seed)
+        for T in synthetic.walk(_ENDLESS, self.period):
+            yield room, T, np.zeros(3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderedBuilding(_Rendered):
+    """Furnished rooms, four on a floor, in each of which the camera turns once; after the last one, again from the
+    first.
 
     Attributes:
         floors: of four rooms each.
         boxes: number of things in a room.
         period: frames per turn of the camera.
-        flicker: see :class:`RenderedRoom`.
-        seed: of the rooms and of the flicker.
     """
 
+    KIND: ClassVar[str] = "building"
     floors: int = 5
     boxes: int = 40
     period: int = 50
-    flicker: float = 0.03
-    seed: int = 0
 
-    @property
-    def available(self) -> int | None:
-        """None: it goes on for ever."""
-        return None
-
-    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
-        """The first ``count`` frames at size x size pixels."""
+    def _views(self) -> Iterator[tuple[synthetic.BoxRoom, Floats, Floats]]:
         rooms = [synthetic.BoxRoom.furnished(self.boxes, self.seed + number) for number in range(4 * self.floors)]
-        K, rng = synthetic.intrinsics(size, size), np.random.default_rng(self.seed)
-        for number, T in enumerate(synthetic.walk(count, self.period)):
-            room = number // self.period % len(rooms)
-            depth = synthetic.flicker(synthetic.render(rooms[room], T, K, size, size), self.flicker, rng)
-            T[:3, 3] += np.array([room % 2, -(room // 4), room // 2 % 2]) * _PITCH
-            yield PosedDepth(torch.from_numpy(depth).float()[None], torch.from_numpy(T), torch.from_numpy(K))
-
-    def describe(self) -> dict[str, object]:
-        """The settings, for the report."""
-        return {"kind": "rendered building", **asdict(self)}
+        for frame, T in enumerate(synthetic.walk(_ENDLESS, self.period)):
+            number = frame // self.period % len(rooms)
+            yield rooms[number], T, _PITCH * [number % 2, -(number // 4), number // 2 % 2]
 
 
-@dataclass(frozen=True)
-class RenderedStreet:
-    """Frames of a drive straight along a street of 20 m between houses, with things on both sides, without an end.
+@dataclass(frozen=True, kw_only=True)
+class RenderedStreet(_Rendered):
+    """A drive straight along a street of 20 m between houses, with things on both sides.
 
     Attributes:
         step: way between two frames [m].
         gap: mean way between two things of one side [m].
-        max_depth: what lies farther has no depth [m].
-        flicker: see :class:`RenderedRoom`.
-        seed: of the things and of the flicker.
     """
 
+    KIND: ClassVar[str] = "street"
     step: float = 2.0
     gap: float = 6.0
     max_depth: float = 60.0
-    flicker: float = 0.03
-    seed: int = 0
 
-    @property
-    def available(self) -> int | None:
-        """None: it goes on for ever."""
-        return None
-
-    def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
-        """The first ``count`` frames at size x size pixels."""
-        K, rng = synthetic.intrinsics(size, size), np.random.default_rng(self.seed)
-        for number in range(count):
+    def _views(self) -> Iterator[tuple[synthetic.BoxRoom, Floats, Floats]]:
+        for number in itertools.count():
             z = self.step * number
-            sway = np.sin(0.05 * number)
-            T = synthetic.look((sway, 0.0, z), 0.1 * np.sin(0.11 * number), 0.05)
-            depth = synthetic.flicker(synthetic.render(self._around(z), T, K, size, size), self.flicker, rng)
-            depth = np.where(depth <= self.max_depth, depth, 0.0)
-            yield PosedDepth(torch.from_numpy(depth).float()[None], torch.from_numpy(T), torch.from_numpy(K))
+            T = synthetic.look((np.sin(0.05 * number), 0.0, z), 0.1 * np.sin(0.11 * number), 0.05)
+            yield self._around(z), T, np.zeros(3)
 
     def _around(self, z: float) -> synthetic.BoxRoom:
         """What a camera at z can see of the street."""
@@ -165,16 +163,12 @@ class RenderedStreet:
         boxes = np.array([self._thing(place, side) for place in places for side in (-1.0, 1.0)])
         return synthetic.BoxRoom(np.array([[-10.0, -12.0, z - 60.0], [10.0, 1.5, z + 10 * self.max_depth]]), boxes)
 
-    def _thing(self, place: int, side: float) -> NDArray[np.float64]:
+    def _thing(self, place: int, side: float) -> Floats:
         """[2, 3] the corners of the thing at a place of one side."""
         rng = np.random.default_rng([self.seed, place + 2**31, int(side > 0)])
         size = rng.uniform((0.6, 0.8, 0.8), (1.8, 4.0, 4.5))
         x, z = side * rng.uniform(4.5, 8.5), self.gap * (place + rng.uniform(0, 1))
         return np.array([[x - size[0] / 2, 1.5 - size[1], z], [x + size[0] / 2, 1.5, z + size[2]]])
-
-    def describe(self) -> dict[str, object]:
-        """The settings, for the report."""
-        return {"kind": "rendered street", **asdict(self)}
 
 
 @dataclass(frozen=True)
