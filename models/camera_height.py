@@ -94,13 +94,11 @@ def align_to_camera_height(
     rays = unproject(torch.ones_like(prediction, dtype=torch.float64), K).flatten(1, 2)  # third component 1
     x = prediction.detach().double().flatten(1)
     down = _down(up_cam, batch, x)
-    if valid is None:
-        area = (rays @ down[..., None])[..., 0] > math.sin(_BELOW_HORIZON) * rays.norm(dim=-1)
-    elif valid.dtype == torch.bool and valid.shape == prediction.shape:
-        area = valid.flatten(1)
-    else:
-        raise ValueError(f"valid must be bool {tuple(prediction.shape)}, got {valid.dtype} {tuple(valid.shape)}")
-    use = area & x.isfinite() & (x > (-math.inf if at_infinity is None else at_infinity))
+    use = (
+        _searched(prediction, valid, rays, down)
+        & x.isfinite()
+        & (x > (-math.inf if at_infinity is None else at_infinity))
+    )
     count = use.sum(1)
     require_each(count >= 10, count, "needs at least 10 pixels that look at the ground with a prediction, has")
     if at_infinity is None:
@@ -119,6 +117,15 @@ def align_to_camera_height(
         scale, infinity = scale.median(), infinity.median()
     shift = -scale * infinity if inverse else torch.zeros_like(scale)
     return GroundFit(Alignment(kind, scale, shift, max_depth), down, inlier.view(prediction.shape))
+
+
+def _searched(prediction: Tensor, valid: Tensor | None, rays: Tensor, down: Tensor) -> Tensor:
+    """[B, P] bool, where ground is looked for."""
+    if valid is None:
+        return (rays @ down[..., None])[..., 0] > math.sin(_BELOW_HORIZON) * rays.norm(dim=-1)
+    if valid.dtype != torch.bool or valid.shape != prediction.shape:
+        raise ValueError(f"valid must be bool {tuple(prediction.shape)}, got {valid.dtype} {tuple(valid.shape)}")
+    return valid.flatten(1)
 
 
 def _plane(

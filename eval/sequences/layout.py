@@ -104,17 +104,24 @@ def open_sequence(
     )
     if poses not in CONVENTIONS:
         raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {poses!r}")
-    if layout == "auto":
-        layout = detect_layout(path, explicit=images is not None or trajectory is not None)
-    if layout not in _READERS:
-        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
-    detect, open_reader, looked_for = _READERS[layout]
-    if layout != "generic" and not detect(path):
-        raise ValueError(f"{path} has not the layout {layout!r}: looked for {looked_for}")
+    layout = _chosen(layout, path, explicit=images is not None or trajectory is not None)
     if layout != "kitti360":
         options.reject(layout, "drive", "scans")
+    _, open_reader, _ = _READERS[layout]
     sequence = replace(open_reader(path, options), folder=path if path.is_dir() else path.parent)
     return convert_poses(sequence, poses)
+
+
+def _chosen(layout: str, path: Path, explicit: bool) -> str:
+    """The layout by name, or detected for "auto"."""
+    if layout == "auto":
+        layout = detect_layout(path, explicit=explicit)
+    if layout not in _READERS:
+        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    detect, _, looked_for = _READERS[layout]
+    if layout != "generic" and not detect(path):
+        raise ValueError(f"{path} has not the layout {layout!r}: looked for {looked_for}")
+    return layout
 
 
 def detect_layout(path: Path, explicit: bool = False) -> str:
