@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.mixture import GaussianMixture
 
 
@@ -41,3 +42,29 @@ def mixture(streams: int, capacity: int, seed: int, *, empty: int = 2, features:
         count=valid.long(),
         features=draw(features) * mask[..., None],
     )
+
+
+def as_lists(m: GaussianMixture, stream: int) -> list[dict]:
+    """The components of a stream as the oracle takes them."""
+    n = int(m.components[stream])
+    return [
+        {
+            "mean": m.mean[stream, k].numpy(),
+            "cov": m.covariance[stream, k].numpy(),
+            "weight": m.weight[stream, k].item(),
+            "m": m.disagreement[stream, k].item(),
+            "count": int(m.count[stream, k]),
+            "features": m.features[stream, k].numpy(),
+        }
+        for k in range(n)
+    ]
+
+
+def random_pairs(streams: int, previous, current, seed: int, density: float = 0.3) -> Correspondence:
+    """Matches of a share ``density`` of all pairs, with overlaps of .5 to 1."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (streams, current.capacity, previous.capacity)
+    match = torch.rand(shape, generator=generator) < density
+    match &= current.valid[:, :, None] & previous.valid[:, None]
+    overlap = 0.5 + 0.5 * torch.rand(shape, generator=generator, dtype=torch.float64)
+    return Correspondence(match, overlap)

@@ -85,3 +85,32 @@ def test_corners_move_with_the_image():
     assert not fine[(goal[:, 0] > 320) | (goal[:, 1] < -1)].any(), "what left the image is not believed"
     _, gone = follow(image, textured(240, 320, seed=5), start, 0.5)
     assert gone.mean() < 0.2, "another image leads back to nowhere"
+
+
+def shifted(image, right):
+    """The same picture, moved to the right."""
+    return cv2.warpAffine(image, np.array([[1.0, 0, right], [0, 1, 0]]), image.shape[::-1])
+
+
+def test_an_expected_position_finds_what_went_too_far():
+    before = textured(240, 480)
+    after = shifted(before, 70.0)
+    start = find(before, 60, 12.0, np.zeros((0, 2)))
+    start = start[(start[:, 0] < 380) & (start[:, 0] > 20)]
+    went = start + np.array([70.0, 0.0])
+    _, without = follow(before, after, start, 0.5)
+    found, fine = follow(before, after, start, 0.5, went + np.array([3.0, -2.0]))
+    assert fine.mean() > 0.95
+    assert fine.mean() > without.mean() + 0.2
+    np.testing.assert_allclose(found[fine], went[fine], atol=0.1)
+
+
+def test_a_wrong_expectation_is_dropped():
+    before = textured(240, 480)
+    after = shifted(before, 4.0)
+    start = find(before, 60, 12.0, np.zeros((0, 2)))
+    _, plain = follow(before, after, start, 0.5)
+    found, fine = follow(before, after, start, 0.5, start + np.array([150.0, 40.0]))
+    assert plain.mean() > 0.9
+    assert fine.mean() > 0.8 * plain.mean()
+    assert np.median(np.abs(found[fine] - start[fine] - np.array([4.0, 0.0]))) < 0.1

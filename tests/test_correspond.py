@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_gaussians import mixture
+from random_gaussians import as_lists, mixture
 
 import oracle
 import scenes
@@ -18,21 +18,6 @@ pytestmark = pytest.mark.numerics
 
 SIZE = (48, 64)
 K = torch.tensor(scenes.intrinsics(*SIZE))
-
-
-def as_lists(m: GaussianMixture, stream: int) -> list[dict]:
-    n = int(m.components[stream])
-    return [
-        {
-            "mean": m.mean[stream, k].numpy(),
-            "cov": m.covariance[stream, k].numpy(),
-            "weight": m.weight[stream, k].item(),
-            "m": m.disagreement[stream, k].item(),
-            "count": int(m.count[stream, k]),
-            "features": m.features[stream, k].numpy(),
-        }
-        for k in range(n)
-    ]
 
 
 def blob(*components: tuple[float, float, float, float]) -> GaussianMixture:

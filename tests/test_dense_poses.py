@@ -16,7 +16,7 @@ K = np.array([[250.0, 0, 159.5], [0, 252.0, 119.5], [0, 0, 1]])
 SHARES = np.arange(3)
 
 
-def scene(seed, count=60, moved=0.3):
+def scene(seed, count=40, moved=0.3):
     """Pixels, inverse depths and three views of them."""
     rng = np.random.default_rng(seed)
     pixel, rho = rng.uniform([10, 10], [310, 230], (count, 2)), rng.uniform(0.3, 1.2, count)
@@ -103,8 +103,8 @@ def known(frames=1, seed=0, noise=0.05, **wrong):
 
 def test_wrong_poses_are_corrected_and_what_remains_is_stated():
     better, normalised = [], []
-    for seed in range(8):
-        _, found, fit, rho = known(12, seed, turned=0.002, moved=0.004)
+    for seed in range(5):
+        _, found, fit, rho = known(8, seed, turned=0.002, moved=0.004)
         better.append(np.median(np.abs(fit.rho - rho)) / np.median(np.abs(found.rho - rho)))
         normalised.append(np.median(np.abs(fit.rho - rho) / np.sqrt(fit.variance)) / 0.674)
     assert np.median(better) < 0.6
@@ -117,10 +117,18 @@ def test_exact_poses_stay_nearly_exact():
 
 
 def test_a_wrong_camera_is_learnt():
-    errors, *_ = known(30, camera=np.array([0.004, 1.0, -0.8, 0.0]))
+    errors, *_ = known(20, camera=np.array([0.004, 1.0, -0.8, 0.0]))
     # The views' K is not corrected here: what is learnt is added up to where the prior holds it.
     assert np.sign(errors.camera(K) - K)[[0, 0, 1], [0, 2, 2]].tolist() == [1, 1, -1]
     assert errors.camera(K)[0, 0] > 1.002 * K[0, 0]
+
+
+def test_frames_that_contradict_their_poses_teach_nothing_of_the_camera():
+    errors, found, *_ = known(3, camera=np.array([0.004, 1.0, -0.8, 0.0]))
+    pixel, _, views = scene(5)
+    before = errors.camera(K)
+    errors.corrected(pixel, found, SHARES, views, K, 2.0, trusted=False)
+    np.testing.assert_array_equal(errors.camera(K), before)
 
 
 def test_nothing_measured_leaves_what_is_believed_of_the_poses():

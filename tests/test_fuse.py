@@ -7,8 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_gaussians import mixture
-from test_correspond import as_lists
+from random_gaussians import as_lists, mixture, random_pairs
 
 import oracle
 from ufmstar_torch.config import UfMStarConfig
@@ -16,15 +15,6 @@ from ufmstar_torch.correspond import Correspondence
 from ufmstar_torch.fuse import append, fuse
 
 pytestmark = pytest.mark.numerics
-
-
-def random_pairs(streams: int, previous, current, seed: int, density: float = 0.3) -> Correspondence:
-    generator = torch.Generator().manual_seed(seed)
-    shape = (streams, current.capacity, previous.capacity)
-    match = torch.rand(shape, generator=generator) < density
-    match &= current.valid[:, :, None] & previous.valid[:, None]
-    overlap = 0.5 + 0.5 * torch.rand(shape, generator=generator, dtype=torch.float64)
-    return Correspondence(match, overlap)
 
 
 @pytest.mark.parametrize("weighted", [False, True])

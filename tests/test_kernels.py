@@ -12,8 +12,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_gaussians import covariances, mixture
-from test_fuse import random_pairs
+from random_gaussians import covariances, mixture, random_pairs
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig, frame, gaussian

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from runs import Brightness, job_of, outputs, read_summary
-from test_suite_anchors import Biased, evaluate, in_memory, row
+from tiny_suite import Biased, evaluate, in_memory, row
 
 from ufmstar_torch import UfMStar, UfMStarConfig, UncertainDepth, cli
 from ufmstar_torch.anchors import Anchors, LandmarkMap, LandmarkTracker, landmark_source

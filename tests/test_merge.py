@@ -10,8 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_gaussians import covariances, mixture
-from test_correspond import as_lists
+from random_gaussians import as_lists, covariances, mixture
 
 import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig

@@ -7,8 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_gaussians import mixture
-from test_correspond import as_lists
+from random_gaussians import as_lists, mixture
 
 import oracle
 import scenes

@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_suite import CPU, base_network, evaluate, row, write_network
+from tiny_suite import CPU, Biased, base_network, evaluate, in_memory, row, write_network
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.eval.engine.anchors import TRUTH_SIGMA, AnchorSource, Tracks, anchor_sources
 from ufmstar_torch.eval.engine.estimators import make_estimator, ufm_star_config
-from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.perturb import perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
@@ -23,7 +22,6 @@ from ufmstar_torch.eval.methods.suite import rows_of, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.report.names import row_label
-from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.name import open_tour
 
@@ -42,32 +40,6 @@ def tour():
 def networks(tmp_path_factory):
     file = write_network(tmp_path_factory.mktemp("anchors") / "depth.safetensors", "depth")
     return {"depth_only": base_network(f"depth_only=trained:{file}")}
-
-
-class Biased:
-    """The truth, but what is farther than 2 m is put 40 % too far; as much of a ``DepthSource`` as is asked of it."""
-
-    digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
-    max_depth = None
-
-    def prepared(self, how):
-        return self
-
-    def turn(self, position):
-        return 0
-
-    def prepare(self, frame):
-        pass
-
-    def one(self, frame, n):
-        depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
-        return Prediction(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
-
-
-def in_memory(sequence, part):
-    frames = [sequence[i] for i in range(len(sequence))[part]]
-    entries = (Entry(f.name, f.T_world_cam, lambda f=f: f.image.copy(), lambda f=f: f.depth.copy()) for f in frames)
-    return replace(sequence, entries=tuple(entries), names_on_disk=tuple(f.name for f in frames))
 
 
 def by_hand(sequence, network, anchors_of, *, config=ON, setting=DEFAULT, corrected=False):

@@ -216,6 +216,44 @@ def test_memory_does_not_grow_and_reset_forgets(tour):
         np.testing.assert_array_equal(a.depth, b.depth)
 
 
+def test_corners_are_expected_where_their_depths_and_the_poses_say(tour):
+    tracker, loaded = LandmarkTracker(), LandmarkTracker()
+    for frame in tour[:5]:
+        tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+    followed, T = tracker._seen[:, tracker._view], tour[5].T_world_cam
+    expected, position = tracker._expected(followed, T), tracker._pixel[followed, tracker._view]
+    rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(frame.intrinsics).T
+    world = true_depth(frame, position)[:, None] * rays @ frame.T_world_cam[:3, :3].T + frame.T_world_cam[:3, 3]
+    cam = (world - T[:3, 3]) @ T[:3, :3] @ frame.intrinsics.T
+    truth = cam[:, :2] / cam[:, 2:]
+    moved, off = (np.median(np.linalg.norm(truth - x, axis=1)) for x in (position, expected))
+    assert off < 0.3 * moved
+    loaded.load_state(tracker.state())
+    np.testing.assert_array_equal(loaded._expected(followed, T), expected)
+
+
+def test_every_reason_for_no_landmark(tour):
+    tracker, frame = LandmarkTracker(), tour[0]
+    arguments = frame.T_world_cam, frame.intrinsics
+    assert tracker.update(frame.image, *arguments).none == "no corner followed from the frame before"
+    assert tracker.update(frame.image, *arguments).none == "no parallax, or no track that fits the poses"
+    assert tracker.update(0 * frame.image, *arguments).none == "no corner followed from the frame before"
+
+
+def test_a_state_shares_the_image_and_stays_as_it_was(tour):
+    tracker = LandmarkTracker()
+    for frame in tour[:3]:
+        tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)
+    state = tracker.state()
+    before = {name: value.clone() for name, value in state.items()}
+    assert state["gray"].data_ptr() == tracker._gray.ctypes.data
+    expected = [tracker.update(f.image, f.T_world_cam, f.intrinsics).depth for f in tour[3:6]]
+    assert all(torch.equal(state[name], value) for name, value in before.items())
+    tracker.load_state(state)
+    for frame, depth in zip(tour[3:6], expected, strict=True):
+        np.testing.assert_array_equal(tracker.update(frame.image, frame.T_world_cam, frame.intrinsics).depth, depth)
+
+
 def test_anchors_lie_where_the_depth_map_says(tour):
     tracker = LandmarkTracker()
     for frame in tour[:8]:

@@ -96,7 +96,7 @@ def test_a_loader_goes_on_inside_an_epoch():
     seen += list(resumed)
     assert len(seen) == 5
     for one, two in zip(seen, expected, strict=True):
-        assert all(torch.equal(one[name], two[name]) for name in one)
+        assert all(torch.equal(one[name].nan_to_num(-1), two[name].nan_to_num(-1)) for name in one)
     assert resumed.state_dict() == {"epoch": 4, "batch": 0}
     resumed.set_epoch(4)
     assert len(list(resumed)) == 5
@@ -133,5 +133,5 @@ def test_worker_processes_load_the_same_and_report_broken_files(tmp_path):
         for one in (alone, apart):
             one.set_epoch(epoch)
         for one, two in zip(alone, apart, strict=True):
-            assert all(torch.equal(one[name], two[name]) for name in one)
+            assert all(torch.equal(one[name].nan_to_num(-1), two[name].nan_to_num(-1)) for name in one)
     assert apart.dataset.bad_files() == alone.dataset.bad_files() == (str(frames.files[1]),)

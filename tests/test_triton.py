@@ -15,9 +15,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from random_gaussians import covariances, mixture
+from random_gaussians import covariances, mixture, random_pairs
 from segment_scenes import REFERENCES, numba_spgf, reference
-from test_fuse import random_pairs
 from walks import HEIGHT, SPGF, WIDTH, oracle_run, walks
 
 import scenes

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import torch
 
 from ufmstar_torch.eval.engine.evaluate import Judge, SequenceTask, evaluate_sequences
 from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
 CPU = torch.device("cpu")
@@ -91,3 +96,30 @@ def same(one, other):
         and one.sums.keys() == other.sums.keys()
         and all(torch.equal(one.sums[m][k], other.sums[m][k]) for m in one.sums for k in one.sums[m])
     )
+
+
+class Biased:
+    """The truth, but what is farther than 2 m is put 40 % too far; as much of a ``DepthSource`` as is asked of it."""
+
+    digest, passes, needs_image, cacheable, networks, runtime = "biased", 1, False, False, (), None
+    max_depth = None
+
+    def prepared(self, how):
+        return self
+
+    def turn(self, position):
+        return 0
+
+    def prepare(self, frame):
+        pass
+
+    def one(self, frame, n):
+        depth = np.where(frame.depth > 2, 1.4, 1.0) * frame.depth
+        return Prediction(torch.from_numpy(depth).float(), None, None, torch.from_numpy(frame.intrinsics))
+
+
+def in_memory(sequence, part):
+    """Some frames of a sequence, decoded: to render them again for every test would take most of the time."""
+    frames = [sequence[i] for i in range(len(sequence))[part]]
+    entries = (Entry(f.name, f.T_world_cam, lambda f=f: f.image.copy(), lambda f=f: f.depth.copy()) for f in frames)
+    return replace(sequence, entries=tuple(entries), names_on_disk=tuple(f.name for f in frames))

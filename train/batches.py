@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,18 +25,27 @@ class EpochBatches(Sampler[list[SampleKey]]):
     ``len`` is the number of batches in the whole epoch, also where iteration starts inside it.
 
     Args:
-        length: number of frames.
-        batch_size: frames per process and step.
+        length: number of frames, or of clips.
+        batch_size: frames, or clips, per process and step.
         seed: of the order.
         rank, world: number of this process, and of all.
         shuffle: training or validation.
+        clips: the frames of every clip, which stay together; None = single frames.
 
     Raises:
         ValueError: a number out of range, or fewer frames than one training step takes.
     """
 
     def __init__(
-        self, length: int, batch_size: int, *, seed: int = 0, rank: int = 0, world: int = 1, shuffle: bool = True
+        self,
+        length: int,
+        batch_size: int,
+        *,
+        seed: int = 0,
+        rank: int = 0,
+        world: int = 1,
+        shuffle: bool = True,
+        clips: Sequence[range] | None = None,
     ) -> None:
         if length < 1 or batch_size < 1:
             raise ValueError(f"length and batch_size must be at least 1, got {length} and {batch_size}")
@@ -46,6 +55,7 @@ class EpochBatches(Sampler[list[SampleKey]]):
             raise ValueError(f"a step takes batch_size {batch_size} x {world} processes of only {length} frames")
         self.length, self.batch_size, self.seed = length, batch_size, seed
         self.rank, self.world, self.shuffle = rank, world, shuffle
+        self.clips = clips
         self.epoch = self.start_batch = 0
 
     def set_epoch(self, epoch: int, start_batch: int = 0) -> None:
@@ -66,7 +76,9 @@ class EpochBatches(Sampler[list[SampleKey]]):
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, order = self.epoch, self._order()
         for batch in range(self.start_batch, len(self)):
-            yield [SampleKey(epoch, int(frame), self._counts()) for frame in self._batch(order, batch)]
+            chosen = self._batch(order, batch).tolist()
+            frames = chosen if self.clips is None else [frame for clip in chosen for frame in self.clips[clip]]
+            yield [SampleKey(epoch, frame, self._counts()) for frame in frames]
 
     def _counts(self) -> bool:
         """Whether this process has frames of its own."""

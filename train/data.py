@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -12,7 +14,7 @@ from ufmstar_torch.train.augment import Augmentation
 from ufmstar_torch.train.batches import EpochBatches, EpochLoader
 from ufmstar_torch.train.data_config import DataConfig, Part
 from ufmstar_torch.train.nyu import NyuFrames
-from ufmstar_torch.train.samples import FrameSource, SampleDataset
+from ufmstar_torch.train.samples import FrameSource, SampleDataset, clips
 from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
 from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_frames
 
@@ -25,11 +27,22 @@ class DepthDataModule(LightningDataModule):
     Args:
         config: where frames come from.
         preprocess: the network's.
+        clip_frames: frames that follow one another and stay together in training. From two on, frames are augmented
+            in colour alone: a zoom that divides depth, or a mirror, does not leave the camera's path as it is.
+
+    Raises:
+        ValueError: a batch that clips do not fill.
+
+    Attributes:
+        clips: of the training part, after ``setup``; None with ``clip_frames = 1``.
     """
 
-    def __init__(self, config: DataConfig, preprocess: Preprocess) -> None:
+    def __init__(self, config: DataConfig, preprocess: Preprocess, clip_frames: int = 1) -> None:
         super().__init__()
-        self.config, self.preprocess = config, preprocess
+        if config.batch_size % clip_frames:
+            raise ValueError(f"batch_size {config.batch_size} of a process must be a multiple of {clip_frames} frames")
+        self.config, self.preprocess, self.clip_frames = config, preprocess, clip_frames
+        self.clips: list[range] | None = None
         self.train_set: SampleDataset | None = None
         self.validation_set: SampleDataset | None = None
 
@@ -49,7 +62,11 @@ class DepthDataModule(LightningDataModule):
             return
         c = self.config
         train, validation = sources(c)
-        augmentation = None if c.augmentation is None else Augmentation(c.augmentation)
+        config = c.augmentation
+        if self.clip_frames > 1:
+            self.clips = clips(train, self.clip_frames)
+            config = None if config is None else replace(config, scale=(1.0, 1.0), rotation=0.0, flip=0.0)
+        augmentation = None if config is None else Augmentation(config)
         self.train_set = SampleDataset(train, self.preprocess, augmentation, seed=c.seed, on_bad_file=c.on_bad_file)
         self.validation_set = SampleDataset(validation, self.preprocess, on_bad_file=c.on_bad_file, evaluate=True)
 
@@ -70,7 +87,11 @@ class DepthDataModule(LightningDataModule):
             raise RuntimeError("call setup() before asking for a loader")
         rank, world = (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
         c = self.config
-        batches = EpochBatches(len(dataset), c.batch_size, seed=c.seed, rank=rank, world=world, shuffle=shuffle)
+        order: dict[str, Any] = {"seed": c.seed, "rank": rank, "world": world, "shuffle": shuffle}
+        if shuffle and self.clips is not None:
+            batches = EpochBatches(len(self.clips), c.batch_size // self.clip_frames, clips=self.clips, **order)
+        else:
+            batches = EpochBatches(len(dataset), c.batch_size, **order)
         return EpochLoader(dataset, batches, workers=c.workers, pin_memory=torch.cuda.is_available())
 
 

@@ -87,7 +87,7 @@ def make_data(job: Job, member: int, world: int) -> DepthDataModule:
     if job.recipe.batch_size % world:
         raise ValueError(f"batch_size {job.recipe.batch_size} must be a multiple of the {world} processes")
     config = replace(job.data, batch_size=job.recipe.batch_size // world, seed=job.seed(member))
-    data = DepthDataModule(config, job.recipe.network.input())
+    data = DepthDataModule(config, job.recipe.network.input(), job.recipe.clip_frames)
     data.setup("fit")
     return data
 
@@ -99,6 +99,8 @@ def training_length(job: Job, data: DepthDataModule) -> tuple[int, int]:
         ValueError: an epoch has no full batch.
     """
     images, batch = len(data.train_set or ()), job.recipe.batch_size
+    if data.clips is not None:
+        images = len(data.clips) * job.recipe.clip_frames
     if images < batch:
         raise ValueError(f"the training part has {images} images, fewer than batch_size {batch}")
     steps = job.recipe.max_steps or job.recipe.epochs * (images // batch)

@@ -17,8 +17,10 @@ from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from ufmstar_torch.models.batch_ensemble import BatchEnsemble
-from ufmstar_torch.models.distribution import DepthDistribution
+from ufmstar_torch.models.distribution import DepthDistribution, GaussianDepth
 from ufmstar_torch.models.network import DepthNetwork
+from ufmstar_torch.prediction import stated_range
+from ufmstar_torch.train.distil import Teacher, distillation_sums
 from ufmstar_torch.train.losses import loss_sums
 from ufmstar_torch.train.presets import Recipe
 from ufmstar_torch.train.progress import Sums, Validation
@@ -61,6 +63,8 @@ class TrainingModule(pl.LightningModule):
         self.losses = Sums()
         self.validation = Validation()
         self._batch_idx = 0
+        # No module of this one: nothing of it is kept from step to step.
+        self._teacher = Teacher(recipe.clip_frames, stated_range([network])) if recipe.clip_frames > 1 else None
 
     @property
     def result(self) -> DepthNetwork:
@@ -97,7 +101,7 @@ class TrainingModule(pl.LightningModule):
         """
         distribution = self._distribution(batch["image"])
         target, valid = _tiled(batch["depth"], distribution), _tiled(batch["valid"], distribution)
-        total, count = loss_sums(distribution, target, valid)
+        total, count = self._loss_sums(batch, distribution, target, valid)
         error = torch.where(valid, distribution.depth.detach().float() - target, 0.0).double()
         mine = torch.stack([total.detach().double(), count.double(), error.square().sum(), valid.sum().double()])
         together, world = self._over_processes(mine)
@@ -180,6 +184,15 @@ class TrainingModule(pl.LightningModule):
         if self.recipe.split_batch:
             return self.network.distribution(image, repeat=False)
         return self.network.distribution(image)
+
+    def _loss_sums(
+        self, batch: Batch, distribution: DepthDistribution, target: Tensor, valid: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The sum of the loss over this process's pixels, and their number."""
+        if self._teacher is None or not isinstance(distribution, GaussianDepth):
+            return loss_sums(distribution, target, valid)
+        variance, measured = self._teacher(distribution.depth, batch["T_world_cam"], batch["intrinsics"])
+        return distillation_sums(distribution, target, valid, variance, measured)
 
     def _over_processes(self, values: Tensor) -> tuple[Tensor, int]:
         """The sum over all processes, and their number."""

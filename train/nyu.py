@@ -57,6 +57,10 @@ class NyuFrames:
         """The file."""
         return str(self.files[index])
 
+    def runs(self) -> list[range]:
+        """None: the frames have no poses."""
+        return []
+
     def load(self, index: int) -> RawSample:
         """Reads a file; nothing stays open, so that worker processes share nothing.
 

@@ -35,6 +35,9 @@ class Recipe(Checked):
         epochs: passes over the training part.
         max_steps: optimizer steps of one member, at which the schedule ends; 0 = all steps of the epochs.
         batch_size: images per step, over all processes together.
+        clip_frames: frames that follow one another, of which a batch consists; 1 = single images. From 2 on, the head
+            learns the variance that UfM* computes in the loop from the network's own depth, instead of its error
+            (``train.distil``).
         learning_rate: Adam's step size after the warm-up.
         schedule: of the learning rate: "cosine" (down to 0 at the last step) or "constant".
         warmup_steps: number of steps in which the learning rate rises linearly from 0.
@@ -56,6 +59,7 @@ class Recipe(Checked):
     epochs: int = number(50, "N", "epochs", 1, 1e6)
     max_steps: int = number(0, "N", "steps", 0, 1e9)
     batch_size: int = number(8, "B", "images", 1, 1e5)
+    clip_frames: int = number(1, "T", "frames", 1, 1000)
     learning_rate: float = number(1e-3, "lr", "1", 0, 10, open_low=True)
     schedule: str = choice("cosine", "constant")
     warmup_steps: int = number(0, "N", "steps", 0, 1e9)
@@ -71,6 +75,12 @@ class Recipe(Checked):
         super().__post_init__()
         if self.network.method == "batch_ensemble" and self.members > 1:
             raise ValueError("Recipe.members must be 1 for a batch_ensemble: its members are Recipe.network.members")
+        if self.clip_frames > 1 and self.network.method not in ("aleatoric", "mc_dropout"):
+            raise ValueError(f"Recipe.clip_frames above 1 needs an aleatoric head, got method {self.network.method!r}")
+        if self.batch_size % self.clip_frames:
+            raise ValueError(
+                f"Recipe.batch_size {self.batch_size} must be a multiple of clip_frames {self.clip_frames}"
+            )
         if self.split_batch and not 1 < self.network.members <= self.batch_size:
             raise ValueError(
                 "Recipe.split_batch needs a batch_ensemble with no more members than batch_size, got "
@@ -79,7 +89,10 @@ class Recipe(Checked):
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain values for JSON."""
-        return {**super().to_dict(), "network": self.network.to_dict()}
+        values = {**super().to_dict(), "network": self.network.to_dict()}
+        if self.clip_frames == 1:
+            del values["clip_frames"]  # as files have it that are older than the field
+        return values
 
     def with_members(self, count: int) -> Recipe:
         """The recipe with another number of members, of the ensemble or of the BatchEnsemble."""
@@ -117,6 +130,13 @@ _DEMO = Recipe(
     average=0.999,
     half=True,
 )
+# UfM*'s variance as the head's: clips of four frames, and no dropout, whose noise would be disagreement as well.
+_DISTILLED = Recipe(
+    network=NetworkSpec(architecture="fastdepth", method="aleatoric", positive="softplus"),
+    clip_frames=4,
+    clip=10.0,
+    **{**OURS["fastdepth"], "batch_size": 16},
+)
 
 
 def _paper(architecture: str, network: dict[str, Any], members: int) -> Recipe:
@@ -128,7 +148,7 @@ PRESETS: dict[str, Recipe] = {
     f"{architecture}-{row}": _paper(architecture, network, members)
     for architecture in OURS
     for row, (network, members) in _METHOD_ROWS.items()
-} | {"demo": _DEMO}
+} | {"fastdepth-ufmstar": _DISTILLED, "demo": _DEMO}
 
 
 _SOURCES = """From the paper (Section V-A): method, members, size, epochs, decay, dropout, Adam's betas (.9, .999), and
@@ -137,7 +157,7 @@ learning rate and its schedule; one head at full resolution (--network.head_scal
 four, as Poggi et al.); dropout after the second convolution of a level
 (--network.dropout_both true: after both); every image trains all members of a BatchEnsemble (--split-batch true: one
 each, with --batch-size 10 or more). fastdepth ends in a ReLU as published; --network.positive softplus is ours and
-better from scratch. The preset demo is ours."""
+better from scratch. The presets demo and fastdepth-ufmstar, whose head learns UfM*'s variance, are ours."""
 
 
 def preset(name: str) -> Recipe:

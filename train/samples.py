@@ -14,6 +14,7 @@ from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
 
 _LOG = logging.getLogger(__name__)
+_UNKNOWN = torch.full((4, 4), torch.nan, dtype=torch.float64)  # a pose
 
 
 class SampleError(Exception):
@@ -37,13 +38,15 @@ class Sample(TypedDict):
     """One training sample at the network's size; a loader stacks them along a first dimension.
 
     image [3, H, W] float32 as the network's ``Preprocess`` returns it; depth [H, W] float32 [m], 0 = none;
-    valid [H, W] bool, True = has ground truth; intrinsics [3, 3] float64 [px].
+    valid [H, W] bool, True = has ground truth; intrinsics [3, 3] float64 [px]; T_world_cam [4, 4] float64
+    camera-to-world [m], NaN = not known.
     """
 
     image: Tensor
     depth: Tensor
     valid: Tensor
     intrinsics: Tensor
+    T_world_cam: Tensor
 
 
 class SampleKey(NamedTuple):
@@ -63,11 +66,13 @@ class RawSample:
         image: [3, H, W] uint8 RGB.
         depth: [H, W] float32 [m]; 0 or not finite = none.
         intrinsics: [3, 3] float64 [px].
+        T_world_cam: [4, 4] float64 camera-to-world [m]; None = not known.
     """
 
     image: Tensor
     depth: Tensor
     intrinsics: Tensor
+    T_world_cam: Tensor | None = None
 
 
 class FrameSource(Protocol):
@@ -81,6 +86,10 @@ class FrameSource(Protocol):
 
     def load(self, index: int) -> RawSample:
         """Decodes frame ``index``; raises :class:`SampleError` where its file is broken."""
+        ...
+
+    def runs(self) -> list[range]:
+        """Numbers of frames that follow one another on a known path, of all paths; [] of single images."""
         ...
 
 
@@ -142,6 +151,8 @@ class SampleDataset(Dataset[Sample]):
         sample = make_sample(raw, self.preprocess, self.augmentation, (self.seed, epoch, index))
         if not counts or (self.evaluate and number != index):
             sample["valid"] = torch.zeros_like(sample["valid"])
+        if number != index:  # perhaps of another path
+            sample["T_world_cam"] = _UNKNOWN.clone()
         return sample
 
     def bad_files(self) -> tuple[str, ...]:
@@ -182,4 +193,17 @@ def make_sample(
         image, depth, K = augmentation(image, depth, K, seed)
     x, K_network = preprocess(image[None], K)
     depth = preprocess.apply_depth(depth)
-    return Sample(image=x[0], depth=depth.contiguous(), valid=depth > 0, intrinsics=K_network)
+    pose = _UNKNOWN.clone() if raw.T_world_cam is None else raw.T_world_cam.to(torch.float64)
+    return Sample(image=x[0], depth=depth.contiguous(), valid=depth > 0, intrinsics=K_network, T_world_cam=pose)
+
+
+def clips(source: FrameSource, length: int) -> list[range]:
+    """The frames of a source in clips that do not overlap; what is left at the end of a path is in none.
+
+    Raises:
+        ValueError: there is none.
+    """
+    found = [run[i : i + length] for run in source.runs() for i in range(0, len(run) - length + 1, length)]
+    if not found:
+        raise ValueError(f"clip_frames: the training part has no {length} frames with known poses one after the other")
+    return found

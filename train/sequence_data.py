@@ -53,6 +53,12 @@ class SequenceFrames:
         sequence = self.sequences[number]
         return f"{sequence.name}/{sequence.entries[frame].name}"
 
+    def runs(self) -> list[range]:
+        """The frames of every sequence with poses."""
+        of = [number for number, _ in self._frames]
+        posed = [number for number in range(len(self.sequences)) if self.sequences[number].posed and number in of]
+        return [range(of.index(number), of.index(number) + of.count(number)) for number in posed]
+
     def load(self, index: int) -> RawSample:
         """Decodes a frame.
 
@@ -73,6 +79,7 @@ class SequenceFrames:
             image=torch.from_numpy(np.ascontiguousarray(frame.image.transpose(2, 0, 1))),
             depth=torch.from_numpy(np.ascontiguousarray(depth, np.float32)),
             intrinsics=torch.from_numpy(frame.intrinsics),
+            T_world_cam=torch.from_numpy(frame.T_world_cam) if self.sequences[number].posed else None,
         )
 
 

@@ -1,9 +1,10 @@
 """Rendered tours as training frames, rendered once into memory-mapped files.
 
 A tour's files are ``<seed>.image.npy`` (uint8 [F, 3, H, W]), ``<seed>.depth.npy`` (uint16 [F, H, W] in
-millimetres, 0 = none) and ``<seed>.camera.npy`` (float64 [3, 3]), written atomically and the camera last, so
-that its presence means that the tour is complete. The name of their folder is a digest of everything that decides
-their content, the renderer's source included, so that other settings and other versions have folders of their own.
+millimetres, 0 = none), ``<seed>.pose.npy`` (float64 [F, 4, 4], camera-to-world) and ``<seed>.camera.npy`` (float64
+[3, 3]), written atomically and the camera last, so that its presence means that the tour is complete. The name of
+their folder is a digest of everything that decides their content, the renderer's source included, so that other
+settings and other versions have folders of their own.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class TourFrames:
 
     def __init__(self, folder: Path, seeds: Iterable[int], frames: int) -> None:
         self.folder, self.seeds, self.frames = folder, tuple(seeds), frames
-        self._maps: dict[int, tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.float64]]] = {}
+        self._maps: dict[int, tuple[NDArray[Any], ...]] = {}
 
     def __getstate__(self) -> dict[str, object]:
         # A worker process maps the files itself: a pickled map would be a copy of all of it.
@@ -99,6 +100,10 @@ class TourFrames:
         """The tour's file and the frame."""
         return f"{self.folder / str(self.seeds[index // self.frames])}.image.npy[{index % self.frames}]"
 
+    def runs(self) -> list[range]:
+        """The frames of every tour."""
+        return [range(n, n + self.frames) for n in range(0, len(self), self.frames)]
+
     def load(self, index: int) -> RawSample:
         """Reads a frame.
 
@@ -107,19 +112,21 @@ class TourFrames:
         """
         seed, frame = self.seeds[index // self.frames], index % self.frames
         try:
-            image, depth, camera = self._mapped(seed)
+            image, depth, pose, camera = self._mapped(seed)
             return RawSample(
                 image=torch.from_numpy(image[frame].copy()),
                 depth=torch.from_numpy(depth[frame].astype(np.float32) * np.float32(_UNIT)),
                 intrinsics=torch.from_numpy(camera.copy()),
+                T_world_cam=torch.from_numpy(pose[frame].copy()),
             )
         except (OSError, ValueError, IndexError) as error:
             raise SampleError(self.name(index), f"cannot be read: {error}") from error
 
-    def _mapped(self, seed: int) -> tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.float64]]:
+    def _mapped(self, seed: int) -> tuple[NDArray[Any], ...]:
         if seed not in self._maps:
-            image, depth, camera = tour_files(self.folder, seed)
-            self._maps[seed] = np.load(image, mmap_mode="r"), np.load(depth, mmap_mode="r"), np.load(camera)
+            image, depth, *small = tour_files(self.folder, seed)
+            maps = (np.load(file, mmap_mode="r") for file in (image, depth))
+            self._maps[seed] = (*maps, *map(np.load, small))
         return self._maps[seed]
 
 
@@ -152,7 +159,7 @@ def tour_frames(
         raise ValueError(f"seeds must hold at least one and workers be at least 1, got {len(seeds)} and {workers}")
     folder = (default_cache() if cache is None else Path(cache)) / f"tours-{settings.digest()}"
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [seed for seed in seeds if not tour_files(folder, seed)[2].exists()]
+    missing = [seed for seed in seeds if not tour_files(folder, seed)[-1].exists()]
     random.Random(os.getpid()).shuffle(missing)
     done = len(seeds) - len(missing)
     if missing:
@@ -164,9 +171,9 @@ def tour_frames(
     return TourFrames(folder, seeds, settings.frames)
 
 
-def tour_files(folder: Path, seed: int) -> tuple[Path, Path, Path]:
-    """A tour's images, depth maps and camera."""
-    return folder / f"{seed}.image.npy", folder / f"{seed}.depth.npy", folder / f"{seed}.camera.npy"
+def tour_files(folder: Path, seed: int) -> tuple[Path, ...]:
+    """A tour's images, depth maps, poses and camera."""
+    return tuple(folder / f"{seed}.{part}.npy" for part in ("image", "depth", "pose", "camera"))
 
 
 def default_cache() -> Path:
@@ -180,7 +187,7 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
     from ufmstar_torch.eval.tour import tour_sequence
 
     files = tour_files(folder, seed)
-    if files[2].exists():
+    if files[-1].exists():
         return
     sequence = tour_sequence(
         seed,
@@ -192,13 +199,15 @@ def render_tour(folder: Path, settings: TourSettings, seed: int) -> None:
     )
     image = np.empty((settings.frames, 3, *settings.size), np.uint8)
     depth = np.empty((settings.frames, *settings.size), np.uint16)
+    pose = np.empty((settings.frames, 4, 4))
     for i in range(settings.frames):
         frame = sequence[i * settings.stride]
         if frame.image is None or frame.depth is None:
             raise ValueError(f"tour {seed}: frame {frame.name} has no image or depth")
         image[i] = frame.image.transpose(2, 0, 1)
         depth[i] = np.rint(frame.depth / _UNIT).clip(0, _FARTHEST)
-    arrays: tuple[NDArray[Any], ...] = (image, depth, sequence.intrinsics)
+        pose[i] = frame.T_world_cam
+    arrays: tuple[NDArray[Any], ...] = (image, depth, pose, sequence.intrinsics)
     write_together({path: partial(np.save, arr=array) for path, array in zip(files, arrays, strict=True)})
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
 from torch import Tensor
@@ -476,7 +476,8 @@ class UfMStar(StatefulModule):
         return [value for value, counts in both if value is not None and counts]
 
     def _stored(self) -> UfMStarState:
-        return UfMStarState(**{name: self._buffers[name] for name in self.STATE})
+        buffers = cast("dict[str, Tensor]", self._buffers)  # none is None; without the detour by ``__getattr__``
+        return UfMStarState(**{name: buffers[name] for name in self.STATE})
 
     def _step(self, device_type: str) -> Step:
         """The step for a device, the same one as long as the state goes on."""

@@ -190,8 +190,8 @@ class _TimedTracker(LandmarkTracker):
                 clock["rest"][-1] -= times[-1]
         return landmarks
 
-    def _followed(self, gray: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
-        return self.times.time("following", super()._followed, gray)
+    def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+        return self.times.time("following", super()._followed, gray, T)
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
         free = int((~self._seen[:, self._view]).sum())

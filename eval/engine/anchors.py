@@ -40,7 +40,7 @@ class FrameAnchors:
         tracked: corners that were followed from the frame before; 0 of ground truth.
         triangulated: those of them with a depth; of ground truth, all.
         ms: of the tracker [ms]; None of ground truth.
-        none: why there is none, where something was tracked and nothing triangulated.
+        none: why nothing was triangulated, where that is so.
     """
 
     anchors: Anchors | None
@@ -59,7 +59,7 @@ class Tracks:
 
     def __init__(self, source: LandmarkSource | None = None) -> None:
         self._tracker = LandmarkTracker() if source is None else source
-        self._before: dict[str, Tensor] = {}
+        self._before: Mapping[str, Tensor] = {}
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     @property
@@ -141,10 +141,10 @@ class AnchorSource:
         if self.tracks is None:
             known = np.zeros(prediction.size, np.float32) if truth is None else truth
             sampled = self._sampled(known, frame.index).to(device)
-            return FrameAnchors(sampled, triangulated=sampled.depth.shape[1])
+            return FrameAnchors(sampled, triangulated=sampled.depth.shape[1], none="no ground truth")
         tracked = self.tracks.of(frame, T_world_cam)
         if tracked is None:
-            return FrameAnchors(None)
+            return FrameAnchors(None, none="no image")
         landmarks, ms = self._thinned(self._disturbed(tracked[0], frame.index), frame.index), tracked[1]
         anchors = landmarks.anchors(frame.intrinsics, prediction.intrinsics).to(device)
         return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms, landmarks.none)

@@ -209,14 +209,12 @@ def _corners(anchors: FrameAnchors, estimate: Estimate) -> dict[str, Any]:
     assert estimate.statistics is not None
     used, usable = int(estimate.statistics.anchors_used[0]), int(estimate.statistics.anchors[0])
     counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
-    why = None if used else why_none(anchors.tracked, anchors.triangulated, usable, anchors.none)
+    why = None if used else why_none(anchors.triangulated, usable, anchors.none)
     return {**counts, "without": why}
 
 
-def why_none(tracked: int, triangulated: int, usable: int, none: str) -> str:
-    """Why a frame has no anchors, from how many were left at each stage, and why none was triangulated."""
-    if not tracked:
-        return "no corner followed from the frame before"
+def why_none(triangulated: int, usable: int, none: str) -> str:
+    """Why a frame has no anchors, from how many were left at each stage, and the source's reason where it has none."""
     if not triangulated:
         return none
     return "none lies on a pixel with a depth" if not usable else "they contradict each other"

@@ -185,12 +185,12 @@ class DenseEvidence:
             noise = self._errors.positions(K, small.shape[1], self._depth)[shares]
             views = self._views([keyframe for _, keyframe in chosen], noise, T, K)
             actual = measure(small, pixel[expected], views, self._search())
-            fit = self._errors.corrected(pixel[expected], actual, shares, views, K, self._depth)
-            searched = len(expected)
-            rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
             agreed[expected] = (actual.agreed >= _AGREE) & (actual.contradicted == 0)
             matched = int((actual.agreed > 0).sum())
             trusted = matched < _ENOUGH or agreed.sum() >= self.config.min_share * matched
+            fit = self._errors.corrected(pixel[expected], actual, shares, views, K, self._depth, trusted)
+            searched = len(expected)
+            rho[expected], variance[expected] = fit.rho, fit.variance + np.square(_SCALE * fit.rho)
         self._contradicted = 0 if trusted else self._contradicted + 1
         agreed &= (rho > np.sqrt(variance)) & trusted
         both, fine = self._memory.compare(sighted, rho[:known], variance[:known], agreed[:known])

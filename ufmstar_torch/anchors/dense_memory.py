@@ -16,7 +16,7 @@ _DUE, _SELDOM = 0.04, 4
 # Confirmed where two measurements differ by at most so many standard deviations, and this share of the inverse depth.
 _SIGMAS, _SHARE = 3.5, 0.01
 # Measurements on which the running estimate of ``apart`` is based, its first value, and steps of its bisection.
-_ENOUGH, _FIRST_APART, _STEPS = 10, 0.01**2, 16
+_ENOUGH, _FIRST_APART, _STEPS = 10, 0.01**2, 8
 # The median of the square of a standard normal variable.
 _MEDIAN_SQUARE = 0.4549
 # Failures in a row, beyond the number of confirmations, after which a landmark is forgotten.
@@ -201,7 +201,7 @@ class Memory:
 
 def _beyond(square: NDArray[np.float64], variance: NDArray[np.float64]) -> float:
     """The variance that, added to those stated, makes squared differences of a median as they should have."""
-    low, high = 1e-8, 0.3**2
+    low, high = 1e-7, 0.3**2
     if np.median(square / (variance + low)) <= _MEDIAN_SQUARE:
         return 0.0
     for _ in range(_STEPS):

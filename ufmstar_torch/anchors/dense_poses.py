@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.kernels.dense_cpu import Measured, Views
-from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, linearised, solved
+from ufmstar_torch.kernels.poses_cpu import CAMERA, POSE, Shown, Solution, linearised, solved
 
 # Matches on which running estimates are based.
 _ENOUGH = 10
@@ -114,6 +114,7 @@ class PoseErrors:
         views: Views,
         K: NDArray[np.float64],
         depth: float,
+        trusted: bool = True,
     ) -> Fit:
         """Depths without the errors that the pixels show together. What is known of the errors follows.
 
@@ -124,6 +125,7 @@ class PoseErrors:
             views: V keyframes.
             K: [3, 3] of :meth:`camera` [px], which the views have.
             depth: median of the scene [m].
+            trusted: False = nothing is learnt of the camera: poses and images contradict each other.
         """
         used = (measured.agreed >= 2)[:, None] & np.isfinite(measured.value)
         shows = used & np.isfinite(measured.across)
@@ -141,7 +143,9 @@ class PoseErrors:
             np.where(shows, measured.across_noise + left, np.inf),
         )
         solution = solved(shown, *self._before(shares))
-        self._learn(solution.error, solution.covariance, shares, K, views.image.shape[2], depth)
+        self._learn_poses(solution, shares, K, depth)
+        if trusted:
+            self._learn_camera(solution, views.image.shape[2])
         self._learn_noise(solution.residual[used], solution.beside, measured.across_noise, shows, shares)
         factor = max(self._disagreement, (1 + self._disagreement) / 2)  # half is the patch's, which all views share
         variance = factor * own.min(1, initial=np.inf) + solution.common
@@ -158,26 +162,20 @@ class PoseErrors:
         precision[n:, n:] = np.linalg.inv(self._covariance)
         return precision, np.concatenate([np.zeros(n + 3), self._camera[3:]])  # K has the first three
 
-    def _learn(
-        self,
-        error: NDArray[np.float64],
-        covariance: NDArray[np.float64],
-        shares: NDArray[np.int64],
-        K: NDArray[np.float64],
-        width: int,
-        depth: float,
-    ) -> None:
-        remains = covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
-        square = np.square(error[:-CAMERA]).reshape(-1, 2, 3).sum(2)
+    def _learn_poses(self, solution: Solution, shares: NDArray[np.int64], K: NDArray[np.float64], depth: float) -> None:
+        remains = solution.covariance.diagonal()[:-CAMERA].reshape(-1, 2, 3).sum(2)
+        square = np.square(solution.error[:-CAMERA]).reshape(-1, 2, 3).sum(2)
         least = np.square(_LEAST / K[0, 0]) * np.array([1, depth**2])
         for share, left, each in zip(shares, remains, square, strict=True):
             before = self._variance[share]
             shown = 3 - left / before  # of the three numbers, what the pixels showed
             step = (1 - self._memory) * (each - shown * before) / np.maximum(shown, 1)
             self._variance[share] = np.maximum(before + step, least)
+
+    def _learn_camera(self, solution: Solution, width: int) -> None:
         before, first = np.linalg.inv(self._covariance), np.linalg.inv(self._prior(width))
-        now = np.linalg.inv(covariance[-CAMERA:, -CAMERA:])
-        measured = error[-CAMERA:] + np.append(self._camera[:3], 0)
+        now = np.linalg.inv(solution.covariance[-CAMERA:, -CAMERA:])
+        measured = solution.error[-CAMERA:] + np.append(self._camera[:3], 0)
         weighted = (1 - _PART) * before @ self._camera + _PART * now @ measured
         self._covariance = np.linalg.inv((1 - _FADES) * ((1 - _PART) * before + _PART * now) + _FADES * first)
         self._camera = self._covariance @ weighted * (1 - _FADES)

@@ -22,7 +22,7 @@ from ufmstar_torch.camera import invert_rigid
 
 CORNERS, DENSE = "corners", "dense"
 FILE_TYPES = (".csv", ".txt", ".npz")
-# Landmarks of one image: as many as a tracker follows, or a few more. Each anchor is compared with all others.
+# Landmarks of one image: as many as a tracker follows, or a few more.
 _MOST = 500
 
 
@@ -56,7 +56,8 @@ class LandmarkSource(Protocol):
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """A copy of all on which the next landmarks depend."""
+        """All on which the next landmarks depend, taken before every image: images are shared, not copied, and must
+        not be written to."""
         ...
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from torch import Tensor
 from ufmstar_torch.anchors.corners import find, follow
 from ufmstar_torch.anchors.given import Anchors
 
+if TYPE_CHECKING:
+    from ufmstar_torch.kernels.triangulate_cpu import Triangulated
+
 # Tracks by which a frame's poses are judged.
 _ENOUGH = 5
 # Errors of a tracked position add up from view to view: the variance of a track of v views is _DRIFT (v - 1) times that
@@ -26,6 +29,10 @@ _DRIFT = 0.6
 # Share of the running estimate of the residuals' variance that remains after a frame; views of the tracks that it is
 # from.
 _MEMORY, _LONG = 0.8, 4
+# Why an image has no landmark.
+_NO_TRACK, _NO_DEPTH = "no corner followed from the frame before", "no parallax, or no track that fits the poses"
+# Of the median depth: nearer, a point's position in an image is not computed but bounded.
+_NEAREST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ class Landmarks:
         variance: [N] of ``depth`` [m^2].
         tracked: corners followed into this image, of which these N passed all tests; of a map, its landmarks.
         confirmed: [N] int64, in how many later views each was confirmed; None = unknown.
-        none: why there is no landmark, where N = 0 and ``tracked`` > 0.
+        none: why there is no landmark, where N = 0.
     """
 
     pixel: NDArray[np.float64]
@@ -105,7 +112,7 @@ class Landmarks:
     variance: NDArray[np.float64]
     tracked: int
     confirmed: NDArray[np.int64] | None = None
-    none: str = "no parallax, or no track that fits the poses"
+    none: str = "no parallax, or no earlier view that agrees"
 
     def anchors(self, K_camera: NDArray[np.float64], intrinsics: Tensor, capacity: int | None = None) -> Anchors:
         """As UfM* takes them, for one stream whose depth map has its own size and intrinsics.
@@ -169,13 +176,15 @@ class LandmarkTracker:
         self._poses = np.tile(np.eye(4), (w, 1, 1))
         self._view = -1
         self._noise = self.config.pixel_noise**2
+        self._point = np.full((n, 3), np.nan)  # of the corners in the newest image [m]; the window decides it
 
     def state(self) -> dict[str, Tensor]:
-        """A copy of all that is remembered, for :meth:`load_state`: the window, and the last image in gray."""
+        """All that is remembered, for :meth:`load_state`: the window, and the last image in gray, which is shared and
+        must not be written to."""
         gray = np.zeros((0, 0), dtype=np.uint8) if self._gray is None else self._gray
         K = np.eye(3) if self._K is None else self._K
-        held = {"gray": gray, "K": K, "pixel": self._pixel, "seen": self._seen, "poses": self._poses}
-        own = {name: torch.tensor(value) for name, value in held.items()}
+        held = {"K": K, "pixel": self._pixel, "seen": self._seen, "poses": self._poses}
+        own = {"gray": torch.from_numpy(gray)} | {name: torch.tensor(value) for name, value in held.items()}
         noise = torch.tensor(self._noise, dtype=torch.float64)
         return own | {"view": torch.tensor(self._view), "noise": noise}
 
@@ -188,11 +197,13 @@ class LandmarkTracker:
         shape, own = tuple(state["pixel"].shape), self._pixel.shape
         if shape != own:
             raise ValueError(f"state must be of {own[0]} points in {own[1]} views, got {shape[0]} in {shape[1]}")
-        gray, K, self._pixel, self._seen, self._poses = (
-            np.array(state[name].numpy()) for name in ("gray", "K", "pixel", "seen", "poses")
+        gray = state["gray"].numpy()
+        K, self._pixel, self._seen, self._poses = (
+            np.array(state[name].numpy()) for name in ("K", "pixel", "seen", "poses")
         )
         self._gray, self._K = (gray, K) if gray.size else (None, None)
         self._view, self._noise = int(state["view"]), float(state["noise"])
+        self._triangulated()
 
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
@@ -217,7 +228,7 @@ class LandmarkTracker:
         if self._gray is not None and self._K is not None:
             if gray.shape != self._gray.shape or not np.array_equal(K, self._K):
                 raise ValueError("image and K must be of the size and camera of the images before: call reset() first")
-            position, alive = self._followed(gray)
+            position, alive = self._followed(gray, T)
         else:
             position, alive = np.zeros((self.config.max_points, 2)), np.zeros(self.config.max_points, dtype=bool)
         self._view = (self._view + 1) % self.config.window
@@ -230,12 +241,33 @@ class LandmarkTracker:
         self._gray, self._K = gray, K
         return self._landmarks(tracked)
 
-    def _followed(self, gray: NDArray[np.uint8]) -> tuple[NDArray, NDArray]:
+    def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
         """Positions [N, 2] in the new image and which corners could be followed there and back [N]."""
         position, alive = self._pixel[:, self._view].copy(), self._seen[:, self._view].copy()
         if alive.any() and self._gray is not None:
-            position[alive], alive[alive] = follow(self._gray, gray, position[alive], self.config.back_tolerance)
+            start, expected = position[alive], self._expected(alive, T)
+            position[alive], alive[alive] = follow(self._gray, gray, start, self.config.back_tolerance, expected)
         return position, alive
+
+    def _expected(self, chosen: NDArray[np.bool_], T: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Where the chosen corners of the last image should be in that of a camera T [4, 4]: each moves as its point
+        does. One without a point has the others' median depth; None where too few have one."""
+        last, K = self._poses[self._view], self._K
+        assert K is not None
+        position, point = self._pixel[chosen, self._view], self._point[chosen]
+        depth = (point - last[:3, 3]) @ last[:3, 2]
+        known = np.isfinite(depth)
+        if known.sum() < _ENOUGH:
+            return None
+        rays = np.concatenate([position, np.ones((len(position), 1))], axis=1) @ np.linalg.inv(K).T
+        usual = np.median(depth[known])
+        point = np.where(known[:, None], point, usual * rays @ last[:3, :3].T + last[:3, 3])
+
+        def seen_by(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+            cam = (point - pose[:3, 3]) @ pose[:3, :3]
+            return np.asarray(cam @ K[:2].T / np.maximum(cam[:, 2:], _NEAREST * usual))
+
+        return np.asarray(position + seen_by(T) - seen_by(last))
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
         """New corners in free slots, away from those that are followed."""
@@ -251,15 +283,27 @@ class LandmarkTracker:
         self._seen[slots, self._view] = True
         self._pixel[slots, self._view] = result
 
-    def _landmarks(self, tracked: int) -> Landmarks:
-        """What the views in the window say of the corners that the newest one shows."""
-        config = self.config
-        chosen = self._seen[:, self._view] & (self._seen.sum(1) >= config.min_views)
+    def _triangulated(self) -> tuple[NDArray[np.bool_], Triangulated | None]:
+        """Which corners of the newest image have views enough in the window [N], and their points; those that fit are
+        remembered."""
+        chosen = self._seen[:, self._view] & (self._seen.sum(1) >= self.config.min_views)
+        self._point = np.full((self.config.max_points, 3), np.nan)
         if not chosen.any() or self._K is None:
-            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked)
+            return chosen, None
         from ufmstar_torch.kernels.triangulate_cpu import triangulate  # compiles when it is first needed
 
         result = triangulate(self._pixel[chosen], self._seen[chosen], self._poses, self._K)
+        fine = result.ahead & (result.error <= self.config.max_error)
+        self._point[chosen] = np.where(fine[:, None], result.point, np.nan)
+        return chosen, result
+
+    def _landmarks(self, tracked: int) -> Landmarks:
+        """What the views in the window say of the corners that the newest one shows."""
+        config = self.config
+        chosen, result = self._triangulated()
+        none = _NO_DEPTH if tracked else _NO_TRACK
+        if result is None:
+            return Landmarks(np.zeros((0, 2)), np.zeros(0), np.zeros(0), tracked, none=none)
         T = self._poses[self._view]
         axis = T[:3, 2]
         depth = (result.point - T[:3, 3]) @ axis
@@ -278,7 +322,7 @@ class LandmarkTracker:
         # Hopeless geometry can make the covariance indefinite.
         independent = np.maximum(residual, config.pixel_noise**2) * one_pixel
         fine &= (variance >= 0) & (independent <= np.square(config.max_relative_sigma * safe))
-        return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked)
+        return Landmarks(self._pixel[chosen][fine, self._view], depth[fine], variance[fine], tracked, none=none)
 
 
 def checked(image: NDArray | None, T_world_cam: NDArray, K: NDArray) -> tuple[NDArray[np.uint8], NDArray, NDArray]:

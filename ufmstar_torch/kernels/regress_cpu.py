@@ -15,9 +15,10 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.kernels.regress_cull_cpu import in_view
 from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
 from ufmstar_torch.kernels.regress_points_cpu import at_points
-from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at, in_view
+from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression, regress_pixels
@@ -61,7 +62,7 @@ def regress_maps(
             calls += [(z[b], K[b], *fields, *settings, out[b], features[b], i, shares) for i in range(shares)]
             continue
         view = in_view(*fields, K[b], *z.shape[1:], *settings, z.dtype.type(0))
-        if kernel is exact:
+        if pixels is None:
             calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
         else:
             calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, fields[4], out[b], features[b]))

@@ -15,14 +15,8 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.kernels.compile_cpu import kernel
-from ufmstar_torch.kernels.segment_image_cpu import (
-    SEGMENT,
-    SEGMENT_INT,
-    join_rows,
-    scan_rows,
-    write_gaussians,
-    write_labels,
-)
+from ufmstar_torch.kernels.segment_image_cpu import join_rows, write_gaussians, write_labels
+from ufmstar_torch.kernels.segment_rows_cpu import SEGMENT, SEGMENT_INT, scan_rows
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.segment_input import SegmentInput

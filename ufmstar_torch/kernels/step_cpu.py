@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +37,7 @@ from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import StepObserver, after_frame, after_regress, frame_statistics
 
 Floats = NDArray[np.floating[Any]]
+_NAMES = tuple(field.name for field in fields(GaussianMixture))
 
 
 class _Slots(NamedTuple):
@@ -45,12 +47,12 @@ class _Slots(NamedTuple):
     covariance: Floats
     weight: Floats
     disagreement: Floats
-    count: NDArray[np.int64]
+    observations: NDArray[np.int64]
     features: Floats
 
     @classmethod
     def of(cls, state: UfMStarState | GaussianMixture) -> _Slots:
-        return cls(*(getattr(state, name).detach().contiguous().numpy() for name in cls._fields))
+        return cls(*(getattr(state, name).detach().contiguous().numpy() for name in _NAMES))
 
     def stream(self, b: int) -> tuple[NDArray[Any], ...]:
         return tuple([value[b] for value in self])
@@ -126,7 +128,7 @@ def step(
         dropped = each(join, joining)
     stage("fuse")
 
-    mixture = {name: torch.from_numpy(value) for name, value in slots._asdict().items()}
+    mixture = {name: torch.from_numpy(value) for name, value in zip(_NAMES, slots, strict=True)}
     moved = GaussianMixture(
         torch.from_numpy(mean_cam), torch.from_numpy(covariance_cam), mixture["weight"].double(),
         mixture["disagreement"].double(), mixture["count"], mixture["features"].double(),

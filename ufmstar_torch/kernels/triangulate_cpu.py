@@ -1,8 +1,8 @@
 """Points from tracks seen by posed cameras: position, depth, its variance, and whether to believe them.
 
-On the CPU (numba), float64, one track after the other, all in registers. The start is the point nearest to all rays; a
-few Gauss-Newton steps on the reprojection error follow, whose normal matrix is the information on the point:
-Cov X = sigma^2 (J^T J)^-1. ``tests/oracle_triangulate.py`` is the same in NumPy.
+On the CPU (numba), float64, some tracks at a time, each in a lane of the processor's vectors. The start is the point
+nearest to all rays; a few Gauss-Newton steps on the reprojection error follow, whose normal matrix is the information
+on the point: Cov X = sigma^2 (J^T J)^-1. ``tests/oracle_triangulate.py`` is the same in NumPy.
 """
 
 from __future__ import annotations
@@ -67,83 +67,115 @@ def triangulate(
     return Triangulated(point + origin, covariance, error, ahead)
 
 
+# Tracks that are computed at once: a few vectors of any processor. Rows of a buffer: the points, the normal equations
+# (upper triangle and right side), the sums of squared residuals, and 1 where in front of all views.
+_LANES = 16
+_X, _Y, _Z, _N00, _N01, _N02, _N11, _N12, _N22, _R0, _R1, _R2, _SQUARES, _FRONT = (i * _LANES for i in range(14))
+
+
 @kernel
 def _tracks(pixel, seen, into, out_of, centre, damping, steps, point, covariance, error, ahead):
     """Pixels [N, W, 2] are counted from the principal point. ``into`` [W, 3, 3] takes an offset from a camera to
     (u z, v z, z) in its image, ``out_of`` [W, 3, 3] a pixel (u, v, 1) to the direction of its ray."""
-    normal, right, inverse = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    for n in range(pixel.shape[0]):
-        X, squares, count, front = point[n], 0.0, 0, True
-        _nearest(pixel[n], seen[n], out_of, centre, normal, right)
+    views = seen.shape[1]
+    given, work, inverse = np.empty((views, 3 * _LANES)), np.empty(14 * _LANES), np.empty((3, 3))
+    for first in range(0, seen.shape[0], _LANES):
+        count = min(_LANES, seen.shape[0] - first)
+        for w in range(views):
+            for lane in range(_LANES):
+                n = first + min(lane, count - 1)
+                u, v = (pixel[n, w, 0], pixel[n, w, 1]) if seen[n, w] else (0.0, 0.0)
+                given[w, lane], given[w, _LANES + lane], given[w, 2 * _LANES + lane] = u, v, 1.0 if seen[n, w] else 0.0
+        _nearest(given, out_of, centre, work)
         for step in range(steps + 1):
-            _inverse(normal, damping, inverse)
+            for lane in range(count):
+                _inverse(work, lane, damping, inverse)
+                r0, r1, r2 = work[_R0 + lane], work[_R1 + lane], work[_R2 + lane]
+                for i in range(3):
+                    change = inverse[i, 0] * r0 + inverse[i, 1] * r1 + inverse[i, 2] * r2
+                    place = i * _LANES + lane
+                    work[place] = change if step == 0 else work[place] - change
+            for lane in range(count, _LANES):
+                for i in range(3):
+                    work[i * _LANES + lane] = work[i * _LANES + count - 1]
+            _linearised(given, into, centre, work)
+        for lane in range(count):
+            n, shown = first + lane, 0
+            for w in range(views):
+                shown += seen[n, w]
             for i in range(3):
-                change = inverse[i, 0] * right[0] + inverse[i, 1] * right[1] + inverse[i, 2] * right[2]
-                X[i] = change if step == 0 else X[i] - change
-            squares, count, front = _linearised(X, pixel[n], seen[n], into, centre, normal, right)
-        error[n] = (squares / max(2 * count, 1)) ** 0.5
-        ahead[n] = front
-        _inverse(normal, damping, covariance[n])
+                point[n, i] = work[i * _LANES + lane]
+            error[n] = (work[_SQUARES + lane] / max(2 * shown, 1)) ** 0.5
+            ahead[n] = work[_FRONT + lane] > 0
+            _inverse(work, lane, damping, covariance[n])
 
 
 @part
-def _nearest(pixel, seen, out_of, centre, normal, right):
-    """Normal equations (upper triangle) of the point nearest to all rays."""
-    n00 = n01 = n02 = n11 = n12 = n22 = r0 = r1 = r2 = 0.0
-    for w in range(seen.shape[0]):
-        if not seen[w]:
-            continue
-        M, u, v = out_of[w], pixel[w, 0], pixel[w, 1]
-        x, y = M[0, 0] * u + M[0, 1] * v + M[0, 2], M[1, 0] * u + M[1, 1] * v + M[1, 2]
-        z = M[2, 0] * u + M[2, 1] * v + M[2, 2]
-        share = 1 / (x * x + y * y + z * z)
-        a00, a01, a02 = 1 - share * x * x, -share * x * y, -share * x * z
-        a11, a12, a22 = 1 - share * y * y, -share * y * z, 1 - share * z * z
+def _nearest(given, out_of, centre, work):
+    """Normal equations of the points nearest to all rays."""
+    for i in range(_N00, work.size):
+        work[i] = 0.0
+    for w in range(given.shape[0]):
+        m00, m01, m02 = out_of[w, 0, 0], out_of[w, 0, 1], out_of[w, 0, 2]
+        m10, m11, m12 = out_of[w, 1, 0], out_of[w, 1, 1], out_of[w, 1, 2]
+        m20, m21, m22 = out_of[w, 2, 0], out_of[w, 2, 1], out_of[w, 2, 2]
         c0, c1, c2 = centre[w, 0], centre[w, 1], centre[w, 2]
-        n00, n01, n02, n11, n12, n22 = n00 + a00, n01 + a01, n02 + a02, n11 + a11, n12 + a12, n22 + a22
-        r0 += a00 * c0 + a01 * c1 + a02 * c2
-        r1 += a01 * c0 + a11 * c1 + a12 * c2
-        r2 += a02 * c0 + a12 * c1 + a22 * c2
-    normal[0, 0], normal[0, 1], normal[0, 2] = n00, n01, n02
-    normal[1, 1], normal[1, 2], normal[2, 2] = n11, n12, n22
-    right[0], right[1], right[2] = r0, r1, r2
+        for i in range(_LANES):
+            u, v, seen = given[w, i], given[w, _LANES + i], given[w, 2 * _LANES + i]
+            x, y, z = m00 * u + m01 * v + m02, m10 * u + m11 * v + m12, m20 * u + m21 * v + m22
+            share = seen / (x * x + y * y + z * z)
+            a00, a01, a02 = seen - share * x * x, -share * x * y, -share * x * z
+            a11, a12, a22 = seen - share * y * y, -share * y * z, seen - share * z * z
+            work[_N00 + i] += a00
+            work[_N01 + i] += a01
+            work[_N02 + i] += a02
+            work[_N11 + i] += a11
+            work[_N12 + i] += a12
+            work[_N22 + i] += a22
+            work[_R0 + i] += a00 * c0 + a01 * c1 + a02 * c2
+            work[_R1 + i] += a01 * c0 + a11 * c1 + a12 * c2
+            work[_R2 + i] += a02 * c0 + a12 * c1 + a22 * c2
 
 
 @part
-def _linearised(X, pixel, seen, into, centre, normal, right):
-    """Normal equations (upper triangle) of a Gauss-Newton step from X; the sum of squared residuals [px^2], how many
-    views saw the point, and whether it lies in front of all of them."""
-    n00 = n01 = n02 = n11 = n12 = n22 = r0 = r1 = r2 = squares = 0.0
-    count, front = 0, True
-    for w in range(seen.shape[0]):
-        if not seen[w]:
-            continue
-        count += 1
-        P, x, y, z = into[w], X[0] - centre[w, 0], X[1] - centre[w, 1], X[2] - centre[w, 2]
-        depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z
-        front = front and depth > 0
-        over = 1 / depth if abs(depth) > 1e-9 else 1e9
-        u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z) * over
-        v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z) * over
-        du, dv = u - pixel[w, 0], v - pixel[w, 1]
-        a0, a1, a2 = (P[0, 0] - u * P[2, 0]) * over, (P[0, 1] - u * P[2, 1]) * over, (P[0, 2] - u * P[2, 2]) * over
-        b0, b1, b2 = (P[1, 0] - v * P[2, 0]) * over, (P[1, 1] - v * P[2, 1]) * over, (P[1, 2] - v * P[2, 2]) * over
-        squares += du * du + dv * dv
-        r0, r1, r2 = r0 + a0 * du + b0 * dv, r1 + a1 * du + b1 * dv, r2 + a2 * du + b2 * dv
-        n00, n01, n02 = n00 + a0 * a0 + b0 * b0, n01 + a0 * a1 + b0 * b1, n02 + a0 * a2 + b0 * b2
-        n11, n12, n22 = n11 + a1 * a1 + b1 * b1, n12 + a1 * a2 + b1 * b2, n22 + a2 * a2 + b2 * b2
-    normal[0, 0], normal[0, 1], normal[0, 2] = n00, n01, n02
-    normal[1, 1], normal[1, 2], normal[2, 2] = n11, n12, n22
-    right[0], right[1], right[2] = r0, r1, r2
-    return squares, count, front
+def _linearised(given, into, centre, work):
+    """Normal equations of a Gauss-Newton step from the points; the sums of squared residuals [px^2], and whether the
+    points lie in front of all views."""
+    for i in range(_N00, work.size):
+        work[i] = 1.0 if i >= _FRONT else 0.0
+    for w in range(given.shape[0]):
+        p00, p01, p02 = into[w, 0, 0], into[w, 0, 1], into[w, 0, 2]
+        p10, p11, p12 = into[w, 1, 0], into[w, 1, 1], into[w, 1, 2]
+        p20, p21, p22 = into[w, 2, 0], into[w, 2, 1], into[w, 2, 2]
+        c0, c1, c2 = centre[w, 0], centre[w, 1], centre[w, 2]
+        for i in range(_LANES):
+            x, y, z, seen = work[_X + i] - c0, work[_Y + i] - c1, work[_Z + i] - c2, given[w, 2 * _LANES + i]
+            depth = p20 * x + p21 * y + p22 * z
+            work[_FRONT + i] = work[_FRONT + i] if depth > 0 or seen == 0 else 0.0
+            over = 1 / depth if abs(depth) > 1e-9 else 1e9
+            u, v = (p00 * x + p01 * y + p02 * z) * over, (p10 * x + p11 * y + p12 * z) * over
+            du, dv, over = seen * (u - given[w, i]), seen * (v - given[w, _LANES + i]), seen * over
+            a0, a1, a2 = (p00 - u * p20) * over, (p01 - u * p21) * over, (p02 - u * p22) * over
+            b0, b1, b2 = (p10 - v * p20) * over, (p11 - v * p21) * over, (p12 - v * p22) * over
+            work[_SQUARES + i] += du * du + dv * dv
+            work[_R0 + i] += a0 * du + b0 * dv
+            work[_R1 + i] += a1 * du + b1 * dv
+            work[_R2 + i] += a2 * du + b2 * dv
+            work[_N00 + i] += a0 * a0 + b0 * b0
+            work[_N01 + i] += a0 * a1 + b0 * b1
+            work[_N02 + i] += a0 * a2 + b0 * b2
+            work[_N11 + i] += a1 * a1 + b1 * b1
+            work[_N12 + i] += a1 * a2 + b1 * b2
+            work[_N22 + i] += a2 * a2 + b2 * b2
 
 
 @part
-def _inverse(S, damping, out):
-    """Of a symmetric positive definite 3x3 (its upper triangle), damped, by cofactors."""
-    more = damping * max(S[0, 0] + S[1, 1] + S[2, 2], 2.2250738585072014e-308)
-    a, b, c = S[0, 0] + more, S[0, 1], S[0, 2]
-    d, e, f = S[1, 1] + more, S[1, 2], S[2, 2] + more
+def _inverse(work, lane, damping, out):
+    """Of a normal matrix, symmetric and positive definite, damped, by cofactors."""
+    n00, n11, n22 = work[_N00 + lane], work[_N11 + lane], work[_N22 + lane]
+    more = damping * max(n00 + n11 + n22, 2.2250738585072014e-308)
+    a, b, c = n00 + more, work[_N01 + lane], work[_N02 + lane]
+    d, e, f = n11 + more, work[_N12 + lane], n22 + more
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     over = 1 / (a * A + b * B + c * C)
     out[0, 0], out[0, 1], out[0, 2] = A * over, B * over, C * over

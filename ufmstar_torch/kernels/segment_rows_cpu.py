@@ -1,0 +1,291 @@
+"""The scanline segmentation of SPGF as compiled code (numba): the rows of an image, each on its own.
+
+Every formula is written in the torch reference's order of operations, so that the decisions agree to the
+last bit. No fastmath: it would let the compiler reorder them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ufmstar_torch.kernels.compile_cpu import kernel, leaf
+
+# Where counters start. numba gives a plain 0 a type of its own, and compiles all that is called with it twice.
+ZERO: Any = np.int64(0)
+
+# Columns of a finished segment. Within a row y = z (v - cy)/fy, so x and z say everything.
+MX, MZ, CXX, CXZ, CZZ, LX, LZ = range(7)
+# Its whole numbers: N, smallest bin, interval.
+N, NEAREST, UL, UR = range(4)
+SEGMENT, SEGMENT_INT = 7, 4
+
+
+class _Open(NamedTuple):
+    """An open segment, which compiled code keeps in registers. d = p - pL."""
+
+    n: int
+    u_left: int
+    u_right: int
+    nearest: int  # smallest depth bin
+    born: int  # which of the segments that the row started, from 1 on
+    x_left: float
+    z_left: float
+    x_right: float
+    z_right: float
+    w2: float  # |pR - pL|^2
+    dx: float  # sums of d_x, d_z, d_x^2, d_x d_z, d_z^2
+    dz: float
+    dxx: float
+    dxz: float
+    dzz: float
+
+
+@kernel
+def scan_rows(
+    z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, owner
+):
+    """Scanline segmentation of the rows from ``first`` to ``last``, each on its own.
+
+    Finished segments go to ``table`` and ``table_int``, from row ``first * most`` on, with at most ``most`` of an image
+    row. ``spans`` [H, 2] receives where a row's segments begin and end, ``owner`` [H, W] 1 + the place of the segment
+    that a pixel belongs to, or 0.
+    """
+    width = z.shape[1]
+    row = np.empty(width), np.empty(width), np.empty(width), np.zeros(width, np.bool_), np.zeros(width)
+    rx, spare = np.empty(width), np.empty(width)
+    for u in range(width):
+        rx[u] = (u - cx) / fx
+    place = np.empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
+    older, older_int = np.empty((limits.max_open, 10)), np.empty((limits.max_open, 5), np.int64)
+    end = first * segments_of_row(width, limits)
+    for v in range(first, last):
+        spans[v, 0] = end
+        _usable(z, use, spread, v, limits.max_depth, row[0], row[4])
+        _thresholds(row[0], rx, slope, limits, row[1], row[2], spare, row[3])
+        end = _scanline(
+            row, rx, (v - cy) / fy, slope, lengths2, edges, limits, spread.size > 0, older, older_int, table,
+            table_int, end, place, owner, v,
+        )  # fmt: skip
+        spans[v, 1] = end
+
+
+@leaf
+def segments_of_row(width, limits):
+    """The most segments that one row can have: each has more than ``sparse`` pixels."""
+    return max(width // (limits.sparse + 1), 1)
+
+
+@leaf
+def _usable(z, use, spread, v, max_depth, depth, s2):
+    """Depth and variance of the pixels of row v, depth 0 for those that take no part. NaN fails every comparison."""
+    for u in range(z.shape[1]):
+        d = np.float64(z[v, u])
+        depth[u] = d if (d > 0) & (d <= max_depth) else 0.0
+    for u in range(use.shape[1]):
+        depth[u] = depth[u] if use[v, u] else 0.0
+    for u in range(spread.shape[1]):
+        s2[u] = spread[v, u]
+        depth[u] = depth[u] if (s2[u] >= 0) & (s2[u] < np.inf) else 0.0
+
+
+@leaf
+def _thresholds(depth, rx, slope, limits, x, tau_z, tau_x, near):
+    """Of a row: x, tau_z (-1 for a pixel that takes no part), tau_x, and which pixels are near the one before."""
+    for u in range(depth.size):
+        x[u] = rx[u] * depth[u]
+    low, high, highest = limits.noise_floor, limits.noise_thresh, limits.line_thresh
+    for u in range(depth.size):
+        t = 6.0 * (slope * depth[u] * depth[u])
+        t = t if t > low else low
+        t = t if t < high else high
+        tau_z[u] = t if depth[u] > 0 else -1.0
+    for u in range(depth.size):
+        t = slope * depth[u] * depth[u]
+        t = t if t > low else low
+        tau_x[u] = t if t < highest else highest
+    for u in range(1, depth.size):
+        near[u] = (abs(depth[u] - depth[u - 1]) < tau_z[u]) & (abs(x[u] - x[u - 1]) < tau_x[u])
+
+
+@leaf
+def _scanline(
+    row, rx, ry, slope, lengths2, edges, limits, spread, older, older_int, segments, segments_int, done,
+    place, owner, v,
+):  # fmt: skip
+    """Scanline segmentation of row v.
+
+    ``row`` are depth, x, tau_z, which pixels are near the one before, and variances, which are 0 without ``spread``.
+    Writes the finished segments from ``done`` on and, to row v of ``owner``, 1 + the place of a pixel's segment or 0;
+    returns the end of the finished segments. The newest open segment lives in registers, the others in a ring of
+    max_open - 1 places, ``front`` being the newest of them. ``place`` is scratch.
+    """
+    depth, x_of, tau_z, near, s2 = row
+    y_factor = 1.0 + ry * ry
+    room = limits.max_open - 1
+    front = waiting = started = n = right = left = nearest = u = k = ZERO
+    x0 = z0 = w2 = dx = dz = dxx = dxz = dzz = 0.0
+    low, high, length2 = 0.0, edges[0], lengths2[0]  # of depth bin k
+    while u < depth.size:
+        z, x = depth[u], x_of[u]
+        if z == 0.0:
+            owner[v, u] = 0
+            u += 1
+            continue
+        if not (z > low and z <= high):
+            while k < edges.size - 1 and edges[k] < z:
+                k += 1
+            while k > 0 and edges[k - 1] >= z:
+                k -= 1
+            low, length2 = edges[k - 1] if k > 0 else 0.0, lengths2[k]
+            high = edges[k] if k < edges.size - 1 else np.inf
+        fits = n > 0 and u - right <= limits.occlusion_gap and w2 < length2
+        if fits and n > limits.n_check:
+            fits = dx != 0 and abs(z0 + dz * (x - x0) / dx - z) < tau_z[u]
+        elif fits:
+            fits = abs(z - depth[right]) < tau_z[u] and abs(x - x_of[right]) < min(
+                max(slope * z * z, limits.noise_floor), limits.line_thresh
+            )
+        if not fits:
+            q = _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, tau_z[u], length2, limits)
+            if q >= 0:
+                match = _extended(_load(older, older_int, q), x, z, u, k, y_factor, rx[u], s2[u])
+                _store(older, older_int, q, match)
+                owner[v, u] = match.born
+                u += 1
+                continue
+            if n > 0:
+                newest = _Open(
+                    n, left, right, nearest, started, x0, z0, x_of[right], depth[right], w2, dx, dz, dxx, dxz, dzz
+                )
+                front, waiting, done = _push(
+                    newest, older, older_int, front, waiting, room, limits.sparse, segments, segments_int, done, place
+                )
+            started += 1
+            n, left, nearest, x0, z0 = ZERO, u, k, x, z
+            dx = dz = dxx = dxz = dzz = 0.0
+        begin = u
+        ex, ez = x - x0, z - z0
+        w2 = ex * ex + y_factor * (ez * ez)
+        dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
+        if s2[u] > 0:
+            dxx, dxz, dzz = dxx + s2[u] * (rx[u] * rx[u]), dxz + s2[u] * rx[u], dzz + s2[u]
+        nearest = min(nearest, k)
+        u += 1
+        # What follows without a gap in the same depth bin, by the same rules: until n_check, then by the line.
+        short = u if spread else min(depth.size, max(u, begin + limits.n_check - n + 1))
+        while u < short:
+            ex, ez = x_of[u] - x0, depth[u] - z0
+            if not (near[u] & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
+                break
+            w2 = ex * ex + y_factor * (ez * ez)
+            dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
+            u += 1
+        stop = depth.size if u == short and not spread else u
+        while u < stop:
+            ex, ez = x_of[u] - x0, depth[u] - z0
+            off = abs(z0 + dz * ex / dx - depth[u])
+            if not ((off < tau_z[u]) & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
+                break
+            w2 = ex * ex + y_factor * (ez * ez)
+            dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
+            u += 1
+        for i in range(begin, u):
+            owner[v, i] = started
+        n, right = n + u - begin, u - 1
+    if n > 0:
+        newest = _Open(n, left, right, nearest, started, x0, z0, x_of[right], depth[right], w2, dx, dz, dxx, dxz, dzz)
+        done = _finish(newest, limits.sparse, segments, segments_int, done, place)
+    for i in range(waiting):
+        q = front - i if front >= i else front - i + room
+        done = _finish(_load(older, older_int, q), limits.sparse, segments, segments_int, done, place)
+    place[0] = 0
+    for u in range(depth.size):
+        owner[v, u] = place[owner[v, u]]
+    return done
+
+
+@leaf
+def _push(newest, older, older_int, front, waiting, room, sparse, segments, segments_int, done, place):
+    """Let the newest open segment wait, and finish the oldest if there is no room."""
+    if room == 0:
+        return front, waiting, _finish(newest, sparse, segments, segments_int, done, place)
+    front = front + 1 if front + 1 < room else 0
+    if waiting == room:  # the ring is full: the place after the front holds the oldest
+        oldest = _load(older, older_int, front)
+        done = _finish(oldest, sparse, segments, segments_int, done, place)
+    else:
+        waiting += 1
+    _store(older, older_int, front, newest)
+    return front, waiting, done
+
+
+@leaf
+def _fits(o, x, z, u, slope, tau_z, length2, limits):
+    """Does the point continue the open segment?"""
+    if u - o.u_right > limits.occlusion_gap or not o.w2 < length2:
+        return False
+    if o.n <= limits.n_check:
+        tau_x = min(max(slope * z * z, limits.noise_floor), limits.line_thresh)
+        return abs(z - o.z_right) < tau_z and abs(x - o.x_right) < tau_x
+    return o.dx != 0 and abs(o.z_left + o.dz * (x - o.x_left) / o.dx - z) < tau_z
+
+
+@leaf
+def _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, tau_z, length2, limits):
+    """The newest of the waiting segments that the point continues, or -1."""
+    for i in range(waiting):
+        q = front - i if front >= i else front - i + room
+        if _fits(_load(older, older_int, q), x, z, u, slope, tau_z, length2, limits):
+            return q
+    return -1
+
+
+@leaf
+def _extended(o, x, z, u, k, y_factor, rx, s2):
+    """The open segment with a pixel added."""
+    dx, dz = x - o.x_left, z - o.z_left
+    dxx, dxz, dzz = o.dxx + dx * dx, o.dxz + dx * dz, o.dzz + dz * dz
+    if s2 > 0:
+        dxx, dxz, dzz = dxx + s2 * (rx * rx), dxz + s2 * rx, dzz + s2
+    return _Open(
+        o.n + 1, o.u_left, u, min(o.nearest, k), o.born, o.x_left, o.z_left, x, z,
+        dx * dx + y_factor * (dz * dz), o.dx + dx, o.dz + dz, dxx, dxz, dzz,
+    )  # fmt: skip
+
+
+@leaf
+def _store(values, whole, q, o):
+    whole[q, 0], whole[q, 1], whole[q, 2], whole[q, 3], whole[q, 4] = o.n, o.u_left, o.u_right, o.nearest, o.born
+    values[q, 0], values[q, 1], values[q, 2], values[q, 3], values[q, 4] = (
+        o.x_left,
+        o.z_left,
+        o.x_right,
+        o.z_right,
+        o.w2,
+    )
+    values[q, 5], values[q, 6], values[q, 7], values[q, 8], values[q, 9] = o.dx, o.dz, o.dxx, o.dxz, o.dzz
+
+
+@leaf
+def _load(values, whole, q):
+    f, i = values[q], whole[q]
+    return _Open(i[0], i[1], i[2], i[3], i[4], f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9])
+
+
+@leaf
+def _finish(o, sparse, segments, segments_int, done, place):
+    """Output an open segment unless it is too sparse; returns the new number of finished ones."""
+    if o.n <= sparse:
+        place[o.born] = 0
+        return done
+    place[o.born] = done + 1
+    out, whole = segments[done], segments_int[done]
+    out[MX], out[MZ] = o.x_left + o.dx / o.n, o.z_left + o.dz / o.n
+    out[CXX] = o.dxx - o.dx * o.dx / o.n
+    out[CXZ] = o.dxz - o.dx * o.dz / o.n
+    out[CZZ] = o.dzz - o.dz * o.dz / o.n
+    out[LX], out[LZ] = o.dx, o.dz
+    whole[N], whole[NEAREST], whole[UL], whole[UR] = o.n, o.nearest, o.u_left, o.u_right
+    return done + 1
