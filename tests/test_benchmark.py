@@ -485,6 +485,7 @@ def test_a_long_run_compares_the_same_room_early_and_late():
         measure_long_run(RenderedRoom(), UfMStarConfig(), size=48, frames=24, early=10, window=10)
 
 
+@pytest.mark.slow
 def test_long_runs_are_drawn_by_world(tmp_path):
     """With merging and without, with a limit of the components in memory and without."""
     config = UfMStarConfig(merge_every=5)

@@ -139,6 +139,7 @@ def test_the_state_has_the_bits_of_a_sequence_alone(tours):
                 assert torch.equal(*((a[:, :used], b[:, :used]) if slots else (a.nan_to_num(-1), b.nan_to_num(-1))))
 
 
+@pytest.mark.slow
 def test_maps_of_other_sizes_are_another_batch(tours):
     small = in_memory("tour:9?frames=3&size=48x64", 3, 9)
     sequences, rows = [tours[0], small, tours[1], small], [row("UfM*-DepthOnly"), row("DepthOnly")]
@@ -208,6 +209,7 @@ def test_networks_that_draw_samples_draw_the_same(tours, tmp_path):
     assert all(same(a, b) for one, other in zip(alone, together, strict=True) for a, b in zip(one, other, strict=True))
 
 
+@pytest.mark.slow
 def test_a_convolutional_network_gives_nearly_the_same(tours, tmp_path):
     file = write_network(tmp_path / "net.safetensors", "aleatoric", 2)
     bases = {"ensemble": base_network(f"ensemble=trained:{file}")}
