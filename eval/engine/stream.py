@@ -164,8 +164,12 @@ class FrameStream:
         return [self.indices[n] for n in left if not self.rows or any(row.selects(n) for row in self.rows)]
 
     def prepare(self, frame: Frame) -> None:
-        """The networks' input, unless a store may have all predictions."""
-        if self._store is None:
+        """The networks' input, unless a store may have all predictions; in the thread that reads ahead.
+
+        Only where torch computes with one thread. With more, torch's operations in this thread would start a second
+        team of OpenMP threads, beside which the first one no longer spins: networks took three times as long.
+        """
+        if self._store is None and torch.get_num_threads() == 1:
             for row in self.rows:
                 row.source.prepare(frame)
 
