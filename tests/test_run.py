@@ -12,20 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from layouts import truncate, write_depth_png, write_generic, write_scannet
+from layouts import truncate, write_depth_png, write_generic
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
-from scenes import render
 from ufmstar_torch import UfMStar, UncertainDepth, cli
 from ufmstar_torch.eval.commands.run import Progress, run
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.outputs import field_of_view, square_pixels
 from ufmstar_torch.eval.results import run_folder, writers
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.models import Preprocess
 
 TESTS = Path(__file__).parent
@@ -61,71 +58,6 @@ def uninterrupted(scene, tmp_path_factory):
 def pair(**trouble):
     """Two members that disagree; trouble happens in the second one."""
     return Brightness(1.0, spread=0.02), Brightness(1.1, spread=0.02, **trouble)
-
-
-# ---- ground truth at the prediction's pixels ----
-
-
-@pytest.mark.parametrize("size", [(480, 640), (360, 540), (640, 480), (229, 305)])
-@pytest.mark.parametrize("preprocess", [Preprocess.nyu(), Preprocess(size=(128, 128)), Preprocess(size=(120, 128))])
-def test_resampling_by_rays_equals_the_preprocessing_of_depth(size, preprocess):
-    labels = torch.arange(size[0] * size[1]).reshape(size)
-    K = torch.tensor([[500.3, 0, 310.7], [0, 497.9, 244.1], [0, 0, 1]], dtype=torch.float64)
-    K_net = preprocess.apply_intrinsics(K, *size).numpy()
-    expected = preprocess.apply_depth(labels).numpy()
-    actual = resample_nearest(labels.numpy(), K.numpy(), K_net, expected.shape)
-    np.testing.assert_array_equal(actual, expected)
-
-
-def test_outside_of_the_other_camera_there_is_nothing():
-    K = np.diag([10.0, 10.0, 1.0])
-    shifted = K + np.array([[0, 0, 2.0], [0, 0, 1.0], [0, 0, 0]])
-    actual = resample_nearest(np.ones((2, 3)), K, shifted, (4, 6))
-    expected = np.zeros((4, 6))
-    expected[1:3, 2:5] = 1
-    np.testing.assert_array_equal(actual, expected)
-
-
-def test_scannet_depth_is_brought_to_the_colour_camera(tmp_path):
-    path, of_color, _ = write_scannet(tmp_path, frames=2)
-    sequence = open_sequence(path)
-    frame = sequence[1]
-    assert frame.depth.shape != frame.image.shape[:2]
-    size, K = (
-        (40, 54),
-        Preprocess(size=(40, 54)).apply_intrinsics(torch.from_numpy(frame.intrinsics), *frame.image.shape[:2]),
-    )
-    actual = truth_at(frame, K.numpy(), size)
-    expected = render(of_color.T_world_cam[1], K.numpy(), *size)
-    both = actual > 0
-    assert both.mean() > 0.85  # the depth camera sees a little less than the colour camera
-    # Nearest pixels: exact but for the slant of the surfaces within a pixel, and a few pixels at edges.
-    off = np.abs(actual - expected)[both] / expected[both]
-    assert np.quantile(off, 0.9) < 0.02
-    assert np.median(off) < 0.006
-
-
-def test_square_pixels_keep_the_view():
-    K = np.array([[198.3, 0, 111.5], [0, 264.3, 119.6], [0, 0, 1]])
-    K_square, size = square_pixels(K, (224, 224))
-    assert size == (224, 299)
-    assert abs(K_square[0, 0] / K_square[1, 1] - 1) < 0.002
-    for corner in ([-0.5, -0.5], [223.5, 223.5]):
-        ray = (np.array(corner) - K[:2, 2]) / np.diag(K)[:2]
-        seen = np.diag(K_square)[:2] * ray + K_square[:2, 2]
-        edge = [-0.5, -0.5] if corner[0] < 0 else [size[1] - 0.5, size[0] - 0.5]
-        np.testing.assert_allclose(seen, edge, atol=1e-9)
-
-
-def test_the_shown_image_is_what_the_network_saw():
-    image = np.dstack([np.mgrid[0:480, 0:640][0] // 2, np.mgrid[0:480, 0:640][1] // 3, np.zeros((480, 640))])
-    K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
-    nyu = Preprocess.nyu()
-    part = field_of_view(image.astype(np.uint8), K.numpy(), nyu.apply_intrinsics(K, 480, 640).numpy(), (224, 224))
-    # 228 x 304 of 250 x 333 pixels, in those of the image.
-    assert abs(part.shape[0] - 480 * 228 / 250) <= 1
-    assert abs(part.shape[1] - 640 * 304 / 333) <= 1
-    assert abs(int(part[0, 0, 0]) - 240 * 11 / 250) <= 1
 
 
 # ---- what a run writes ----
