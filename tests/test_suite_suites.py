@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import pickle
 from dataclasses import replace
 
 import pytest
@@ -242,7 +242,7 @@ methods = ["Ensemble"]
     suite = suite_named(str(tmp_path / "own.toml"))
     expected = ["UfM*-Ensemble, as we deploy it", "UfM-Ensemble-100K, as we deploy it", "loose", "Ensemble"]
     assert list(row_labels(suite.rows).values()) == [row_label(row) for row in suite.rows] == expected
-    again = Suite.from_dict(json.loads(json.dumps(suite.to_dict())))
+    again = pickle.loads(pickle.dumps(suite))
     assert [row.title for row in again.rows] == [*expected[:3], ""]
     listed = listed_rows({"rows": [row.to_dict() for row in suite.rows]})
     assert [row_label(row) for row in listed] == expected
@@ -295,8 +295,9 @@ multiples = { "segment.line_thresh" = [1.0, 2.0] }
 @pytest.mark.parametrize("name", ["paper-table-2", "paper-table-3", "ablation-anchors", "ablation-segmentation"])
 def test_a_suite_is_the_same_after_a_way_through_json(name):
     suite = suite_named(name)
-    again = Suite.from_dict(json.loads(json.dumps(suite.to_dict())))
-    assert again.to_dict() == suite.to_dict()
+    again = pickle.loads(pickle.dumps(suite))
+    assert again == suite
+    assert [row.title for row in again.rows] == [row.title for row in suite.rows]
     assert again.rows == suite.rows
 
 

@@ -172,7 +172,6 @@ class _RequireVariances(FrameSink):
     """Raises ValueError where a row has no variance: the network states none."""
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         if any(row.estimate.variance is None for row in result.rows.values()):
             raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
 
@@ -201,12 +200,10 @@ class _Walk(FrameSink):
         return [self._panels[index] for index in self._rows]
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._gaussians = next(row.estimator for row in stream.rows if row.key == UFM_STAR)
         self._progress(Progress("frames", 0, len(self._unfamiliar), None, 0))
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         for key, row in result.rows.items():
             self.ms.setdefault(key, []).append(row.ms)
         if result.index in self._rows:

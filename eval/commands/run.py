@@ -220,11 +220,9 @@ class _Reports(FrameSink):
         self._skipped = sum(record["state"] == "skipped" for record in folder.records)
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._progress(Progress("frames", stream.position, len(self._job.indices), None, self._skipped))
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         self._skipped += len(result.skipped)
         statistics = result.rows[UFM].estimate.statistics if UFM in result.rows else None
         components = None if statistics is None else int(statistics.components[0])
@@ -238,11 +236,9 @@ class _Summaries(FrameSink):
         self._job, self._folder = job, folder
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._reported = perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         if perf_counter() - self._reported > _SUMMARY_EVERY:
             _write_summary(self._job, self._folder, _GOING_ON)
             self._reported = perf_counter()

@@ -49,7 +49,6 @@ class Behind(FrameSink):
             self._thread.shutdown(cancel_futures=True)
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._stream = stream
         for sink in self._sinks:
             sink.begin(stream)
@@ -69,7 +68,6 @@ class Behind(FrameSink):
         self._waiting.append(self._thread.submit(self._work, replace(result, state=state)))
 
     def end(self) -> None:
-        """See ``Sink``."""
         self._wait(0)
         for sink in self._sinks:
             sink.end()

@@ -28,7 +28,9 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     chosen = []
     for kind in (alone, [other for other in pointwise if _points(other) == fewest]):
         if kind:
-            chosen.append(min(kind, key=lambda other: (_noise(other) != _noise(row), other.setting.slug)))
+            chosen.append(
+                min(kind, key=lambda other: (other.setting.pose_noise != row.setting.pose_noise, other.setting.slug))
+            )
     return chosen
 
 
@@ -52,10 +54,6 @@ def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
 def _frames(row: Row) -> tuple[int, str]:
     """What decides which frames a row sees, and which part of them."""
     return row.setting.skip, row.setting.preprocess
-
-
-def _noise(row: Row) -> tuple[float, ...]:
-    return row.setting.pose_noise
 
 
 def _points(row: Row) -> float:

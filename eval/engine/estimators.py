@@ -86,13 +86,8 @@ class Estimator(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class EstimatorInput:
-    """The arguments of :meth:`Estimator.update`."""
-
-    prediction: Prediction
-    T_world_cam: Tensor
-    anchors: Anchors | None = None
+# The arguments of :meth:`Estimator.update`.
+EstimatorInput = tuple[Prediction, Tensor, Anchors | None]
 
 
 def make_estimator(row: Row, device: torch.device, max_depth: float | None = None, *, streams: int = 1) -> Estimator:
@@ -109,29 +104,27 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
             that was fitted under other settings.
         FileNotFoundError: the setting's recalibration does not exist.
     """
-    method = row.method
-    if row.setting.of_ufm_star and method.fusion in (ALONE, UFM):
-        raise ValueError(f"{row.label}: settings of UfM* go with UfM* only")
-    if row.setting.anchors and method.fusion != UFM_STAR:
-        raise ValueError(f"{row.label}: anchors go with UfM* only")
-    if row.setting.recalibration and method.fusion != UFM_STAR:
-        raise ValueError(f"{row.label}: a recalibration goes with UfM* only")
+    method, setting = row.method, row.setting
+    of_ufm_star = {"settings of UfM*": setting.of_ufm_star, "anchors": setting.anchors}
+    for what, given in (of_ufm_star | {"recalibrations": setting.recalibration}).items():
+        if given and method.fusion != UFM_STAR:
+            raise ValueError(f"{row.label}: {what} go with UfM* only")
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(points, device, uses_variances=method.uses_aleatoric)
-    recalibration = read_recalibration(row.setting.recalibration) if row.setting.recalibration else None
+    recalibration = read_recalibration(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row).within(max_depth)
     return Gaussians(
         config,
         device,
         streams=streams if config.spill is None else 1,
         uses_variances=method.uses_aleatoric,
-        corrected=row.setting.corrected,
-        posterior=row.setting.posterior,
+        corrected=setting.corrected,
+        posterior=setting.posterior,
         recalibration=recalibration,
-        aleatoric_in_h=row.setting.aleatoric_in_h,
+        aleatoric_in_h=setting.aleatoric_in_h,
     )
 
 
@@ -165,7 +158,6 @@ class Alone:
     uses_variances: bool = True
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`; pose and anchors do not matter."""
         a, e = _variances(prediction, self.uses_variances)
         parts = [part for part in (a, e) if part is not None]
         valid = (prediction.depth > 0) & prediction.depth.isfinite()
@@ -183,7 +175,6 @@ class Alone:
         return {}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """See :meth:`Estimator.load_state`."""
         if state:
             raise ValueError(f"the saved state has {sorted(state)} too many")
 
@@ -202,7 +193,6 @@ class Pointwise:
         self._uses_variances = uses_variances
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`; anchors do not matter."""
         a, e = _variances(prediction, self._uses_variances)
         out = self.ufm(prediction.depth[None], T_world_cam, prediction.intrinsics, _one(a), _one(e))
         return _estimate(depth=prediction.depth, variance=out.variance[0], valid=out.valid[0], aleatoric=a, epistemic=e)
@@ -214,11 +204,9 @@ class Pointwise:
         return {"bytes": count * (cloud.bytes_per_point if cloud else 0), "count": count, "smoothing_bytes": 0}
 
     def state(self) -> dict[str, Tensor]:
-        """See :meth:`Estimator.state`."""
         return dict(self.ufm.state_dict())
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """See :meth:`Estimator.load_state`."""
         _load(self.ufm, state)
 
 
@@ -278,7 +266,7 @@ class Gaussians:
         Raises:
             ValueError: ``aleatoric_in_h`` without an aleatoric variance.
         """
-        return self.update_together([self], [EstimatorInput(prediction, T_world_cam, anchors)])[0]
+        return self.update_together([self], [(prediction, T_world_cam, anchors)])[0]
 
     @staticmethod
     def update_together(streams: Sequence[Gaussians], inputs: Sequence[EstimatorInput]) -> list[Estimate]:
@@ -287,19 +275,18 @@ class Gaussians:
         Raises:
             ValueError: as :meth:`update`.
         """
-        frames = {one._stream: one._input(given) for one, given in zip(streams, inputs, strict=True)}
+        frames = {one._stream: one._input(*given) for one, given in zip(streams, inputs, strict=True)}
         out = streams[0]._streams(frames)
         return [one._estimate(frames[one._stream], out[one._stream]) for one in streams]
 
-    def _input(self, given: EstimatorInput) -> StreamInput:
-        prediction = given.prediction
+    def _input(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None) -> StreamInput:
         a, e = _variances(prediction, self._uses_variances)
         features = None
         if self._in_h:
             if a is None:
                 raise ValueError("aleatoric_in_h needs a network that predicts an aleatoric variance")
             features = torch.stack([a, torch.ones_like(a)])
-        return StreamInput(prediction.depth, given.T_world_cam, prediction.intrinsics, a, e, features, given.anchors)
+        return StreamInput(prediction.depth, T_world_cam, prediction.intrinsics, a, e, features, anchors)
 
     def _estimate(self, given: StreamInput, out: UfMStarOutput) -> Estimate:
         """What the row makes of UfM*'s output for one stream."""
@@ -346,7 +333,6 @@ class Gaussians:
         return kept
 
     def state(self) -> dict[str, Tensor]:
-        """See :meth:`Estimator.state`."""
         return self._streams.state(self._stream)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
@@ -31,9 +31,6 @@ class Figures(Generic[Key]):
     def __init__(self, bins: str = "ours") -> None:
         self._metrics: dict[Key, SequenceMetrics] = {}
         self._bins = bins
-
-    def __iter__(self) -> Iterator[Key]:
-        return iter(self._metrics)
 
     def of(self, key: Key, *, with_variance: bool = True) -> SequenceMetrics:
         """The metrics of a key, made now if there are none."""

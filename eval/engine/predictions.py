@@ -95,42 +95,37 @@ def combined(predictions: Sequence[Prediction]) -> Prediction:
     return Prediction.of(joint, predictions[0].intrinsics, sum(times) if len(times) == len(predictions) else None)
 
 
-class DepthSource(Protocol):
+class DepthSource:
     """Where depth comes from: networks, or maps that exist already.
 
     Attributes:
-        label: as tables show it.
-        networks: that it runs; () of maps.
         identity: plain values that distinguish this source from another one.
-        digest: the same as a hex digest, the source's name in a store; "" where nothing is stored.
+        label: as tables show it.
+        digest: of the identity, in hex, the source's name in a store; "" where nothing is stored.
+        networks: that it runs; () of maps.
         passes: inferences that all members (or samples) take.
-        needs_image: whether it predicts from the image; from the depth map otherwise.
-        cacheable: whether a store may keep its predictions. They are then of single precision, read or computed.
-        is_truth: whether it is the sequence's own depth, which has no error.
         max_depth: [m] the largest depth that its networks can predict; None where it is not known.
-        runtime: what runs the networks, for the record: name, version, threads, precision; None of maps.
+        needs_image: whether it predicts from the image; from the depth map otherwise.
+        is_truth: whether it is the sequence's own depth, which has no error.
     """
 
+    needs_image = is_truth = False
+    networks: tuple[DepthNetwork, ...] = ()
+    passes = 1
+    max_depth: float | None = None
+
+    def __init__(self, identity: Mapping[str, Any], label: str = "", digest: str = "") -> None:
+        self.identity, self.label, self.digest = dict(identity), label, digest
+
     @property
-    def label(self) -> str: ...
+    def cacheable(self) -> bool:
+        """Whether a store may keep its predictions. They are then of single precision, read or computed."""
+        return self.needs_image and bool(self.digest)
+
     @property
-    def networks(self) -> tuple[DepthNetwork, ...]: ...
-    @property
-    def identity(self) -> Mapping[str, Any]: ...
-    @property
-    def digest(self) -> str: ...
-    @property
-    def passes(self) -> int: ...
-    @property
-    def needs_image(self) -> bool: ...
-    @property
-    def cacheable(self) -> bool: ...
-    @property
-    def is_truth(self) -> bool: ...
-    @property
-    def max_depth(self) -> float | None: ...
-    @property
-    def runtime(self) -> Mapping[str, Any] | None: ...
+    def runtime(self) -> Mapping[str, Any] | None:
+        """What runs the networks, for the record: name, version, threads, precision; None of maps."""
+        return None
 
     def prepared(self, how: str) -> DepthSource:
         """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change.
@@ -138,15 +133,14 @@ class DepthSource(Protocol):
         Raises:
             ValueError: there are no images to prepare.
         """
-        ...
+        raise NotImplementedError
 
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""
-        ...
+        return 0
 
     def prepare(self, frame: Frame) -> None:
         """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
-        ...
 
     def one(self, frame: Frame, n: int) -> Prediction:
         """One timed inference, of member (or sample) n.
@@ -154,7 +148,7 @@ class DepthSource(Protocol):
         Raises:
             FrameError: the frame has nothing to predict from.
         """
-        ...
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ class RowInput:
     def of_estimator(self) -> EstimatorInput:
         """What the row's estimator gets."""
         anchors = None if self.anchors is None else self.anchors.anchors
-        return EstimatorInput(self.prediction, torch.from_numpy(self.T_world_cam), anchors)
+        return (self.prediction, torch.from_numpy(self.T_world_cam), anchors)
 
 
 class RowRunner:

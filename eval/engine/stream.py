@@ -198,7 +198,7 @@ class FrameStream:
                 if self._check is not None:
                     self._check(frame)
             known = FramePredictions(frame, self._device, self._store, self._digest)
-            yield [Inference(known, row.source, row.images, row.every) for row in active]
+            yield [Inference(known, row) for row in active]
             with self.timer.stage("predict"):
                 predictions = {row.key: row.predict(known) for row in active}
             with self.timer.stage("truth"):

@@ -4,27 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput, Gaussians
 from ufmstar_torch.eval.engine.networks import NetworkSource
-from ufmstar_torch.eval.engine.predictions import DepthSource, FramePredictions
+from ufmstar_torch.eval.engine.predictions import FramePredictions
 from ufmstar_torch.eval.engine.rows import RowInput, RowRunner
 
 
-@dataclass(frozen=True, eq=False)
-class Inference:
-    """What a row needs of a frame's predictions.
-
-    Attributes:
-        predictions: of the frame.
-        source, position, every: as ``FramePredictions.of``.
-    """
+class Inference(NamedTuple):
+    """A frame's predictions, and the row that needs one of them."""
 
     predictions: FramePredictions
-    source: DepthSource
-    position: int
-    every: bool
+    row: RowRunner
 
 
 @dataclass(eq=False)
@@ -59,10 +52,10 @@ def infer_together(wanted: Sequence[Inference]) -> None:
     if len({one.predictions for one in wanted}) < 2:
         return
     frames: dict[tuple[object, int], dict[FramePredictions, NetworkSource]] = {}
-    for one in wanted:
-        if isinstance(one.source, NetworkSource) and one.source.batches:
-            for n in one.predictions.missing(one.source, one.position, one.every):
-                frames.setdefault((one.source.digest or one.source, n), {})[one.predictions] = one.source
+    for predictions, row in wanted:
+        if isinstance(row.source, NetworkSource) and row.source.batches:
+            for n in predictions.missing(row.source, row.images, row.every):
+                frames.setdefault((row.source.digest or row.source, n), {})[predictions] = row.source
     for (_, n), sources in frames.items():
         together = [known for known in sources if known.frame.image is not None]
         if len(together) > 1:

@@ -96,6 +96,10 @@ class Setting(Checked):
     def __hash__(self) -> int:
         return hash(self.slug)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A mapping proxy cannot be pickled."""
+        return Setting, (dict(self.overrides), *(getattr(self, name) for name in _OWN))
+
     def to_dict(self) -> dict[str, Any]:
         """What differs from the default, flat: {} for the row as it is."""
         own = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}

@@ -118,20 +118,6 @@ class Suite:
             )
         return replace(self, rows=kept)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The suite as plain values, for another process."""
-        return {**self.__dict__, "rows": [row.to_dict() for row in self.rows]}
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Suite:
-        """The suite of :meth:`to_dict`, also after a way through JSON."""
-        rows = [
-            Row(Method.parse(row["method"]), setting_from(row["setting"]), row.get("label", ""))
-            for row in values["rows"]
-        ]
-        plain = {name: _plain(value) for name, value in values.items()}
-        return cls(**{**plain, "rows": tuple(rows)})
-
 
 def names() -> tuple[str, ...]:
     """The names of the suites that come with the package, the paper's tables first."""
@@ -173,7 +159,8 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
         named: dict[str, Any] = {"name": values.get("name", own), "title": values.get("title", own), "rows": rows}
-        hints: dict[str, Any] = {key: _plain(values[key]) for key in _HINTS if key in values}
+        hints: dict[str, Any] = {key: values[key] for key in _HINTS if key in values}
+        hints |= {key: tuple(value) for key, value in hints.items() if isinstance(value, list)}
         return Suite(**named, sweep=tuple(dict.fromkeys(_sweep(values))), **hints)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from error
@@ -289,7 +276,3 @@ def _words(values: Mapping[str, Any], name: str, default: Iterable[str] = ()) ->
     if not all(isinstance(word, str) for word in words):
         raise ValueError(f"{name} must be a list of words, got {words!r}")
     return tuple(words)
-
-
-def _plain(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value

@@ -7,6 +7,7 @@ some minutes, are cancelled by SIGINT, outlive a killed starter and write to fil
 from __future__ import annotations
 
 import os
+import pickle
 import secrets
 import signal
 import subprocess
@@ -170,7 +171,7 @@ def evaluate_suite(
     if rank is not None:
         _require_plain(options, rank)
         # No common launch: torchrun starts all processes again when one was killed, and the sequence is tried again.
-        task = WorkerTask(job.to_dict(), rank.rank + 1, rank.world, rank.local, "", options.threads)
+        task = WorkerTask(job, rank.rank + 1, rank.world, rank.local, "", options.threads)
         finished = work(task, stop=stop, report=report, waits=rank.rank == 0, evaluate=evaluate)
         return _outcome(job, finished, stop(), reports=rank.rank == 0)
     if options.slurm or options.processes > 1:
@@ -197,9 +198,7 @@ def tasks_of(job: EvalJob, options: LaunchOptions, jobs: int | None = None) -> l
     """The tasks of processes that share a job: ``options.processes`` on this computer, or ``jobs`` on a cluster."""
     launch, count = secrets.token_hex(8), jobs or options.processes
     threads = options.threads if jobs else options.threads or max(1, available_cores() // count)
-    return [
-        WorkerTask(job.to_dict(), n + 1, count, 0 if jobs else n, launch, threads, options.debug) for n in range(count)
-    ]
+    return [WorkerTask(job, n + 1, count, 0 if jobs else n, launch, threads, options.debug) for n in range(count)]
 
 
 def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = _WORKER) -> bool:
@@ -220,10 +219,10 @@ def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, co
     try:
         for task in tasks:
             # In a session of its own, so that Ctrl-C reaches this process alone, which passes it on.
-            child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
+            child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
             running.append(_Process(task.label, child))
             assert child.stdin is not None
-            child.stdin.write(task.to_json())
+            pickle.dump(task, child.stdin)
             child.stdin.close()
         return _wait(running, stop, report)
     finally:
@@ -253,7 +252,7 @@ def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: 
         import submitit
     except ImportError as error:
         raise ImportError("--slurm needs submitit: pip install 'ufmstar-torch[cluster]'") from error
-    folder = f"{tasks[0].job['out']}/slurm"
+    folder = f"{tasks[0].job.out}/slurm"
     try:
         executor = submitit.AutoExecutor(folder=folder, cluster=slurm.cluster)
         executor.update_parameters(**{"name": "ufmstar-eval", **slurm.parameters})
@@ -291,7 +290,7 @@ class _Process:
     """A process on this computer."""
 
     label: str
-    child: subprocess.Popen[str]
+    child: subprocess.Popen[bytes]
 
     def outcome(self) -> tuple[bool, str] | None:
         """Whether it came to its end, and a line about what went wrong, or ""; None while it runs."""

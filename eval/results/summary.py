@@ -5,9 +5,8 @@ from __future__ import annotations
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import mean, median
-from typing import Any
+from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
 from ufmstar_torch.eval.results import machine
@@ -21,8 +20,7 @@ STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "s
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 
 
-@dataclass(frozen=True)
-class Ending:
+class Ending(NamedTuple):
     """How a run ended: "finished", "interrupted" or "failed", and why."""
 
     state: str

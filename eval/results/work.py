@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.results.claim import Claim
 from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
-from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
+from ufmstar_torch.eval.results.examples import ExampleWriter
 from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
@@ -115,35 +115,6 @@ class EvalJob:
         """Whether the sequence is one of the first of its data set, from which pictures are drawn."""
         same = [other for other in self.items if other.dataset == item.dataset]
         return item in same[: self.examples]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The job as plain values, for another process."""
-        plain = "missing_bases device confident bins examples samples runtime precision streams"
-        own = {name: getattr(self, name) for name in plain.split()}
-        return own | {
-            "suite": self.suite.to_dict(),
-            "networks": [asdict(choice) for choice in self.networks.values()],
-            "items": [asdict(item) for item in self.items],
-            "out": str(self.out),
-            "frames": [self.frames.start, self.frames.stop, self.frames.step],
-            "cache": None if self.cache is None else str(self.cache),
-        }
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> EvalJob:
-        """The job of :meth:`to_dict`, also after a way through JSON."""
-        networks = [NetworkChoice(**{**choice, "files": tuple(choice["files"])}) for choice in values["networks"]]
-        items = [WorkItem(**{**item, "opening": tuple(map(tuple, item["opening"]))}) for item in values["items"]]
-        made = {
-            "suite": Suite.from_dict(values["suite"]),
-            "networks": {choice.base: choice for choice in networks},
-            "items": tuple(items),
-            "out": Path(values["out"]),
-            "missing_bases": tuple(values["missing_bases"]),
-            "frames": slice(*values["frames"]),
-            "cache": None if values["cache"] is None else Path(values["cache"]),
-        }
-        return cls(**{**values, **made})
 
 
 @dataclass(frozen=True)
@@ -299,7 +270,7 @@ class _Worker:
             return None
         todo = [row for row in missing if row in possible]
         rows = with_references(todo, possible) if todo else missing
-        sinks = [ExampleWriter(Examples(self.folder.place(item)))] if self.job.keeps_examples(item) else []
+        sinks = [ExampleWriter(self.folder.place(item))] if self.job.keeps_examples(item) else []
         task = SequenceTask(sequence, rows, sinks, partial(self.context.progress, item.label))
         self._in_hand[task] = one
         return task
