@@ -224,11 +224,8 @@ def _walk(
     tour: Tour,
     progress: Callable[[Progress], None],
 ) -> tuple[list[RowRunner], RegionMetrics, _Walk]:
-    """All frames through all rows, with their figures by kind of room.
-
-    Raises:
-        ValueError: a network states no variance of its own.
-    """
+    """All frames through all rows, with their figures by kind of room. Raises ValueError: a network states no variance
+    of its own."""
     # Libraries set themselves up at the first call, which does not count.
     FrameStream(sequence, range(1), demo_rows(source, device), device=device).drive([_RequireVariances()])
     rows, kinds = demo_rows(source, device), [surface_kinds(tour, frame) for frame in sequence]
@@ -307,11 +304,8 @@ def _network(info: TrainedInfo, digest: str, members: int) -> dict[str, Any]:
 
 @contextmanager
 def _weights(path: Path | None) -> Iterator[Path]:
-    """The file with the networks: the user's, or the package's own wherever that is installed.
-
-    Raises:
-        FileNotFoundError: it is not there.
-    """
+    """The file with the networks: the user's, or the package's own wherever that is installed. Raises
+    FileNotFoundError: it is not there."""
     if path is not None:
         if not path.is_file():
             raise FileNotFoundError(f"--weights: no such file: {path}")
@@ -325,11 +319,7 @@ def _weights(path: Path | None) -> Iterator[Path]:
 
 
 def _device(name: str) -> torch.device:
-    """The device, if it is there.
-
-    Raises:
-        DemoError: it is not.
-    """
+    """The device, if it is there. Raises DemoError: it is not."""
     try:
         return torch.zeros((), device=require_device(name)).device
     except ValueError as error:

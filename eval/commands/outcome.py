@@ -47,11 +47,8 @@ def measure(outcome: EvalOutcome, threads: int | None = None) -> str | None:
 
 
 def draw(outcome: EvalOutcome) -> str:
-    """Draw tables and figures; a line with their place, or with the reason why there are none.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
+    """Draw tables and figures; a line with their place, or with the reason why there are none. Raises OSError: a file
+    cannot be written."""
     try:
         report = write_report(outcome.job.out)
     except (ImportError, ResultsError) as error:

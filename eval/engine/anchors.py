@@ -33,21 +33,14 @@ _TAKEN, _NOISE = 1, 2
 
 @dataclass(frozen=True, eq=False)
 class FrameAnchors:
-    """The anchors of one frame.
+    """The anchors of one frame."""
 
-    Attributes:
-        anchors: [1, N] in the pixels of the depth map, on its device; None where there is no image to track in.
-        tracked: corners that were followed from the frame before; 0 of ground truth.
-        triangulated: those of them with a depth; of ground truth, all.
-        ms: of the tracker [ms]; None of ground truth.
-        none: why nothing was triangulated, where that is so.
-    """
-
+    # [1, N] in the pixels of the depth map, on its device; None where there is no image to track in.
     anchors: Anchors | None
-    tracked: int = 0
-    triangulated: int = 0
-    ms: float | None = None
-    none: str = ""
+    tracked: int = 0  # corners that were followed from the frame before; 0 of ground truth
+    triangulated: int = 0  # those of them with a depth; of ground truth, all
+    ms: float | None = None  # of the tracker [ms]; None of ground truth
+    none: str = ""  # why nothing was triangulated, where that is so
 
 
 class Tracks:
@@ -97,11 +90,7 @@ class Tracks:
         return self._tracker.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken.
-
-        Raises:
-            ValueError: it is of a tracker of another size.
-        """
+        """Continue where ``state`` was taken. Raises ValueError: it is of a tracker of another size."""
         self._tracker.load_state(state)
         self._last = None
 
@@ -212,22 +201,16 @@ def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
 
 
 def landmark_digests(rows: Iterable[Row], folder: Path | None) -> dict[str, str]:
-    """Digests of the landmarks of those rows that have them from a file, by the rows' slugs.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`landmarks_of`.
-    """
+    """Digests of the landmarks of those rows that have them from a file, by the rows' slugs. Raises FileNotFoundError,
+    ValueError, as :func:`landmarks_of`."""
     files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
     known = {file: landmarks_of(file, folder).identity for file in set(files.values())}
     return {slug: known[file]["landmarks"] for slug, file in files.items() if "landmarks" in known[file]}
 
 
 def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row, AnchorSource]:
-    """The source of every row with anchors; rows of the same images and poses share a tracker.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`landmarks_of`.
-    """
+    """The source of every row with anchors; rows of the same images and poses share a tracker. Raises
+    FileNotFoundError, ValueError, as :func:`landmarks_of`."""
     tracks: dict[tuple[object, ...], Tracks] = {}
     sources = {}
     for row in rows:

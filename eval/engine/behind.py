@@ -55,11 +55,8 @@ class Behind(FrameSink):
         self._last = perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """Queue a frame; waits where the sinks are too far behind.
-
-        Raises:
-            BaseException: what a sink raised for an earlier frame.
-        """
+        """Queue a frame; waits where the sinks are too far behind. Raises BaseException: what a sink raised for an
+        earlier frame."""
         self._wait(_WAITING)
         state = {name: value.clone() for name, value in self._stream.state().items()}
         now = perf_counter()

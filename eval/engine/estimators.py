@@ -27,32 +27,22 @@ from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A row's answer for one frame: maps [h, w] on the CPU.
+    """A row's answer for one frame: maps [h, w] on the CPU."""
 
-    Attributes:
-        depth: as predicted, or corrected by the anchors' bias, where the row is about that [m].
-        variance: total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
-        valid: bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
-        aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
-        disagreement: M of UfM* [m^2], or None.
-        anchored: B of UfM* with anchors [m^2], or None.
-        bias: r of UfM* with anchors, or None.
-        posterior_depth: of UfM* with anchors and a posterior [m], or None.
-        posterior_variance: likewise [m^2].
-        statistics: of UfM*, [1] per count, or None.
-    """
-
-    depth: Tensor
+    depth: Tensor  # as predicted, or corrected by the anchors' bias, where the row is about that [m]
+    # total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
     variance: Tensor | None
+    # bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
     valid: Tensor
+    # aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
     aleatoric: Tensor | None = None
     epistemic: Tensor | None = None
-    disagreement: Tensor | None = None
-    anchored: Tensor | None = None
-    bias: Tensor | None = None
-    posterior_depth: Tensor | None = None
-    posterior_variance: Tensor | None = None
-    statistics: FrameStatistics | None = None
+    disagreement: Tensor | None = None  # M of UfM* [m^2], or None
+    anchored: Tensor | None = None  # B of UfM* with anchors [m^2], or None
+    bias: Tensor | None = None  # r of UfM* with anchors, or None
+    posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
+    posterior_variance: Tensor | None = None  # likewise [m^2]
+    statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
 
 
 class Estimator(Protocol):
@@ -78,11 +68,7 @@ class Estimator(Protocol):
         ...
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken.
-
-        Raises:
-            ValueError: it is the state of another kind of estimator.
-        """
+        """Continue where ``state`` was taken. Raises ValueError: it is the state of another kind of estimator."""
         ...
 
 
@@ -149,13 +135,9 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
 
 @dataclass(frozen=True)
 class Alone:
-    """The network's own variance, A + E of what it has.
+    """The network's own variance, A + E of what it has."""
 
-    Attributes:
-        uses_variances: False leaves A and E aside, so that there is no variance.
-    """
-
-    uses_variances: bool = True
+    uses_variances: bool = True  # False leaves A and E aside, so that there is no variance
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         a, e = _variances(prediction, self.uses_variances)
@@ -261,20 +243,13 @@ class Gaussians:
         return self._streams.choose(self._stream, prediction.size), prediction.size, *prediction.maps()
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`.
-
-        Raises:
-            ValueError: ``aleatoric_in_h`` without an aleatoric variance.
-        """
+        """See :meth:`Estimator.update`. Raises ValueError: ``aleatoric_in_h`` without an aleatoric variance."""
         return self.update_together([self], [(prediction, T_world_cam, anchors)])[0]
 
     @staticmethod
     def update_together(streams: Sequence[Gaussians], inputs: Sequence[EstimatorInput]) -> list[Estimate]:
-        """The next frames of some streams of one UfM*, which have the same :meth:`batch`.
-
-        Raises:
-            ValueError: as :meth:`update`.
-        """
+        """The next frames of some streams of one UfM*, which have the same :meth:`batch`. Raises ValueError, as
+        :meth:`update`."""
         frames = {one._stream: one._input(*given) for one, given in zip(streams, inputs, strict=True)}
         out = streams[0]._streams(frames)
         return [one._estimate(frames[one._stream], out[one._stream]) for one in streams]

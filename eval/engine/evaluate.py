@@ -54,38 +54,28 @@ BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 
 @dataclass(frozen=True)
 class RowResult:
-    """One row on one sequence.
+    """One row on one sequence."""
 
-    Attributes:
-        row: which.
-        frames, figures, curves, state, ms: as ``Record`` has them.
-        sums: states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and
-            "nll_by_error:REFERENCE" (``NLLByError``), to be added up over sequences.
-    """
-
-    row: Row
+    row: Row  # which
+    # frames, figures, curves, state, ms: as ``Record`` has them.
     frames: dict[str, Any]
     figures: dict[str, float]
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
+    # (``NLLByError``), to be added up over sequences.
     sums: dict[str, dict[str, Tensor]]
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceTask:
-    """What is judged of a sequence.
+    """What is judged of a sequence."""
 
-    Attributes:
-        sequence: posed frames with ground truth.
-        rows: different ones.
-        sinks: take the frames after the metrics; a row's key is its slug.
-        progress: called with the frames that are done and all of them, at the start and after every one.
-    """
-
-    sequence: FrameSequence
-    rows: Sequence[Row]
-    sinks: Sequence[Sink] = ()
+    sequence: FrameSequence  # posed frames with ground truth
+    rows: Sequence[Row]  # different ones
+    sinks: Sequence[Sink] = ()  # take the frames after the metrics; a row's key is its slug
+    # called with the frames that are done and all of them, at the start and after every one.
     progress: Callable[[int, int], None] = lambda done, total: None
 
 
@@ -93,26 +83,18 @@ class SequenceTask:
 class Judge:
     """How sequences are judged.
 
-    Attributes:
-        networks: by base.
-        device: where UfM and UfM* run.
-        store: of predictions; None = all are computed.
-        limit: which frames, before a setting's skip.
-        confident: of the pixels of a frame, the share of which a reference method counts as confident.
-        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
-        streams: sequences that are judged at the same time: networks and UfM* get their frames as one batch. UfM* gives
-            the same bits as for one sequence after the other; a network may not (``NetworkSource.several``).
-
     Raises:
         ValueError: a share of confident pixels out of range, or less than one stream.
     """
 
-    networks: Mapping[str, DepthSource]
-    device: torch.device
-    store: PredictionStore | None = None
-    limit: slice = field(default_factory=lambda: slice(None))
-    confident: float = 0.5
-    bins: str = "ours"
+    networks: Mapping[str, DepthSource]  # by base
+    device: torch.device  # where UfM and UfM* run
+    store: PredictionStore | None = None  # of predictions; None = all are computed
+    limit: slice = field(default_factory=lambda: slice(None))  # which frames, before a setting's skip
+    confident: float = 0.5  # of the pixels of a frame, the share of which a reference method counts as confident
+    bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
+    # sequences that are judged at the same time: networks and UfM* get their frames as one batch. UfM* gives the same
+    # bits as for one sequence after the other; a network may not (``NetworkSource.several``).
     streams: int = 1
 
     def __post_init__(self) -> None:
@@ -320,11 +302,7 @@ def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range
 
 
 def _result(row: Row, account: _Account, metrics: RowMetrics, sequence: FrameSequence) -> RowResult:
-    """What a row leaves behind.
-
-    Raises:
-        SequenceError: it has judged nothing.
-    """
+    """What a row leaves behind. Raises SequenceError: it has judged nothing."""
     key, frames = row.slug, account.frames(metrics.judged[row.slug])
     if not frames["judged"]:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])

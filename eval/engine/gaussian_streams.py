@@ -18,24 +18,16 @@ _Batch = TypeVar("_Batch")
 
 @dataclass(frozen=True, eq=False)
 class StreamInput:
-    """What ``UfMStar.forward`` takes of one stream, without the leading dimension.
+    """What ``UfMStar.forward`` takes of one stream, without the leading dimension."""
 
-    Attributes:
-        depth: [H, W] [m].
-        pose: [4, 4] float64 camera-to-world [m].
-        intrinsics: [3, 3] float64 [px].
-        aleatoric, epistemic: [H, W] [m^2], or None.
-        features: [F, H, W], or None.
-        anchors: [1, N], or None.
-    """
-
-    depth: Tensor
-    pose: Tensor
-    intrinsics: Tensor
+    depth: Tensor  # [H, W] [m]
+    pose: Tensor  # [4, 4] float64 camera-to-world [m]
+    intrinsics: Tensor  # [3, 3] float64 [px]
+    # aleatoric, epistemic: [H, W] [m^2], or None.
     aleatoric: Tensor | None = None
     epistemic: Tensor | None = None
-    features: Tensor | None = None
-    anchors: Anchors | None = None
+    features: Tensor | None = None  # [F, H, W], or None
+    anchors: Anchors | None = None  # [1, N], or None
 
 
 class UfMStarStreams:
@@ -68,11 +60,7 @@ class UfMStarStreams:
             module.reset([stream])
 
     def sole(self) -> UfMStar:
-        """The module of a single stream.
-
-        Raises:
-            ValueError: it has several.
-        """
+        """The module of a single stream. Raises ValueError: it has several."""
         if self._count > 1:
             raise ValueError(f"a state goes into a UfM* of one stream, this one has {self._count}")
         return self._modules[None]

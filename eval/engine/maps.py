@@ -69,11 +69,7 @@ class MapSource(DepthSource):
         return self
 
     def one(self, frame: Frame, n: int) -> Prediction:
-        """The frame's map; no network runs.
-
-        Raises:
-            FrameError: it has none, or it cannot be read.
-        """
+        """The frame's map; no network runs. Raises FrameError: it has none, or it cannot be read."""
         given = self._read(frame).resized(self._size)
         variance = None if given.variance is None else torch.from_numpy(given.variance)
         return Prediction(torch.from_numpy(given.depth), variance, None, torch.from_numpy(given.intrinsics).double())

@@ -76,11 +76,8 @@ class NetworkSource(DepthSource):
         return runtime_of(self.networks[0], self._precision)
 
     def prepared(self, how: str) -> NetworkSource:
-        """The same networks, which draw from the same generator, on images that are prepared otherwise.
-
-        Raises:
-            ValueError: the networks do not declare their input by a ``Preprocess``.
-        """
+        """The same networks, which draw from the same generator, on images that are prepared otherwise. Raises
+        ValueError: the networks do not declare their input by a ``Preprocess``."""
         own = self._turns.preprocess
         if how == OF_NETWORK:
             return self
@@ -106,11 +103,7 @@ class NetworkSource(DepthSource):
         return not self._draws
 
     def one(self, frame: Frame, n: int) -> Prediction:
-        """One inference, of member (or sample) n.
-
-        Raises:
-            FrameError: the frame has no image.
-        """
+        """One inference, of member (or sample) n. Raises FrameError: the frame has no image."""
         return self.several([frame], n)[0]
 
     def several(self, frames: Sequence[Frame], n: int) -> list[Prediction]:

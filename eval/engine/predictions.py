@@ -23,21 +23,13 @@ _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A depth map with the variances that come with it.
+    """A depth map with the variances that come with it."""
 
-    Attributes:
-        depth: [h, w] [m].
-        aleatoric: [h, w] A [m^2], or None.
-        epistemic: [h, w] E [m^2], or None.
-        intrinsics: [3, 3] float64 of the depth map [px], on the CPU.
-        ms: of the inference, or of all of them together [ms]; None where no network ran.
-    """
-
-    depth: Tensor
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-    intrinsics: Tensor
-    ms: float | None = None
+    depth: Tensor  # [h, w] [m]
+    aleatoric: Tensor | None  # [h, w] A [m^2], or None
+    epistemic: Tensor | None  # [h, w] E [m^2], or None
+    intrinsics: Tensor  # [3, 3] float64 of the depth map [px], on the CPU
+    ms: float | None = None  # of the inference, or of all of them together [ms]; None where no network ran
 
     @property
     def size(self) -> tuple[int, int]:
@@ -81,11 +73,8 @@ class Prediction:
 
 
 def combined(predictions: Sequence[Prediction]) -> Prediction:
-    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added.
-
-    Raises:
-        ValueError: no prediction.
-    """
+    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added. Raises
+    ValueError: no prediction."""
 
     def batch(value: Tensor | None) -> Tensor | None:
         return None if value is None else value[None]
@@ -128,11 +117,8 @@ class DepthSource:
         return None
 
     def prepared(self, how: str) -> DepthSource:
-        """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change.
-
-        Raises:
-            ValueError: there are no images to prepare.
-        """
+        """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change. Raises
+        ValueError: there are no images to prepare."""
         raise NotImplementedError
 
     def turn(self, position: int) -> int:
@@ -143,31 +129,19 @@ class DepthSource:
         """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
 
     def one(self, frame: Frame, n: int) -> Prediction:
-        """One timed inference, of member (or sample) n.
-
-        Raises:
-            FrameError: the frame has nothing to predict from.
-        """
+        """One timed inference, of member (or sample) n. Raises FrameError: the frame has nothing to predict from."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class PredictionKey:
-    """What a prediction depends on.
+    """What a prediction depends on."""
 
-    Attributes:
-        network: digest of the network(s).
-        sequence: ``sequence_digest``.
-        frame: its name.
-        member: "0", "1", ..., or "all".
-        content: ``frame_digest``.
-    """
-
-    network: str
-    sequence: str
-    frame: str
-    member: str
-    content: str
+    network: str  # digest of the network(s)
+    sequence: str  # ``sequence_digest``
+    frame: str  # its name
+    member: str  # "0", "1", ..., or "all"
+    content: str  # ``frame_digest``
 
     @property
     def path(self) -> Path:
@@ -203,11 +177,8 @@ class FramePredictions:
         self._known: dict[tuple[object, str], Prediction] = {}
 
     def of(self, source: DepthSource, position: int, every: bool) -> Prediction:
-        """What a row gets that has used ``position`` images before: of all members, or of the one in turn.
-
-        Raises:
-            FrameError: the frame has nothing to predict from.
-        """
+        """What a row gets that has used ``position`` images before: of all members, or of the one in turn. Raises
+        FrameError: the frame has nothing to predict from."""
         n = _pass(source, position, every)
         known = self._looked_up(source, n)
         if known is None:

@@ -24,25 +24,16 @@ _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drif
 
 @dataclass(frozen=True, eq=False)
 class RowFrame:
-    """A frame that a row has taken in.
+    """A frame that a row has taken in."""
 
-    Attributes:
-        prediction: the depth map, on the estimator's device.
-        estimate: what the row makes of it, on the CPU.
-        truth: [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
-        T_world_cam: [4, 4] the pose as the row sees it [m].
-        member: which network predicted; None where all did, and of maps.
-        anchors: of the frame; None of a row without anchors.
-        ms: "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms].
-    """
-
-    prediction: Prediction
-    estimate: Estimate
+    prediction: Prediction  # the depth map, on the estimator's device
+    estimate: Estimate  # what the row makes of it, on the CPU
+    # [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
     truth: NDArray[np.float32] | None
-    T_world_cam: NDArray[np.float64]
-    member: int | None
-    anchors: FrameAnchors | None
-    ms: Mapping[str, float]
+    T_world_cam: NDArray[np.float64]  # [4, 4] the pose as the row sees it [m]
+    member: int | None  # which network predicted; None where all did, and of maps
+    anchors: FrameAnchors | None  # of the frame; None of a row without anchors
+    ms: Mapping[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +93,8 @@ class RowRunner:
         return selects(self.setting, number)
 
     def predict(self, predictions: FramePredictions) -> Prediction:
-        """The prediction that the row gets for the next frame.
-
-        Raises:
-            FrameError: the frame has nothing to predict from.
-        """
+        """The prediction that the row gets for the next frame. Raises FrameError: the frame has nothing to predict
+        from."""
         return predictions.of(self.source, self.images, self.every)
 
     def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowInput:
@@ -147,11 +135,7 @@ class RowRunner:
         return {_IMAGES: torch.tensor(self.images), **kept}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken.
-
-        Raises:
-            ValueError: it is the state of another kind of row.
-        """
+        """Continue where ``state`` was taken. Raises ValueError: it is the state of another kind of row."""
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

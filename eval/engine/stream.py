@@ -32,27 +32,18 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What came of a frame.
+    """What came of a frame."""
 
-    Attributes:
-        number: of the frame among those that the stream selects, from 0.
-        index: of the frame in its sequence.
-        name: of the frame.
-        frame: as it was read; None where no row selects it, or it cannot be used.
-        rows: by key, of the rows that have taken it in.
-        skipped: by key, why a row that selects the frame cannot use it.
-        ms: "read" (what was left to wait for: frames are read ahead), "predict" (without the batches of several
-            streams) and "truth", and the stages of the sinks that came before [ms].
-        state: the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
-    """
-
-    number: int
-    index: int
-    name: str
-    frame: Frame | None = None
-    rows: Mapping[str, RowFrame] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)
+    number: int  # of the frame among those that the stream selects, from 0
+    index: int  # of the frame in its sequence
+    name: str  # of the frame
+    frame: Frame | None = None  # as it was read; None where no row selects it, or it cannot be used
+    rows: Mapping[str, RowFrame] = field(default_factory=dict)  # by key, of the rows that have taken it in
+    skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
+    # "read" (what was left to wait for: frames are read ahead), "predict" (without the batches of several streams) and
+    # "truth", and the stages of the sinks that came before [ms].
     ms: dict[str, float] = field(default_factory=dict)
+    # the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
     state: Mapping[str, Tensor] = field(default_factory=dict)
 
 
@@ -149,11 +140,8 @@ class FrameStream:
         return {f"{row.key}/{name}": value for row in self.rows for name, value in row.state().items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Bring the rows to where ``state`` was taken; :attr:`position` is the caller's.
-
-        Raises:
-            ValueError: it is the state of other rows.
-        """
+        """Bring the rows to where ``state`` was taken; :attr:`position` is the caller's. Raises ValueError: it is the
+        state of other rows."""
         for row in self.rows:
             prefix = f"{row.key}/"
             row.load_state({name[len(prefix) :]: v for name, v in state.items() if name.startswith(prefix)})
@@ -344,11 +332,8 @@ def hand_over(result: FrameResult, sinks: Sequence[Sink], timer: StageTimer) -> 
 
 
 def _truths(frame: Frame, predictions: Mapping[str, Prediction]) -> dict[str, NDArray[np.float32] | None]:
-    """Ground truth at the pixels of every row's maps, [h, w] [m], 0 = none; once for every camera.
-
-    Raises:
-        FrameError: the depth map has no camera.
-    """
+    """Ground truth at the pixels of every row's maps, [h, w] [m], 0 = none; once for every camera. Raises FrameError:
+    the depth map has no camera."""
     known: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
     for key, one in predictions.items():

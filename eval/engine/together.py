@@ -22,19 +22,13 @@ class Inference(NamedTuple):
 
 @dataclass(eq=False)
 class Update:
-    """A frame for a row's estimator.
+    """A frame for a row's estimator."""
 
-    Attributes:
-        row: which.
-        given: the frame.
-        answer: of the estimator: its estimate, or the error that the frame raises.
-        ms: of the estimator; of a batch, divided by its frames [ms].
-    """
-
-    row: RowRunner
-    given: RowInput
+    row: RowRunner  # which
+    given: RowInput  # the frame
+    # of the estimator: its estimate, or the error that the frame raises.
     answer: Estimate | RuntimeError | ValueError | None = None
-    ms: float = 0.0
+    ms: float = 0.0  # of the estimator; of a batch, divided by its frames [ms]
 
     def answered(self) -> Estimate:
         """The estimate; an error is raised."""

@@ -14,16 +14,11 @@ from ufmstar_torch.recalibrate import split_name
 
 @dataclass(frozen=True)
 class Row:
-    """What is judged.
+    """What is judged."""
 
-    Attributes:
-        method: which network, how often it is run, and what judges its views.
-        setting: what an ablation changes about it.
-        title: what tables and figures call it; "" = by method and setting. It makes no other row of it.
-    """
-
-    method: Method
-    setting: Setting = DEFAULT
+    method: Method  # which network, how often it is run, and what judges its views
+    setting: Setting = DEFAULT  # what an ablation changes about it
+    # what tables and figures call it; "" = by method and setting. It makes no other row of it.
     title: str = field(default="", compare=False)
 
     @property

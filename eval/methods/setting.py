@@ -165,11 +165,8 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
 
 
 def value_of(setting: Mapping[str, Any], name: str) -> Any:
-    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it has none.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it has none. Raises
+    ValueError: an unknown name."""
     return setting[name] if name in setting else default_of(name, setting.get("ufm_preset", DEFAULTS))
 
 
@@ -201,11 +198,7 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
 
 
 def configured(setting: Setting) -> UfMStarConfig:
-    """UfM*'s configuration under a setting.
-
-    Raises:
-        ValueError: an unknown name, or a value that it does not take.
-    """
+    """UfM*'s configuration under a setting. Raises ValueError: an unknown name, or a value that it does not take."""
     nested: dict[str, Any] = {}
     for name, value in setting.overrides.items():
         default_of(name)

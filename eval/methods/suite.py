@@ -59,30 +59,19 @@ _ROW_KEYS |= {"label": str}
 class Suite:
     """Rows, in the order of the table.
 
-    Attributes:
-        name: small letters, digits and single dashes.
-        title: one line for people.
-        rows: each of them once.
-        sweep: settings that vary, by the names of ``Setting.to_dict``; () = a table of methods.
-        datasets: that the paper takes.
-        sequences: how many it samples of each; None = all.
-        network: that it judges.
-        size: (h, w) of the network's input in the paper [px].
-        efficiency: whether time, energy and memory are what it is about.
-
     Raises:
         ValueError: a field is impossible.
     """
 
-    name: str
-    title: str
-    rows: tuple[Row, ...]
-    sweep: tuple[str, ...] = ()
-    datasets: tuple[str, ...] = ()
-    sequences: int | None = None
-    network: str = ""
-    size: tuple[int, int] | None = None
-    efficiency: bool = False
+    name: str  # small letters, digits and single dashes
+    title: str  # one line for people
+    rows: tuple[Row, ...]  # each of them once
+    sweep: tuple[str, ...] = ()  # settings that vary, by the names of ``Setting.to_dict``; () = a table of methods
+    datasets: tuple[str, ...] = ()  # that the paper takes
+    sequences: int | None = None  # how many it samples of each; None = all
+    network: str = ""  # that it judges
+    size: tuple[int, int] | None = None  # (h, w) of the network's input in the paper [px]
+    efficiency: bool = False  # whether time, energy and memory are what it is about
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -104,11 +93,7 @@ class Suite:
         return tuple(dict.fromkeys(row.method.base for row in self.rows))
 
     def with_bases(self, bases: Iterable[str]) -> Suite:
-        """The suite with the rows of some bases only.
-
-        Raises:
-            ValueError: none is left.
-        """
+        """The suite with the rows of some bases only. Raises ValueError: none is left."""
         given = set(bases)
         kept = tuple(row for row in self.rows if row.method.base in given)
         if not kept:
@@ -179,21 +164,13 @@ def check_row(row: Row) -> None:
 
 
 def rows_of(methods: Iterable[Method | str], setting: Setting = DEFAULT) -> tuple[Row, ...]:
-    """A row for each method (or its name) under one setting.
-
-    Raises:
-        ValueError: no method is called so.
-    """
+    """A row for each method (or its name) under one setting. Raises ValueError: no method is called so."""
     parsed = [Method.parse(method) if isinstance(method, str) else method for method in methods]
     return tuple(Row(method, setting) for method in parsed)
 
 
 def _file(name: str) -> Traversable:
-    """The file of a suite.
-
-    Raises:
-        ValueError: no suite is called so.
-    """
+    """The file of a suite. Raises ValueError: no suite is called so."""
     if name.endswith(".toml"):
         return Path(name)
     if name not in names():

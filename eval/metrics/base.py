@@ -53,11 +53,8 @@ class SumMetric(Metric):
             setattr(self, name, state + (value.to(state.device) if isinstance(value, Tensor) else value))
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
-        """Add another metric's sums to this one's.
-
-        Raises:
-            ValueError: the other one was made with other settings, so that its sums mean something else.
-        """
+        """Add another metric's sums to this one's. Raises ValueError: the other one was made with other settings, so
+        that its sums mean something else."""
         if isinstance(incoming_state, SumMetric) and incoming_state.settings != self.settings:
             raise ValueError(
                 f"incoming_state must come from a metric with the settings {self.settings}, "

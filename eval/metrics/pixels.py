@@ -10,19 +10,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Pixels:
-    """The comparable pixels of one or more frames, flat and in float64.
+    """The comparable pixels of one or more frames, flat and in float64."""
 
-    Attributes:
-        depth: [P] predicted depth d [m].
-        variance: [P] predicted variance v [m^2], >= 0; empty where a metric does not need it.
-        target: [P] ground-truth depth [m], > 0.
-        with_truth: [] int64, pixels with valid ground truth, whatever the prediction there.
-    """
-
-    depth: Tensor
-    variance: Tensor
-    target: Tensor
-    with_truth: Tensor
+    depth: Tensor  # [P] predicted depth d [m]
+    variance: Tensor  # [P] predicted variance v [m^2], >= 0; empty where a metric does not need it
+    target: Tensor  # [P] ground-truth depth [m], > 0
+    with_truth: Tensor  # [] int64, pixels with valid ground truth, whatever the prediction there
 
     @property
     def left_out(self) -> Tensor:

@@ -90,11 +90,7 @@ class SequenceMetrics(nn.Module):
         return {f"metrics.{kind}.{name}": getattr(metric, name) for kind, metric in named for name in metric.states}
 
     def merge_state(self, other: SequenceMetrics) -> None:
-        """Add the sums of another part of the same sequence.
-
-        Raises:
-            ValueError: the other one judges other things.
-        """
+        """Add the sums of another part of the same sequence. Raises ValueError: the other one judges other things."""
         if other.metrics.keys() != self.metrics.keys():
             raise ValueError(f"other must hold the metrics {list(self.metrics)}, got {list(other.metrics)}")
         for mine, theirs in zip(self._all(), other._all(), strict=True):

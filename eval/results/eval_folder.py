@@ -116,11 +116,7 @@ class EvalFolder:
                 )
 
     def keep(self, item: WorkItem, record: Record, result: RowResult) -> None:
-        """Store a row, completely or not at all.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Store a row, completely or not at all. Raises OSError: it cannot be written."""
         path = self.place(item) / f"{result.row.slug}.json"
         sums = {name: {key: pack(value) for key, value in states.items()} for name, states in result.sums.items()}
         path.unlink(missing_ok=True)  # one that could not be read
@@ -171,11 +167,8 @@ def _union(first: list[Any], second: list[Any]) -> list[Any]:
 
 
 def _clear(out: Path) -> None:
-    """Remove what an earlier evaluation and its report left, by their names; the cache stays.
-
-    Raises:
-        FolderError: a process is at one of its sequences.
-    """
+    """Remove what an earlier evaluation and its report left, by their names; the cache stays. Raises FolderError: a
+    process is at one of its sequences."""
     places = sorted({path.parent for path in out.glob(f"records/*/*/{PATTERN}")})
     with ExitStack() as held:
         for place in places:

@@ -59,11 +59,8 @@ class ExampleWriter(FrameSink):
         self._gaussians = {row.key: row.estimator for row in stream.rows if isinstance(row.estimator, Gaussians)}
 
     def take(self, result: FrameResult) -> None:
-        """After each frame; one that no row has taken in hands its place to the next.
-
-        Raises:
-            OSError: see ``write_atomic``.
-        """
+        """After each frame; one that no row has taken in hands its place to the next. Raises OSError, see
+        ``write_atomic``."""
         if not result.rows or result.frame is None:
             return
         for key in self._gaussians if self._room else ():
@@ -77,11 +74,7 @@ class ExampleWriter(FrameSink):
             self._write_rooms()
 
     def end(self) -> None:
-        """After the last frame.
-
-        Raises:
-            OSError: see ``write_atomic``.
-        """
+        """After the last frame. Raises OSError, see ``write_atomic``."""
         if self._room:
             self._write_rooms()
 

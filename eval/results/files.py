@@ -79,11 +79,8 @@ def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def to_json(value: Any, where: str = "data") -> Any:
-    """The value as dict, list, str, int, float, bool or None, with None for NaN and infinities.
-
-    Raises:
-        TypeError: the value, or one inside it, has no JSON form.
-    """
+    """The value as dict, list, str, int, float, bool or None, with None for NaN and infinities. Raises TypeError: the
+    value, or one inside it, has no JSON form."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray | np.generic):

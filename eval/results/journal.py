@@ -40,11 +40,7 @@ class MapWriter(FrameSink):
         self.written = WrittenFrame(0, 0)
 
     def take(self, result: FrameResult) -> None:
-        """Write a frame.
-
-        Raises:
-            OSError: see :meth:`FrameWriter.write`.
-        """
+        """Write a frame. Raises OSError, see :meth:`FrameWriter.write`."""
         if self._key in result.rows:
             estimate = result.rows[self._key].estimate
             anchored = ("anchored", "bias", "posterior_depth", "posterior_variance")
@@ -82,11 +78,7 @@ class Journal(FrameSink):
         self._first, self._started = stream.position, perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """Commit a frame.
-
-        Raises:
-            OSError: see :meth:`RunFolder.commit`.
-        """
+        """Commit a frame. Raises OSError, see :meth:`RunFolder.commit`."""
         session = {
             "first": self._first,
             "frames": result.number + 1 - self._first,

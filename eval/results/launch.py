@@ -39,45 +39,28 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class LaunchOptions:
-    """Who carries an evaluation out: options of ``ufmstar eval``, under their names.
+    """Who carries an evaluation out: options of ``ufmstar eval``, under their names."""
 
-    Attributes:
-        processes: on this computer.
-        slurm: KEY=VALUE words; see ``Slurm``. () = no cluster.
-        shard: "i/n", the part of the sequences that this process does; None = all.
-        threads: of the CPU, for each process; None = all, divided among them.
-        resume, overwrite: see ``EvalFolder.open``.
-        debug: show tracebacks.
-    """
-
-    processes: int = 1
-    slurm: Sequence[str] = ()
-    shard: str | None = None
-    threads: int | None = None
+    processes: int = 1  # on this computer
+    slurm: Sequence[str] = ()  # KEY=VALUE words; see ``Slurm``. () = no cluster
+    shard: str | None = None  # "i/n", the part of the sequences that this process does; None = all
+    threads: int | None = None  # of the CPU, for each process; None = all, divided among them
+    # resume, overwrite: see ``EvalFolder.open``.
     resume: bool = False
     overwrite: bool = False
-    debug: bool = False
+    debug: bool = False  # show tracebacks
 
 
 @dataclass(frozen=True)
 class EvalOutcome:
-    """How an evaluation ended.
+    """How an evaluation ended."""
 
-    Attributes:
-        job: what was evaluated.
-        finished: False: it was stopped, or a process ended early.
-        stopped: by the caller.
-        failed: why a sequence is broken, by its label.
-        left: number of sequences without all of their rows, broken ones left out.
-        reports: whether this process reports the results; further ones of torchrun are silent.
-    """
-
-    job: EvalJob
-    finished: bool
-    stopped: bool
-    failed: Mapping[str, str]
-    left: int
-    reports: bool = True
+    job: EvalJob  # what was evaluated
+    finished: bool  # False: it was stopped, or a process ended early
+    stopped: bool  # by the caller
+    failed: Mapping[str, str]  # why a sequence is broken, by its label
+    left: int  # number of sequences without all of their rows, broken ones left out
+    reports: bool = True  # whether this process reports the results; further ones of torchrun are silent
 
 
 @dataclass(frozen=True)
@@ -90,11 +73,8 @@ class Rank:
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Rank | None:
-        """The rank in an environment; None where torchrun has not started several processes.
-
-        Raises:
-            ValueError: the variables are not such numbers.
-        """
+        """The rank in an environment; None where torchrun has not started several processes. Raises ValueError: the
+        variables are not such numbers."""
         if any(name not in environment for name in _TORCHRUN):
             return None
         try:
@@ -108,25 +88,15 @@ class Rank:
 
 @dataclass(frozen=True)
 class Slurm:
-    """The words of ``--slurm``.
+    """The words of ``--slurm``."""
 
-    Attributes:
-        jobs: how many share the work.
-        cluster: of submitit: "slurm"; "local" and "debug" run on this computer.
-        parameters: of ``submitit.AutoExecutor``.
-    """
-
-    jobs: int
-    cluster: str
-    parameters: Mapping[str, Any]
+    jobs: int  # how many share the work
+    cluster: str  # of submitit: "slurm"; "local" and "debug" run on this computer
+    parameters: Mapping[str, Any]  # of ``submitit.AutoExecutor``
 
     @classmethod
     def parse(cls, words: Iterable[str]) -> Slurm:
-        """From KEY=VALUE words.
-
-        Raises:
-            ValueError: another form, a key twice, or a number of jobs below 1.
-        """
+        """From KEY=VALUE words. Raises ValueError: another form, a key twice, or a number of jobs below 1."""
         values: dict[str, Any] = {}
         for word in words:
             key, equals, value = word.partition("=")

@@ -52,20 +52,13 @@ RUN = FolderKind(
 
 @dataclass
 class Checkpoint:
-    """What a run needs to go on.
+    """What a run needs to go on."""
 
-    Attributes:
-        position: number of frames handled, skipped ones included.
-        journal_bytes: length of frames.jsonl then.
-        module: state of UfM* and of the alternation.
-        metrics: sums of the metrics, by name.
-        sessions: {"first", "frames", "seconds"} of every start of the program.
-    """
-
-    position: int = 0
-    journal_bytes: int = 0
-    module: dict[str, Tensor] = field(default_factory=dict)
-    metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    position: int = 0  # number of frames handled, skipped ones included
+    journal_bytes: int = 0  # length of frames.jsonl then
+    module: dict[str, Tensor] = field(default_factory=dict)  # state of UfM* and of the alternation
+    metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
+    # {"first", "frames", "seconds"} of every start of the program.
     sessions: list[dict[str, float]] = field(default_factory=list)
 
 
@@ -127,11 +120,8 @@ class RunFolder:
         self._folder.close()
 
     def commit(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
-        """Record a frame as handled, once its files are written; now and then, :meth:`store`.
-
-        Raises:
-            OSError: a full disk, say; the folder stays at the frame before.
-        """
+        """Record a frame as handled, once its files are written; now and then, :meth:`store`. Raises OSError: a full
+        disk, say; the folder stays at the frame before."""
         if self._journal is None:
             raise ValueError("commit needs an open folder: use `with folder:`")
         line = json.dumps(to_json(record), allow_nan=False).encode() + b"\n"
@@ -146,11 +136,8 @@ class RunFolder:
         self.checkpoint = checkpoint
 
     def store(self) -> None:
-        """Keep the state after the last finished frame on disk, for a run that goes on from it.
-
-        Raises:
-            OSError: a full disk, say; the state before stays.
-        """
+        """Keep the state after the last finished frame on disk, for a run that goes on from it. Raises OSError: a full
+        disk, say; the state before stays."""
         if self._stored is not self.checkpoint:
             self._store(self.checkpoint)
 

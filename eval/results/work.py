@@ -41,40 +41,24 @@ _FITTED = "{} recalibrated rows were fitted to this sequence and are not judged 
 
 @dataclass(frozen=True)
 class EvalJob:
-    """What is evaluated.
+    """What is evaluated."""
 
-    Attributes:
-        suite: its rows, of the bases that have a network.
-        missing_bases: bases of rows that were left out.
-        networks: chosen, by base.
-        items: the sequences.
-        out: the folder for everything that is written.
-        frames: which of each sequence.
-        cache: folder of predictions; None = in ``out``.
-        device: "cpu", "cuda", "cuda:1".
-        confident: share of a frame's pixels of which a reference method counts as confident.
-        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
-        examples: of each data set, sequences of which a few frames are stored for pictures.
-        samples: passes of MC-Dropout.
-        runtime, precision: of the networks (``Inference``).
-        streams: sequences that a process evaluates at the same time.
-    """
-
-    suite: Suite
-    networks: Mapping[str, NetworkChoice]
-    items: tuple[WorkItem, ...]
-    out: Path
-    missing_bases: tuple[str, ...] = ()
-    frames: slice = field(default_factory=lambda: slice(None))
-    cache: Path | None = None
-    device: str = "cpu"
-    confident: float = 0.5
-    bins: str = "ours"
-    examples: int = 3
-    samples: int | None = None
+    suite: Suite  # its rows, of the bases that have a network
+    networks: Mapping[str, NetworkChoice]  # chosen, by base
+    items: tuple[WorkItem, ...]  # the sequences
+    out: Path  # the folder for everything that is written
+    missing_bases: tuple[str, ...] = ()  # bases of rows that were left out
+    frames: slice = field(default_factory=lambda: slice(None))  # which of each sequence
+    cache: Path | None = None  # folder of predictions; None = in ``out``
+    device: str = "cpu"  # "cpu", "cuda", "cuda:1"
+    confident: float = 0.5  # share of a frame's pixels of which a reference method counts as confident
+    bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
+    examples: int = 3  # of each data set, sequences of which a few frames are stored for pictures
+    samples: int | None = None  # passes of MC-Dropout
+    # runtime, precision: of the networks (``Inference``).
     runtime: str = "auto"
     precision: str = "float32"
-    streams: int = 1
+    streams: int = 1  # sequences that a process evaluates at the same time
 
     @property
     def unused(self) -> tuple[str, ...]:
@@ -82,11 +66,8 @@ class EvalJob:
         return tuple(base for base in self.networks if base not in self.suite.bases)
 
     def load(self, device: torch.device) -> dict[str, DepthSource]:
-        """The networks that the rows need.
-
-        Raises:
-            FileNotFoundError, ValueError, ImportError: see ``NetworkChoice.load``.
-        """
+        """The networks that the rows need. Raises FileNotFoundError, ValueError, ImportError, see
+        ``NetworkChoice.load``."""
         passes = {} if self.samples is None else {"samples": self.samples}
         needed = [self.networks[base] for base in self.suite.bases]
         inference = Inference(self.runtime, self.precision)
@@ -119,27 +100,17 @@ class EvalJob:
 
 @dataclass(frozen=True)
 class WorkerContext:
-    """How one process takes part in an evaluation.
+    """How one process takes part in an evaluation."""
 
-    Attributes:
-        shard: the part of the sequences that it begins with.
-        helps: take sequences of other parts afterwards; for processes that were started together.
-        waits: stay until the sequences that other processes work on are finished.
-        launch: the same for all processes that were started together; "" = one of its own.
-        stop: asked before every frame.
-        report: receives a line when a sequence is finished.
-        progress: called with a sequence's label, its number of finished frames, and the number of all of them.
-        evaluate: computes rows on sequences; see ``evaluate_sequences``.
-    """
-
-    shard: Shard = field(default_factory=Shard)
-    helps: bool = False
-    waits: bool = False
-    launch: str = ""
-    stop: Callable[[], bool] = lambda: False
-    report: Callable[[str], None] = lambda line: None
+    shard: Shard = field(default_factory=Shard)  # the part of the sequences that it begins with
+    helps: bool = False  # take sequences of other parts afterwards; for processes that were started together
+    waits: bool = False  # stay until the sequences that other processes work on are finished
+    launch: str = ""  # the same for all processes that were started together; "" = one of its own
+    stop: Callable[[], bool] = lambda: False  # asked before every frame
+    report: Callable[[str], None] = lambda line: None  # receives a line when a sequence is finished
+    # called with a sequence's label, its number of finished frames, and the number of all of them.
     progress: Callable[[str, int, int], None] = lambda label, done, total: None
-    evaluate: Evaluate = evaluate_sequences
+    evaluate: Evaluate = evaluate_sequences  # computes rows on sequences; see ``evaluate_sequences``
 
 
 def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext) -> bool:
@@ -182,24 +153,18 @@ def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource
 
 @dataclass(frozen=True, eq=False)
 class _InHand:
-    """A sequence that is evaluated.
+    """A sequence that is evaluated."""
 
-    Attributes:
-        item, claim: which, and the claim to it.
-        digest, landmarks: what its rows are computed from.
-        missing: rows to store.
-        left_out: those of them that cannot be had of this sequence, and why.
-        started: [s] ``time.monotonic``.
-    """
-
+    # item, claim: which, and the claim to it.
     item: WorkItem
     claim: Claim
+    # digest, landmarks: what its rows are computed from.
     digest: str
     landmarks: Mapping[str, str]
-    missing: Sequence[Row]
-    left_out: Sequence[Row]
+    missing: Sequence[Row]  # rows to store
+    left_out: Sequence[Row]  # those of them that cannot be had of this sequence, and why
     why: str
-    started: float
+    started: float  # [s] ``time.monotonic``
 
 
 class _Worker:

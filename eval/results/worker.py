@@ -22,24 +22,16 @@ DONE, FAILED, STOPPED = 0, 1, 130
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """What one process does; pickled for it.
+    """What one process does; pickled for it."""
 
-    Attributes:
-        job: what is evaluated; the output folder exists already.
-        index, count: which part it begins with, from 1, of how many.
-        local: number of the process on its computer, from 0, which decides its GPU.
-        launch: the same for all processes that were started together; "" = one of its own.
-        threads: of the CPU; None = torch's own choice.
-        debug: show tracebacks.
-    """
-
-    job: EvalJob
+    job: EvalJob  # what is evaluated; the output folder exists already
+    # index, count: which part it begins with, from 1, of how many.
     index: int
     count: int
-    local: int
-    launch: str
-    threads: int | None = None
-    debug: bool = False
+    local: int  # number of the process on its computer, from 0, which decides its GPU
+    launch: str  # the same for all processes that were started together; "" = one of its own
+    threads: int | None = None  # of the CPU; None = torch's own choice
+    debug: bool = False  # show tracebacks
 
     @property
     def label(self) -> str:
@@ -55,11 +47,8 @@ def work(
     waits: bool = False,
     evaluate: Evaluate = evaluate_sequences,
 ) -> bool:
-    """Take part; True when nothing is left to do.
-
-    Raises:
-        FolderError, OSError, ValueError, ImportError: the work cannot be begun, or nothing can be written.
-    """
+    """Take part; True when nothing is left to do. Raises FolderError, OSError, ValueError, ImportError: the work cannot
+    be begun, or nothing can be written."""
     if task.threads is not None:
         torch.set_num_threads(task.threads)
     job = replace(task.job, device=device_of(task.job.device, task.local))
@@ -71,11 +60,8 @@ def work(
 
 
 def device_of(name: str, local: int) -> str:
-    """The device of the process with that number on its computer: "cuda" is the GPU in turn, else as it stands.
-
-    Raises:
-        ValueError: the device does not exist.
-    """
+    """The device of the process with that number on its computer: "cuda" is the GPU in turn, else as it stands. Raises
+    ValueError: the device does not exist."""
     if name == "cuda" and torch.cuda.is_available():
         name = f"cuda:{local % torch.cuda.device_count()}"
     return require_device(name)

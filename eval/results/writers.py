@@ -62,11 +62,8 @@ class FrameWriter:
             (self.out_dir / folder).mkdir(parents=True, exist_ok=True)
 
     def paths(self, name: str) -> dict[str, Path]:
-        """The files of a frame by kind (depth, sigma, frames), in the order in which they are written.
-
-        Raises:
-            ValueError: the name is not usable as a file name.
-        """
+        """The files of a frame by kind (depth, sigma, frames), in the order in which they are written. Raises
+        ValueError: the name is not usable as a file name."""
         if not name or name.startswith(".") or any(c in name for c in "/\\\0"):
             raise ValueError(f"name must be a plain file name without its ending, got {name!r}")
         kinds = {"depth": "png", "sigma": "png", "frames": "npz"}

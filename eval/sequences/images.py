@@ -37,11 +37,8 @@ _MILLIMETRE = 1e-3
 
 
 def read_color(path: str | Path) -> np.ndarray:
-    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped).
-
-    Raises:
-        FrameError: missing, truncated, corrupt, or not an 8-bit image.
-    """
+    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped). Raises FrameError: missing, truncated,
+    corrupt, or not an 8-bit image."""
     return decode_color(path, path)
 
 
@@ -110,11 +107,8 @@ def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
 
 
 def image_tensor(frame: Frame) -> torch.Tensor:
-    """The frame's image [1, 3, H, W] uint8 RGB, as a network's ``preprocess`` takes it.
-
-    Raises:
-        FrameError: the frame has no image.
-    """
+    """The frame's image [1, 3, H, W] uint8 RGB, as a network's ``preprocess`` takes it. Raises FrameError: the frame
+    has no image."""
     if frame.image is None:
         raise FrameError(frame.name, "no image")
     return torch.from_numpy(frame.image).permute(2, 0, 1)[None]

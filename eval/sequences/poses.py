@@ -142,11 +142,8 @@ def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> d
 
 
 def read_matrix(path: str | Path) -> np.ndarray:
-    """The numbers of a small text file, one row per line, [R, C] float64; non-finite ones are kept.
-
-    Raises:
-        ValueError: a line holds something else than numbers, or lines differ in length.
-    """
+    """The numbers of a small text file, one row per line, [R, C] float64; non-finite ones are kept. Raises ValueError:
+    a line holds something else than numbers, or lines differ in length."""
     rows: list[list[float]] = []
     for number, text in numbered_lines(path):
         where = f"{path}:{number}"
@@ -159,11 +156,8 @@ def read_matrix(path: str | Path) -> np.ndarray:
 
 
 def read_pose(path: str | Path) -> np.ndarray:
-    """The camera-to-world pose [4, 4] of a file with one 4x4 matrix; all NaN if an entry is not finite.
-
-    Raises:
-        ValueError: the file does not hold 4x4 numbers with the bottom row 0 0 0 1.
-    """
+    """The camera-to-world pose [4, 4] of a file with one 4x4 matrix; all NaN if an entry is not finite. Raises
+    ValueError: the file does not hold 4x4 numbers with the bottom row 0 0 0 1."""
     T = read_matrix(path)
     if T.shape != (4, 4):
         raise ValueError(f"{path}: expected a 4x4 matrix, got {' x '.join(map(str, T.shape))} numbers")
@@ -179,11 +173,7 @@ def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) ->
 
 
 def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
-    """Line numbers from 1, and the lines of a text file.
-
-    Raises:
-        ValueError: it is no text file (UTF-8).
-    """
+    """Line numbers from 1, and the lines of a text file. Raises ValueError: it is no text file (UTF-8)."""
     try:
         return list(enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1))
     except UnicodeDecodeError as error:

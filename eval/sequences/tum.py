@@ -68,11 +68,8 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Timestamps [N] [s] and file names of lines ``timestamp filename``; ``#`` starts a comment line.
-
-    Raises:
-        ValueError: a line (named by file and number) has another form.
-    """
+    """Timestamps [N] [s] and file names of lines ``timestamp filename``; ``#`` starts a comment line. Raises
+    ValueError: a line (named by file and number) has another form."""
     times, files = [], []
     for number, text in numbered_lines(path):
         words = text.split(maxsplit=1)

@@ -23,18 +23,13 @@ _TRIES = 400
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A rectangle of floor with walls up to a ceiling.
+    """A rectangle of floor with walls up to a ceiling."""
 
-    Attributes:
-        lower, upper: [2] x and z of its corners [m].
-        height: of the ceiling [m].
-        style: how it is furnished.
-    """
-
+    # lower, upper: [2] x and z of its corners [m].
     lower: Array
     upper: Array
-    height: float
-    style: TourStyle
+    height: float  # of the ceiling [m]
+    style: TourStyle  # how it is furnished
 
     @property
     def centre(self) -> Array:
@@ -44,22 +39,15 @@ class Room:
 
 @dataclass(frozen=True, eq=False)
 class Door:
-    """An opening in the wall between two rooms.
+    """An opening in the wall between two rooms."""
 
-    Attributes:
-        rooms: the earlier and the later room.
-        middle: [2] x and z of its middle, halfway through the wall [m].
-        normal: [2] unit vector from the earlier into the later room.
-        width, height: of the opening [m].
-        thickness: of the wall [m].
-    """
-
-    rooms: tuple[int, int]
-    middle: Array
-    normal: Array
+    rooms: tuple[int, int]  # the earlier and the later room
+    middle: Array  # [2] x and z of its middle, halfway through the wall [m]
+    normal: Array  # [2] unit vector from the earlier into the later room
+    # width, height: of the opening [m].
     width: float
     height: float
-    thickness: float
+    thickness: float  # of the wall [m]
 
     @property
     def along(self) -> Array:

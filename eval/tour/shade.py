@@ -24,21 +24,13 @@ _CAP = 1e-3  # how near to a frustum's end a point is on its cap, in unit coordi
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where pixels see a surface; P of them, float32, pixels of the same room, kind and texture side by side.
+    """Where pixels see a surface; P of them, float32, pixels of the same room, kind and texture side by side."""
 
-    Attributes:
-        surface: [P] int64.
-        point: [3, P] [m].
-        normal: [3, P] unit, towards the camera.
-        uv: [2, P] coordinates on the surface [m].
-        footprint: [P] size of a pixel there [m].
-    """
-
-    surface: Tensor
-    point: Tensor
-    normal: Tensor
-    uv: Tensor
-    footprint: Tensor
+    surface: Tensor  # [P] int64
+    point: Tensor  # [3, P] [m]
+    normal: Tensor  # [3, P] unit, towards the camera
+    uv: Tensor  # [2, P] coordinates on the surface [m]
+    footprint: Tensor  # [P] size of a pixel there [m]
 
 
 def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float) -> Tensor:

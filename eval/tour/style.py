@@ -85,11 +85,7 @@ class TourStyle:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TourStyle:
-        """From plain values.
-
-        Raises:
-            ValueError: an unknown name, or a value out of its range.
-        """
+        """From plain values. Raises ValueError: an unknown name, or a value out of its range."""
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
             raise ValueError(f"unknown field {unknown} of TourStyle, expected some of {[f.name for f in fields(cls)]}")
@@ -130,11 +126,7 @@ STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED}
 
 
 def style_of(style: str | TourStyle) -> TourStyle:
-    """A style by its name.
-
-    Raises:
-        ValueError: no such name.
-    """
+    """A style by its name. Raises ValueError: no such name."""
     if isinstance(style, TourStyle):
         return style
     if style not in STYLES:
