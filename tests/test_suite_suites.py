@@ -6,13 +6,14 @@ import pickle
 from dataclasses import replace
 
 import pytest
+from tiny_suite import rows_of
 
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.method import BASES, MANY, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from, value_of
-from ufmstar_torch.eval.methods.suite import Suite, names, rows_of, suite_named
+from ufmstar_torch.eval.methods.suite import Suite, names, suite_named
 from ufmstar_torch.eval.report.data import listed_rows
 from ufmstar_torch.eval.report.names import row_label, row_labels, shared_words
 
@@ -197,8 +198,6 @@ def test_impossible_suites():
         Suite("x", "", ())
     with pytest.raises(ValueError, match="small letters"):
         Suite("../x", "", rows)
-    with pytest.raises(ValueError, match="row Ensemble: eta is of UfM"):
-        Suite("x", "", rows_of(["Ensemble"], Setting({"eta": 0.1})))
     with pytest.raises(ValueError, match="no setting is called 'etta'"):
         Suite("x", "", rows, sweep=("etta",))
 

@@ -30,11 +30,11 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.report.outputs import Finished, common_scales, draw_sheet, draw_video, write_mixture
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
-from ufmstar_torch.eval.results.journal import Journal, MapWriter, row_state
+from ufmstar_torch.eval.results.journal import Journal, row_state
 from ufmstar_torch.eval.results.run_folder import RunFolder
 from ufmstar_torch.eval.results.summary import FAILED, FINISHED, INTERRUPTED, Ending, summarise
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.recalibrate import Recalibration, read_recalibration, split_name
+from ufmstar_torch.recalibrate import read_recalibration, split_name
 from ufmstar_torch.ufmstar import UfMStar
 
 # [s] between two updates of the summary of a run that is going on.
@@ -74,10 +74,11 @@ class RunJob:
 
     def row(self, module: Mapping[str, Tensor], position: int) -> RowRunner:
         """UfM* on the source after ``position`` frames, in the state that a checkpoint holds; {} at the start."""
+        mapped = read_recalibration(self.recalibration) if self.recalibration else None
         row = RowRunner(
             UFM,
             self.source,
-            Gaussians(self.config, self.device, recalibration=self._map()),
+            Gaussians(self.config, self.device, recalibration=mapped),
             every=self.every,
             anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks())) if self.config.anchored else None,
             skips_faults=True,
@@ -86,9 +87,6 @@ class RunJob:
         if module:
             row.load_state(row_state(module, bare=not self.source.needs_image, images=torch.tensor(position)))
         return row
-
-    def _map(self) -> Recalibration | None:
-        return read_recalibration(self.recalibration) if self.recalibration else None
 
     @property
     def source_identity(self) -> dict[str, Any]:
@@ -205,10 +203,10 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     UfMStar(job.config, device=job.device).warm_up((32, 32), progress=compiling)
     position = folder.checkpoint.position
     row = job.row(folder.checkpoint.module, position)
-    metrics, maps = RunMetrics(UFM, folder.checkpoint.metrics), MapWriter(UFM, folder.writer)
-    journal = Journal(UFM, folder, metrics.figures.state, maps, bare=not job.source.needs_image)
+    metrics = RunMetrics(UFM, folder.checkpoint.metrics)
+    journal = Journal(UFM, folder, metrics.figures.state, bare=not job.source.needs_image)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
-    with Behind([metrics, maps, journal, _Summaries(job, folder)]) as behind:
+    with Behind([metrics, journal, _Summaries(job, folder)]) as behind:
         stream.drive([behind, _Reports(job, folder, progress)], stop=stop)
 
 

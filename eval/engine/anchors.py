@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import torch
@@ -54,11 +53,6 @@ class Tracks:
         self._tracker = LandmarkTracker() if source is None else source
         self._before: Mapping[str, Tensor] = {}
         self._last: tuple[Frame, Landmarks, float] | None = None
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """Plain values on which the landmarks depend."""
-        return self._tracker.identity
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
         """Landmarks of a frame, which follows those that were asked for before, and the time that they took [ms].

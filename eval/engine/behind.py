@@ -14,7 +14,7 @@ from time import perf_counter
 import torch
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink, hand_over
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, hand_over
 
 # Frames that wait for their sinks; each holds its maps and the state after it, about 3 MB at 224 x 224.
 _WAITING = 4
@@ -31,7 +31,7 @@ class Behind(FrameSink):
             time since the frame before [ms]: of the whole loop, waiting for these sinks included.
     """
 
-    def __init__(self, sinks: Sequence[Sink]) -> None:
+    def __init__(self, sinks: Sequence[FrameSink]) -> None:
         self._sinks = tuple(sinks)
         self._timer = StageTimer(torch.device("cpu"))
         self._thread = ThreadPoolExecutor(1)

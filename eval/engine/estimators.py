@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.gaussian_streams import StreamInput, UfMStarStreams
 from ufmstar_torch.eval.engine.predictions import Prediction
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
+from ufmstar_torch.eval.methods.method import ALONE, UFM
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
@@ -45,8 +45,8 @@ class Estimate:
     statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
 
 
-class Estimator(Protocol):
-    """Turns the predictions of a sequence, one after the other, into variances."""
+class Estimator:
+    """Turns the predictions of a sequence, one after the other, into variances; this one remembers nothing."""
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """Take in the next frame.
@@ -56,20 +56,21 @@ class Estimator(Protocol):
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
             anchors: [1, N] of the frame in the map's pixels; None = none.
         """
-        ...
+        raise NotImplementedError
 
     def memory(self) -> dict[str, float]:
         """What is kept for the next frame: "bytes" and "count" of points or components, "smoothing_bytes" of the map
         kept for smoothing [B]; {} if nothing is. With anchors also "anchors", those used of the frame."""
-        ...
+        return {}
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends."""
-        ...
+        return {}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken. Raises ValueError: it is the state of another kind of estimator."""
-        ...
+        """Continue where ``state`` was taken; raises ValueError for that of another kind of estimator."""
+        if state:
+            raise ValueError(f"the saved state has {sorted(state)} too many")
 
 
 # The arguments of :meth:`Estimator.update`.
@@ -91,10 +92,6 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         FileNotFoundError: the setting's recalibration does not exist.
     """
     method, setting = row.method, row.setting
-    of_ufm_star = {"settings of UfM*": setting.of_ufm_star, "anchors": setting.anchors}
-    for what, given in (of_ufm_star | {"recalibrations": setting.recalibration}).items():
-        if given and method.fusion != UFM_STAR:
-            raise ValueError(f"{row.label}: {what} go with UfM* only")
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
@@ -122,19 +119,13 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     and rows in pixels are not scaled, and the threshold a z^2 / f has the image's own focal length, where scaling keeps
     a / f. Segments are then smaller and more. Thresholds in metres, overlaps and radii are alike in both. At 224 x 224
     only the second part makes a difference, as far as the focal length is not 200 px.
-
-    Raises:
-        ValueError: an override has an unknown name or an impossible value; the message names it.
     """
-    try:
-        config = configured(row.setting).replace(on_bad_frame="skip")
-    except ValueError as error:
-        raise ValueError(f"{row.label}: {error}") from error
+    config = configured(row.setting).replace(on_bad_frame="skip")
     return config.replace(segment=replace(config.segment, scale_with_image=False)) if row.method.fixed_param else config
 
 
 @dataclass(frozen=True)
-class Alone:
+class Alone(Estimator):
     """The network's own variance, A + E of what it has."""
 
     uses_variances: bool = True  # False leaves A and E aside, so that there is no variance
@@ -148,20 +139,8 @@ class Alone:
         variance = torch.where(valid, sum(parts[1:], start=parts[0]), torch.nan) if parts else None
         return _estimate(depth=prediction.depth, variance=variance, valid=valid, aleatoric=a, epistemic=e)
 
-    def memory(self) -> dict[str, float]:
-        """Nothing."""
-        return {}
 
-    def state(self) -> dict[str, Tensor]:
-        """Nothing."""
-        return {}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        if state:
-            raise ValueError(f"the saved state has {sorted(state)} too many")
-
-
-class Pointwise:
+class Pointwise(Estimator):
     """UfM.
 
     Args:
@@ -192,7 +171,7 @@ class Pointwise:
         _load(self.ufm, state)
 
 
-class Gaussians:
+class Gaussians(Estimator):
     """UfM*.
 
     Args:

@@ -26,7 +26,7 @@ from ufmstar_torch.eval.engine.estimators import Estimator, Gaussians, make_esti
 from ufmstar_torch.eval.engine.judge import RowMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink, drive_together
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, drive_together
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
@@ -74,7 +74,7 @@ class SequenceTask:
 
     sequence: FrameSequence  # posed frames with ground truth
     rows: Sequence[Row]  # different ones
-    sinks: Sequence[Sink] = ()  # take the frames after the metrics; a row's key is its slug
+    sinks: Sequence[FrameSink] = ()  # take the frames after the metrics; a row's key is its slug
     # called with the frames that are done and all of them, at the start and after every one.
     progress: Callable[[int, int], None] = lambda done, total: None
 
@@ -127,7 +127,7 @@ def evaluate_sequences(
     estimators = _Estimators(judge.device, judge.streams)
     running: dict[FrameStream, _Evaluation] = {}
 
-    def begun() -> Iterator[tuple[FrameStream, Sequence[Sink]]]:
+    def begun() -> Iterator[tuple[FrameStream, Sequence[FrameSink]]]:
         for task in tasks:
             slot = min(set(range(judge.streams)) - {one.slot for one in running.values()})
             try:
@@ -185,7 +185,7 @@ class _Evaluation:
         anchors = anchor_sources(rows, sequence.folder)
         named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
         self._metrics, self._accounts = RowMetrics(named, judge.confident, judge.bins), _Accounts()
-        self.sinks: Sequence[Sink] = [self._metrics, self._accounts, *task.sinks, ProgressSink(task.progress)]
+        self.sinks: Sequence[FrameSink] = [self._metrics, self._accounts, *task.sinks, ProgressSink(task.progress)]
         runners = []
         for row in rows:
             source = sources[row.method.base, row.setting.preprocess]

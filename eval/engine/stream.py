@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from torch import Tensor
 from ufmstar_torch.eval.engine.ahead import FramesAhead
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
-from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
-from ufmstar_torch.eval.engine.together import Inference, Update, infer_together, update_together
+from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner, Update
+from ufmstar_torch.eval.engine.together import Inference, infer_together, update_together
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 
@@ -47,38 +46,21 @@ class FrameResult:
     state: Mapping[str, Tensor] = field(default_factory=dict)
 
 
-class Sink(Protocol):
-    """Takes what comes of the frames: metrics, writers, progress.
-
-    Attributes:
-        stage: its time stands in ``FrameResult.ms`` under this name for the sinks after it; None = it is not timed.
-    """
-
-    stage: str | None
-
-    def begin(self, stream: FrameStream) -> None:
-        """Before the first frame, or the first one after a resume."""
-        ...
-
-    def take(self, result: FrameResult) -> None:
-        """After every frame, skipped ones too. The stream's state is that after the frame."""
-        ...
-
-    def end(self) -> None:
-        """After the last frame; not after a stop or an error."""
-        ...
-
-
 class FrameSink:
-    """The parts of a :class:`Sink` that most sinks leave empty; each defines its own ``take``."""
+    """Takes what comes of the frames: metrics, writers, progress. Each defines its own ``take``."""
 
+    # Its time stands in ``FrameResult.ms`` under this name for the sinks after it; None = it is not timed.
     stage: str | None = None
 
     def begin(self, stream: FrameStream) -> None:
-        """See :class:`Sink`."""
+        """Before the first frame, or the first one after a resume."""
+
+    def take(self, result: FrameResult) -> None:
+        """After every frame, skipped ones too. The stream's state is that after the frame."""
+        raise NotImplementedError
 
     def end(self) -> None:
-        """See :class:`Sink`."""
+        """After the last frame; not after a stop or an error."""
 
 
 class FrameStream:
@@ -121,11 +103,11 @@ class FrameStream:
         self.timer = StageTimer(self._device)
         self.position = start
 
-    def drive(self, sinks: Sequence[Sink], *, stop: Callable[[], bool] = lambda: False) -> None:
+    def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
         """Go through the frames that are left; each one's result goes to the sinks in their order.
 
         Args:
-            sinks: see :class:`Sink`.
+            sinks: see :class:`FrameSink`.
             stop: asked before every frame.
 
         Raises:
@@ -196,13 +178,13 @@ class FrameStream:
                 raise
             return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
         ms = self.timer.take()
-        updates = [Update(row, row.begin(frame, predictions[row.key], truths[row.key])) for row in active]
+        updates = [row.begin(frame, predictions[row.key], truths[row.key]) for row in active]
         yield updates
         taken: dict[str, RowFrame] = {}
         skipped: dict[str, str] = {}
         for one in updates:
             try:
-                taken[one.row.key] = one.row.finish(frame, one.given, one.answered(), one.ms)
+                taken[one.row.key] = one.row.finish(frame, one)
             except FrameError as error:
                 skipped[one.row.key] = error.reason
         return FrameResult(number, index, name, frame, taken, skipped, ms)
@@ -212,7 +194,7 @@ _Frame = Generator[Sequence[Inference | Update], None, FrameResult]
 
 
 def drive_together(
-    streams: Iterator[tuple[FrameStream, Sequence[Sink]]],
+    streams: Iterator[tuple[FrameStream, Sequence[FrameSink]]],
     *,
     at_once: int = 1,
     stop: Callable[[], bool] = lambda: False,
@@ -255,7 +237,7 @@ def drive_together(
 class _Lane:
     """A stream on its way, its sinks, and what keeps an error of its own from other streams."""
 
-    def __init__(self, stream: FrameStream, sinks: Sequence[Sink], broken: tuple[type[Exception], ...]) -> None:
+    def __init__(self, stream: FrameStream, sinks: Sequence[FrameSink], broken: tuple[type[Exception], ...]) -> None:
         self.stream, self._sinks, self._broken = stream, sinks, broken
         self.error: Exception | None = None
         self._frame: _Frame | None = None
@@ -320,7 +302,7 @@ def _one_frame_of_each(lanes: Sequence[_Lane]) -> None:
         wanted = [one for lane in lanes if lane.waits for one in lane.advance()]
 
 
-def hand_over(result: FrameResult, sinks: Sequence[Sink], timer: StageTimer) -> None:
+def hand_over(result: FrameResult, sinks: Sequence[FrameSink], timer: StageTimer) -> None:
     """Give a result to sinks, in their order; the times of their stages are added to it."""
     for sink in sinks:
         if sink.stage is None:

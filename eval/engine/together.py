@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput, Gaussians
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.predictions import FramePredictions
-from ufmstar_torch.eval.engine.rows import RowInput, RowRunner
+from ufmstar_torch.eval.engine.rows import RowRunner, Update
 
 
 class Inference(NamedTuple):
@@ -18,24 +17,6 @@ class Inference(NamedTuple):
 
     predictions: FramePredictions
     row: RowRunner
-
-
-@dataclass(eq=False)
-class Update:
-    """A frame for a row's estimator."""
-
-    row: RowRunner  # which
-    given: RowInput  # the frame
-    # of the estimator: its estimate, or the error that the frame raises.
-    answer: Estimate | RuntimeError | ValueError | None = None
-    ms: float = 0.0  # of the estimator; of a batch, divided by its frames [ms]
-
-    def answered(self) -> Estimate:
-        """The estimate; an error is raised."""
-        assert self.answer is not None
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        return self.answer
 
 
 def infer_together(wanted: Sequence[Inference]) -> None:
@@ -67,12 +48,12 @@ def update_together(updates: Sequence[Update]) -> None:
     batches: dict[object, list[Update]] = {}
     for n, update in enumerate(updates):
         estimator = update.row.estimator
-        batch = estimator.batch(update.given.prediction) if isinstance(estimator, Gaussians) else n
+        batch = estimator.batch(update.prediction) if isinstance(estimator, Gaussians) else n
         batches.setdefault(batch, []).append(update)
     for batch in batches.values():
         timer = StageTimer(batch[0].row.device)
         with timer.stage("uncertainty"):
-            answers = _answers([one.row.estimator for one in batch], [one.given.of_estimator() for one in batch])
+            answers = _answers([one.row.estimator for one in batch], [one.of_estimator() for one in batch])
         ms = timer.take()["uncertainty"] / len(batch)
         for update, answer in zip(batch, answers, strict=True):
             update.answer, update.ms = answer, ms
@@ -86,7 +67,7 @@ def _answers(
     try:
         if streams:
             return Gaussians.update_together(streams, inputs)
-        return [estimators[0].update(inputs[0].prediction, inputs[0].T_world_cam, inputs[0].anchors)]
+        return [estimators[0].update(*inputs[0])]
     except (RuntimeError, ValueError) as error:
         if len(estimators) == 1:
             return [error]

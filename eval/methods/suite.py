@@ -36,7 +36,7 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, DEFAULTS, Setting, configured, default_of, setting_from
+from ufmstar_torch.eval.methods.setting import DEFAULTS, default_of, setting_from
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
@@ -84,8 +84,6 @@ class Suite:
             raise ValueError(f"suite {self.name} has a row twice: {', '.join(twice)}")
         for name in self.sweep:
             default_of(name)
-        for row in self.rows:
-            check_row(row)
 
     @property
     def bases(self) -> tuple[str, ...]:
@@ -149,24 +147,6 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         return Suite(**named, sweep=tuple(dict.fromkeys(_sweep(values))), **hints)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from error
-
-
-def check_row(row: Row) -> None:
-    """Raises ValueError unless the setting changes something of the method, in a way that it takes."""
-    if row.setting.of_ufm_star and row.method.fusion != UFM_STAR:
-        names = ", ".join(row.setting.of_ufm_star)
-        raise ValueError(f"row {row.method.name}: {names} is of UfM*, which the row does without")
-    if row.setting.anchors and row.method.fusion != UFM_STAR:
-        raise ValueError(f"row {row.method.name}: anchors are of UfM*, which the row does without")
-    if row.setting.aleatoric_in_h and not row.method.uses_aleatoric:
-        raise ValueError(f"row {row.method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
-    configured(row.setting)
-
-
-def rows_of(methods: Iterable[Method | str], setting: Setting = DEFAULT) -> tuple[Row, ...]:
-    """A row for each method (or its name) under one setting. Raises ValueError: no method is called so."""
-    parsed = [Method.parse(method) if isinstance(method, str) else method for method in methods]
-    return tuple(Row(method, setting) for method in parsed)
 
 
 def _file(name: str) -> Traversable:

@@ -17,17 +17,6 @@ class Pixels:
     target: Tensor  # [P] ground-truth depth [m], > 0
     with_truth: Tensor  # [] int64, pixels with valid ground truth, whatever the prediction there
 
-    @property
-    def left_out(self) -> Tensor:
-        """[] int64, pixels with ground truth whose prediction cannot be judged (NaN, infinite, v < 0)."""
-        return self.with_truth - self.depth.numel()
-
-
-def truth_mask(target: Tensor, valid: Tensor | None) -> Tensor:
-    """[...] True where there is ground truth: finite, positive, and in ``valid`` if that is given."""
-    mask = torch.isfinite(target) & (target > 0)
-    return mask if valid is None else mask & valid
-
 
 def select_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> Pixels:
     """The pixels with valid ground truth and a usable prediction.
@@ -42,7 +31,8 @@ def select_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid:
         ValueError: an argument has another shape than ``depth`` or the wrong type.
     """
     check_maps(depth, variance, target, valid)
-    truth = truth_mask(target, valid)
+    truth = torch.isfinite(target) & (target > 0)
+    truth = truth if valid is None else truth & valid
     usable = truth & torch.isfinite(depth)
     if variance is not None:
         usable = usable & torch.isfinite(variance) & (variance >= 0)

@@ -221,8 +221,3 @@ class NLLByError(SumMetric):
         """[percentiles] mean of each group, from the sums up to its end."""
         upto = kept_mean(self.count, total, kept) * kept
         return torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles
-
-
-def confident(variance: Tensor, threshold: float) -> Tensor:
-    """[...] bool, where a method states sigma <= threshold [m] (NaN: False); for ``NLLByError``'s ``valid``."""
-    return variance <= threshold**2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from torch import Tensor, nn
@@ -137,10 +137,3 @@ def mean_and_ci(values: Iterable[float], *, level: float = 0.95) -> tuple[float,
 
     deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in kept) / (n - 1))
     return mean, float(t.ppf(0.5 + level / 2, n - 1)) * deviation / math.sqrt(n)
-
-
-def over_sequences(results: Iterable[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
-    """Mean and 95 % half-width of each figure over the sequences' ``SequenceMetrics.compute()``."""
-    rows = list(results)
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    return {name: mean_and_ci(row[name] for row in rows if name in row) for name in names}

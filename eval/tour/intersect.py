@@ -6,8 +6,6 @@ alone, so with directions of camera z = 1, t is the depth. A miss is infinity.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -88,9 +86,4 @@ def _frustum(o: Scalars, d: Components, taper: float) -> Tensor:
     return best
 
 
-_ENTRIES: dict[int, Callable[[Scalars, Components, float], Tensor]] = {
-    QUAD: _quad,
-    BOX: _box,
-    ELLIPSOID: _ellipsoid,
-    FRUSTUM: _frustum,
-}
+_ENTRIES = {QUAD: _quad, BOX: _box, ELLIPSOID: _ellipsoid, FRUSTUM: _frustum}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -132,12 +131,7 @@ def _frustum(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(cap, flat, side), uv
 
 
-_LOCAL: dict[int, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
-    QUAD: _quad,
-    BOX: _box,
-    ELLIPSOID: _ellipsoid,
-    FRUSTUM: _frustum,
-}
+_LOCAL = {QUAD: _quad, BOX: _box, ELLIPSOID: _ellipsoid, FRUSTUM: _frustum}
 
 
 def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:

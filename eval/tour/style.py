@@ -13,18 +13,8 @@ Range = tuple[float, float]
 
 # The two sets are disjoint on purpose: a texture of the second is something a network never saw.
 HOME_TEXTURES = (
-    "plain",
-    "plaster",
-    "wood",
-    "checks",
-    "stripes",
-    "tiles",
-    "bricks",
-    "fabric",
-    "books",
-    "painting",
-    "window",
-)
+    "plain", "plaster", "wood", "checks", "stripes", "tiles", "bricks", "fabric", "books", "painting", "window"
+)  # fmt: skip
 HALL_TEXTURES = ("dots", "zigzag", "marble", "terrazzo", "hexagons", "rings")
 TEXTURES = HOME_TEXTURES + HALL_TEXTURES
 

@@ -200,22 +200,8 @@ def _rings(p: Patch) -> Tensor:
     return p.mixed(_square(4 * (u * u + v * v).sqrt(), p.pixel))
 
 
-_PATTERNS: dict[str, Callable[[Patch], Tensor]] = {
-    "plain": _plain,
-    "plaster": _plaster,
-    "wood": _wood,
-    "checks": _checks,
-    "stripes": _stripes,
-    "tiles": _tiles,
-    "bricks": _bricks,
-    "fabric": _fabric,
-    "books": _books,
-    "painting": _painting,
-    "window": _window,
-    "dots": _dots,
-    "zigzag": _zigzag,
-    "marble": _marble,
-    "terrazzo": _terrazzo,
-    "hexagons": _hexagons,
-    "rings": _rings,
-}
+_FUNCTIONS: tuple[Callable[[Patch], Tensor], ...] = (
+    _plain, _plaster, _wood, _checks, _stripes, _tiles, _bricks, _fabric, _books, _painting, _window,
+    _dots, _zigzag, _marble, _terrazzo, _hexagons, _rings,
+)  # fmt: skip
+_PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}
