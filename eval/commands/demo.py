@@ -50,7 +50,7 @@ from ufmstar_torch.eval.results.summary import versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
-from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
+from ufmstar_torch.models.trained import load_trained, read_info
 from ufmstar_torch.pipeline import NetworksInTurn
 from ufmstar_torch.ufmstar import UfMStar
 
@@ -62,10 +62,6 @@ _POSTERIOR = UfMStarConfig(anchored=True, posterior=True)
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
 DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
-
-
-class DemoError(ValueError):
-    """An option is out of range, or cannot be met on this machine."""
 
 
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
@@ -80,13 +76,12 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
 
     Raises:
         FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
-        DemoError: the device does not exist.
         FileNotFoundError, CheckpointError: the networks cannot be loaded.
-        ValueError: the networks state no variance.
+        ValueError: the device does not exist, or the networks state no variance.
         OSError: the results cannot be written.
     """
     started = perf_counter()
-    device = _device(options.device)
+    device = torch.zeros((), device=require_device(options.device)).device
     with _weights(options.weights) as file:
         info, members = read_info(file), load_trained(file)
         digest = sha256(file)
@@ -101,7 +96,13 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "out": str(options.out),
         "settings": options.settings(),
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
-        "network": _network(info, digest, len(members)),
+        "network": {
+            "file": info.path.name,
+            "sha256": digest,
+            "members": len(members),
+            "spec": info.spec.to_dict(),
+            "training": info.info,
+        },
         "methods": _methods(rows, metrics, walk),
         "surfaces": metrics.by_region(),
         "components": int(rows[2].estimator.memory()["count"]),
@@ -184,7 +185,6 @@ class _Walk(FrameSink):
         progress: called at the start and after every frame.
 
     Attributes:
-        panels: the rows of the sheet, in its order.
         ms: by row, the times of every frame by stage [ms].
     """
 
@@ -196,7 +196,7 @@ class _Walk(FrameSink):
 
     @property
     def panels(self) -> list[FramePanel]:
-        """See above."""
+        """The rows of the sheet, in its order."""
         return [self._panels[index] for index in self._rows]
 
     def begin(self, stream: FrameStream) -> None:
@@ -218,11 +218,7 @@ class _Walk(FrameSink):
 
 
 def _walk(
-    sequence: FrameSequence,
-    source: DepthSource,
-    device: torch.device,
-    tour: Tour,
-    progress: Callable[[Progress], None],
+    sequence: FrameSequence, source: DepthSource, device: torch.device, tour: Tour, progress: Callable[[Progress], None]
 ) -> tuple[list[RowRunner], RegionMetrics, _Walk]:
     """All frames through all rows, with their figures by kind of room. Raises ValueError: a network states no variance
     of its own."""
@@ -292,16 +288,6 @@ def _state_bytes(row: RowRunner) -> int:
     return int(row.estimator.memory().get("bytes", 0)) + sum(value.nbytes for value in evidence.values())
 
 
-def _network(info: TrainedInfo, digest: str, members: int) -> dict[str, Any]:
-    return {
-        "file": info.path.name,
-        "sha256": digest,
-        "members": members,
-        "spec": info.spec.to_dict(),
-        "training": info.info,
-    }
-
-
 @contextmanager
 def _weights(path: Path | None) -> Iterator[Path]:
     """The file with the networks: the user's, or the package's own wherever that is installed. Raises
@@ -316,11 +302,3 @@ def _weights(path: Path | None) -> Iterator[Path]:
         raise FileNotFoundError(f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another")
     with as_file(own) as file:
         yield file
-
-
-def _device(name: str) -> torch.device:
-    """The device, if it is there. Raises DemoError: it is not."""
-    try:
-        return torch.zeros((), device=require_device(name)).device
-    except ValueError as error:
-        raise DemoError(str(error)) from error

@@ -58,12 +58,11 @@ def main(options: DemoOptions) -> int:
     from ufmstar_torch.eval.commands import demo
     from ufmstar_torch.eval.commands.terminal import Bars
     from ufmstar_torch.eval.report.text import demo_explanation, demo_table
-    from ufmstar_torch.eval.results.folder import FolderError
 
     try:
         with Bars() as bars:
             summary = demo.run_demo(options, bars.show)
-    except (demo.DemoError, FileNotFoundError, FolderError) as error:
+    except (FileNotFoundError, ValueError) as error:
         raise UsageError(error) from error
     print(demo_table(summary), demo_explanation(summary), sep="\n\n")
     return 0

@@ -195,12 +195,7 @@ def main(options: RunOptions) -> int:
     try:
         with Bars() as bars, stop_signals(bars.say) as stop:
             summary = run_job(
-                job,
-                options.out,
-                resume=options.resume,
-                overwrite=options.overwrite,
-                progress=bars.show,
-                stop=stop,
+                job, options.out, resume=options.resume, overwrite=options.overwrite, progress=bars.show, stop=stop
             )
     except FolderError as error:
         raise UsageError(error) from error

@@ -106,11 +106,7 @@ class AnchorSource:
         self._setting, self.tracks = setting, tracks
 
     def of(
-        self,
-        frame: Frame,
-        T_world_cam: NDArray[np.float64],
-        prediction: Prediction,
-        truth: NDArray[np.float32] | None,
+        self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: Prediction, truth: NDArray[np.float32] | None
     ) -> FrameAnchors:
         """The anchors of the next frame.
 

@@ -89,14 +89,15 @@ class UfMStarStreams:
         first = next(row for row in rows if row is not None)
         (module,) = {self.choose(stream, (one.depth.shape[0], one.depth.shape[1])) for stream, one in given.items()}
         nowhere = torch.full_like(first.pose, torch.nan)
+        maps = {
+            name: _stack([None if row is None else getattr(row, name) for row in rows])
+            for name in ("depth", "aleatoric", "epistemic", "features")
+        }
         out = module(
-            _stack([None if row is None else row.depth for row in rows]),
-            torch.stack([nowhere if row is None else row.pose for row in rows]),
-            torch.stack([first.intrinsics if row is None else row.intrinsics for row in rows]),
-            _stack([None if row is None else row.aleatoric for row in rows]),
-            _stack([None if row is None else row.epistemic for row in rows]),
-            features=_stack([None if row is None else row.features for row in rows]),
+            pose=torch.stack([nowhere if row is None else row.pose for row in rows]),
+            intrinsics=torch.stack([first.intrinsics if row is None else row.intrinsics for row in rows]),
             anchors=_padded([None if row is None else row.anchors for row in rows]),
+            **maps,
         )
         for stream, row in enumerate(rows):
             self._absent[stream] += row is None and self._of[stream] is module

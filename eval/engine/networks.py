@@ -127,10 +127,7 @@ class NetworkSource(DepthSource):
         """Of inputs of one size."""
         x, K = (torch.cat(values) if len(values) > 1 else values[0] for values in zip(*inputs, strict=True))
         reduced = self._precision == BF16
-        with (
-            self._timer.stage("network"),
-            torch.autocast(self._device.type, torch.bfloat16, enabled=reduced),
-        ):
+        with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
             prediction = self._turns.member(x, K, n)
         made = Prediction.each(prediction, K, self._timer.take()["network"])
         return [one.to(torch.float32) for one in made] if reduced else made

@@ -207,8 +207,9 @@ def configured(setting: Setting) -> UfMStarConfig:
     config = _start(setting.ufm_preset).replace(anchored=bool(setting.anchors), posterior=setting.posterior)
     if setting.aleatoric_in_h:
         config = config.replace(features=2, add_aleatoric=False)
-    groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}
-    return config.replace(**{name: value for name, value in nested.items() if not _group(value)}, **groups)
+    groups = {name: value for name, value in nested.items() if isinstance(value, dict)}
+    changed = {group: replace(getattr(config, group), **values) for group, values in groups.items()}
+    return config.replace(**nested | changed)
 
 
 def _start(preset: str) -> UfMStarConfig:
@@ -225,7 +226,3 @@ def _names(config: Any, prefix: str = "") -> list[str]:
         value = getattr(config, f.name)
         names += _names(value, f"{prefix}{f.name}.") if is_dataclass(value) else [f"{prefix}{f.name}"]
     return names
-
-
-def _group(value: Any) -> bool:
-    return isinstance(value, dict)

@@ -13,7 +13,6 @@ import os
 import socket
 import tempfile
 import threading
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -85,14 +84,10 @@ def claim(place: Path, launch: str) -> Claim | None:
     if _last(place) != own:
         own.unlink(missing_ok=True)
         return None
-    remove(path for path in place.glob(PATTERN) if path != own)
+    for path in list(place.glob(PATTERN)):
+        if path != own:
+            path.unlink(missing_ok=True)
     return Claim(own, died=died)
-
-
-def remove(claims: Iterable[Path]) -> None:
-    """Remove files of claims that no process needs."""
-    for path in list(claims):
-        path.unlink(missing_ok=True)
 
 
 def _last(place: Path) -> Path | None:

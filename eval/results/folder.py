@@ -157,7 +157,9 @@ class OutputFolder:
             if kind.lock is not None:
                 lock = hold(out / kind.lock, wait=kind.wait)
                 if lock is None:
-                    raise FolderError(f"--out {out}: {_busy(kind)}")
+                    preparing = f"another process is preparing it for over {kind.wait:g} s"
+                    busy = preparing if kind.held == "opening" else f"another {kind.noun} is writing there now"
+                    raise FolderError(f"--out {out}: {busy}")
                 held.callback(lock.release)
             # Checked again: another process may have made the folder while this one waited.
             kind.require_choice(out, resume=resume, overwrite=overwrite)
@@ -257,9 +259,3 @@ def _flat(values: Manifest, prefix: str = "") -> dict[str, Any]:
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 40 else text[:16] + '..."'
-
-
-def _busy(kind: FolderKind) -> str:
-    if kind.held == "opening":
-        return f"another process is preparing it for over {kind.wait:g} s"
-    return f"another {kind.noun} is writing there now"

@@ -142,7 +142,9 @@ class RunFolder:
             self._store(self.checkpoint)
 
     def _store(self, checkpoint: Checkpoint) -> None:
-        content = _storable(checkpoint)
+        # Plain values and tensors, large ones by their non-zero entries.
+        sums = {name: {key: pack(value) for key, value in own.items()} for name, own in checkpoint.metrics.items()}
+        content = {**checkpoint.__dict__, "format": FORMAT, "metrics": sums}
         write_atomic(self.path / "resume" / "state.pt", lambda file: torch.save(content, file))
         self._stored, self._stored_at = checkpoint, monotonic()
 
@@ -157,12 +159,6 @@ class RunFolder:
         except OSError:
             self.release_reserve()
             self.writer.write_summary(summary)
-
-
-def _storable(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The checkpoint as it is stored: plain values and tensors, large ones by their non-zero entries."""
-    metrics = {name: {key: pack(value) for key, value in sums.items()} for name, sums in checkpoint.metrics.items()}
-    return {**checkpoint.__dict__, "format": FORMAT, "metrics": metrics}
 
 
 def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:

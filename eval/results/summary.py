@@ -41,21 +41,8 @@ def summarise(
     figures: Mapping[str, Mapping[str, float]],
     outputs: Mapping[str, str | None],
 ) -> dict[str, Any]:
-    """The content of summary.json, from what the run has stored.
-
-    Args:
-        ending: of the run.
-        settings: what the user chose.
-        sequence: the frames, of which ``selected`` were asked for.
-        selected: see above.
-        source: what the depth came from.
-        runtime: what ran the networks (``DepthSource.runtime``).
-        records: the lines of frames.jsonl.
-        sessions: of every start of the program.
-        mixture: at the end.
-        figures: metrics by method.
-        outputs: by file, None if it exists, or why it does not.
-    """
+    """The content of summary.json, from what the run has stored: ``records`` are the lines of frames.jsonl, ``mixture``
+    that at the end; ``outputs`` holds for each file None if it exists, or why it does not."""
     done = [record for record in records if record["state"] == "done"]
     return {
         "program": "ufmstar run",

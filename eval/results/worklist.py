@@ -77,11 +77,7 @@ class Shard:
 
 
 def find_work(
-    roots: Iterable[str],
-    *,
-    sample: int | None = None,
-    seed: int = 0,
-    only: Iterable[str] | None = None,
+    roots: Iterable[str], *, sample: int | None = None, seed: int = 0, only: Iterable[str] | None = None
 ) -> list[WorkItem]:
     """All sequences below the roots, sorted.
 

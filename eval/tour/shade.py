@@ -68,13 +68,7 @@ def _merged(spans: list[Span], divisor: int) -> list[Span]:
 
 
 def _hits(
-    tour: Tour,
-    surface: Tensor,
-    depth: Tensor,
-    direction: Tensor,
-    origin: Tensor,
-    pixel_angle: float,
-    kinds: list[Span],
+    tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float, kinds: list[Span]
 ) -> Hits:
     s = tour.surfaces
     geometry = torch.cat([s.rotation.flatten(1), s.centre, s.half, s.taper[:, None]], dim=1).float().T.contiguous()
