@@ -206,16 +206,8 @@ def load_members(
     inference: Inference = _AS_USERS,
     device: torch.device = _CPU,
 ) -> list[DepthNetwork]:
-    """The networks in the files, in their order, in eval mode and on the CPU. They want the same input.
-
-    Args:
-        model, spec, offload, inference: as :func:`network_source` has them.
-        files: of weights.
-        device: where they will run.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`network_source`.
-    """
+    """The networks in the files, in their order, in eval mode and on the CPU, for a device. They want the same input.
+    Arguments and errors as :func:`network_source`."""
     paths = [Path(file) for file in files]
     for folder in paths if model in DIRECTORIES else []:
         if not folder.is_dir():

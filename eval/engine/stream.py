@@ -104,11 +104,8 @@ class FrameStream:
         self.position = start
 
     def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
-        """Go through the frames that are left; each one's result goes to the sinks in their order.
-
-        Args:
-            sinks: see :class:`FrameSink`.
-            stop: asked before every frame.
+        """Go through the frames that are left; each one's result goes to the sinks in their order. ``stop`` is asked
+        before every frame.
 
         Raises:
             Stopped: ``stop`` returned True.

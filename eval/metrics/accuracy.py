@@ -49,14 +49,12 @@ class Delta1(SumMetric):
             self.add_count(name)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
         p = select_pixels(depth, None, target, valid)
         n = torch.tensor(p.depth.numel())
         hits, ratio = _delta1_update(p, self.tolerance), _delta1_ratio_update(p, self.tolerance)
         self.add(hits=hits, hits_ratio=ratio, pixels=n, with_truth=p.with_truth)
 
     def compute(self) -> dict[str, Tensor]:
-        """The figures of all updates so far."""
         return {
             "delta1": share(self.hits, self.pixels),
             "delta1_ratio": share(self.hits_ratio, self.pixels),
@@ -77,7 +75,6 @@ class _MeanError(SumMetric):
         self.add_count("pixels")
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
         error = self._error(select_pixels(depth, None, target, valid))
         self.add(total=error.sum(), pixels=torch.tensor(error.numel()))
 
@@ -92,7 +89,6 @@ class AbsRel(_MeanError):
         return (p.depth - p.target).abs() / p.target
 
     def compute(self) -> dict[str, Tensor]:
-        """The figure of all updates so far."""
         return {"abs_rel": share(self.total, self.pixels)}
 
 
@@ -103,5 +99,4 @@ class RMSE(_MeanError):
         return (p.depth - p.target).square()
 
     def compute(self) -> dict[str, Tensor]:
-        """The figure of all updates so far."""
         return {"rmse": share(self.total, self.pixels).sqrt()}

@@ -2,6 +2,9 @@
 
 Processes on this computer are started and watched here rather than by submitit's local executor, whose jobs end after
 some minutes, are cancelled by SIGINT, outlive a killed starter and write to files instead of the terminal.
+
+``stop`` is asked before every frame, or while processes or jobs run, and ends the work; ``report`` receives a line for
+everything that a user should see.
 """
 
 from __future__ import annotations
@@ -123,15 +126,8 @@ def evaluate_suite(
     progress: Callable[[str, int, int], None],
     evaluate: Evaluate = evaluate_sequences,
 ) -> EvalOutcome:
-    """Evaluate a job.
-
-    Args:
-        job: what is evaluated.
-        options: by whom.
-        stop: asked before every frame.
-        report: receives a line when a sequence is finished.
-        progress: see ``WorkerContext``; of this process's own work.
-        evaluate: of this process's own work; see ``evaluate_sequences``.
+    """Evaluate a job; ``progress`` (see ``WorkerContext``) and ``evaluate`` (see ``evaluate_sequences``) are of this
+    process's own work.
 
     Raises:
         FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
@@ -172,19 +168,8 @@ def tasks_of(job: EvalJob, options: LaunchOptions, jobs: int | None = None) -> l
 
 
 def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = _WORKER) -> bool:
-    """Start a process for every task, and wait for all of them.
-
-    One that ends early loses only the sequence in hand: the others do the rest.
-
-    Args:
-        tasks: one for each process.
-        stop: True: all end after the frame in hand.
-        report: receives a line for each process that ends early.
-        command: that runs ``worker.main``.
-
-    Returns:
-        Whether every process came to its end.
-    """
+    """Start a process for every task by ``command``, which runs ``worker.main``, and wait for all; whether every one
+    came to its end. One that ends early loses only the sequence in hand: the others do the rest."""
     running: list[_Process] = []
     try:
         for task in tasks:
@@ -203,16 +188,8 @@ def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, co
 
 
 def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: Report) -> bool:
-    """Submit a job for every task, and wait for all of them; OUT/slurm has their output.
-
-    Args:
-        slurm: the words of ``--slurm``.
-        tasks: one for each job.
-        stop: True: the jobs are cancelled.
-        report: receives a line for the jobs that were submitted, and for each that failed.
-
-    Returns:
-        Whether every job came to its end.
+    """Submit a job for every task, and wait for all of them; whether every one came to its end. OUT/slurm has their
+    output; stopping cancels them.
 
     Raises:
         ImportError: submitit is missing.

@@ -114,16 +114,8 @@ class WorkerContext:
 
 
 def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext) -> bool:
-    """Evaluate the sequences one after another.
-
-    Args:
-        job: what is evaluated.
-        folder: opened for the job.
-        networks: loaded for the job.
-        context: this process's part in it.
-
-    Returns:
-        Whether it came to the end; False = ``context.stop`` ended it. ``folder.failure`` reports broken sequences.
+    """Evaluate the sequences one after another, with the folder opened and the networks loaded for the job; whether it
+    came to the end (False: ``context.stop`` ended it). ``folder.failure`` reports broken sequences.
 
     Raises:
         FolderError: earlier results were computed from another sequence of that name.
