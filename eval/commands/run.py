@@ -44,32 +44,19 @@ _GOING_ON = Ending(INTERRUPTED, "no orderly end: the program was killed, or is s
 
 @dataclass(frozen=True, eq=False)
 class RunJob:
-    """What to run.
+    """What to run."""
 
-    Attributes:
-        sequence: the posed frames.
-        indices: which of them, in order.
-        source: of the depth.
-        config: of UfM*.
-        device: of UfM*.
-        settings: everything the user chose, as plain values, for the summary.
-        recalibration: FILE@DIGEST of a map of the variance; "" = none.
-        every: all members predict on every image, instead of one in turn.
-        video: whether to make preview.mp4.
-        sheet: whether to make contact_sheet.png.
-        landmarks: makes the source of the anchors, in its initial state; for ``config.anchored``.
-    """
-
-    sequence: FrameSequence
-    indices: range
-    source: DepthSource
-    config: UfMStarConfig
-    device: torch.device
-    settings: Mapping[str, Any]
-    recalibration: str = ""
-    every: bool = False
-    video: bool = True
-    sheet: bool = True
+    sequence: FrameSequence  # the posed frames
+    indices: range  # which of them, in order
+    source: DepthSource  # of the depth
+    config: UfMStarConfig  # of UfM*
+    device: torch.device  # of UfM*
+    settings: Mapping[str, Any]  # everything the user chose, as plain values, for the summary
+    recalibration: str = ""  # FILE@DIGEST of a map of the variance; "" = none
+    every: bool = False  # all members predict on every image, instead of one in turn
+    video: bool = True  # whether to make preview.mp4
+    sheet: bool = True  # whether to make contact_sheet.png
+    # makes the source of the anchors, in its initial state; for ``config.anchored``.
     landmarks: Callable[[], LandmarkSource] = LandmarkTracker
 
     def row(self, module: Mapping[str, Tensor], position: int) -> RowRunner:
@@ -127,21 +114,13 @@ class RunJob:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is.
+    """How far a run is."""
 
-    Attributes:
-        stage: "kernels" (compiled on a machine's first run), "frames" or "pictures".
-        done: of this stage, skipped frames included.
-        total: of this stage.
-        components: K after this frame, None if it was skipped or nothing has been done yet.
-        skipped: frames so far.
-    """
-
-    stage: str
-    done: int
-    total: int
-    components: int | None
-    skipped: int
+    stage: str  # "kernels" (compiled on a machine's first run), "frames" or "pictures"
+    done: int  # of this stage, skipped frames included
+    total: int  # of this stage
+    components: int | None  # K after this frame, None if it was skipped or nothing has been done yet
+    skipped: int  # frames so far
 
 
 def run(

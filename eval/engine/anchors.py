@@ -55,11 +55,8 @@ class Tracks:
         self._last: tuple[Frame, Landmarks, float] | None = None
 
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
-        """Landmarks of a frame, which follows those that were asked for before, and the time that they took [ms].
-
-        Args:
-            frame: without an image that the source needs, there are none, and the source stays as it is.
-            T_world_cam: [4, 4], noise included [m].
+        """Landmarks of a frame, which follows those that were asked for before, at the pose [4, 4] with its noise [m],
+        and the time that they took [ms]. None without an image that the source needs; the source stays as it is.
 
         Raises:
             ModuleNotFoundError: OpenCV is not installed.
@@ -108,14 +105,8 @@ class AnchorSource:
     def of(
         self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: Prediction, truth: NDArray[np.float32] | None
     ) -> FrameAnchors:
-        """The anchors of the next frame.
-
-        Args:
-            frame: the next one.
-            T_world_cam: [4, 4] as the row sees it [m].
-            prediction: with the camera of the maps.
-            truth: [h, w] at their pixels [m], 0 = none; None = nowhere.
-        """
+        """The anchors of the next frame, at the pose [4, 4] that the row sees [m], in the camera of the prediction;
+        ``truth`` [h, w] is the ground truth at its pixels [m], 0 = none, or None."""
         device = prediction.depth.device
         if self.tracks is None:
             known = np.zeros(prediction.size, np.float32) if truth is None else truth
@@ -175,11 +166,8 @@ class AnchorSource:
 
 
 def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
-    """What yields the landmarks of a sequence: the one place where an option or a setting becomes a source.
-
-    Args:
-        value: True, "corners" or "tracked": tracked corners; else as ``landmark_source`` takes it.
-        folder: of the sequence; a file of landmarks lies in it, or else in the working folder.
+    """What yields the landmarks of a sequence; True, "corners" and "tracked" mean tracked corners, other values are as
+    ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder.
 
     Raises:
         FileNotFoundError: no such file.

@@ -35,13 +35,8 @@ def references(row: Row, rows: Sequence[Row]) -> list[Row]:
 
 
 def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
-    """[h, w] bool, of the pixels with ground truth those with a variance at or below the frame's ``share`` quantile.
-
-    Args:
-        estimate: of the reference, with a variance.
-        truth: [h, w] [m], 0 = none.
-        share: in (0, 1].
-    """
+    """[h, w] bool, of the pixels with ground truth [h, w] [m] (0 = none) those whose variance is at or below the
+    frame's ``share`` quantile, in (0, 1]."""
     assert estimate.variance is not None
     judged = estimate.valid & (truth > 0)
     values = estimate.variance[judged]

@@ -87,8 +87,7 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         streams: of UfM* (:meth:`Gaussians.stream`); with ``config.spill``, whose folder is one sequence's, one.
 
     Raises:
-        ValueError: the setting changes what UfM* does not have, or what the method does not use; or a recalibration
-            that was fitted under other settings.
+        ValueError: a recalibration that was fitted under other settings.
         FileNotFoundError: the setting's recalibration does not exist.
     """
     method, setting = row.method, row.setting
@@ -141,13 +140,7 @@ class Alone(Estimator):
 
 
 class Pointwise(Estimator):
-    """UfM.
-
-    Args:
-        config: its settings.
-        device: of the points.
-        uses_variances: False leaves A and E aside.
-    """
+    """UfM. Without ``uses_variances``, A and E are left aside."""
 
     def __init__(self, config: UfMConfig, device: torch.device, *, uses_variances: bool = True) -> None:
         self.ufm = UfM(config, device=device)

@@ -77,14 +77,8 @@ class UfMStarStreams:
         return chosen
 
     def __call__(self, given: Mapping[int, StreamInput]) -> dict[int, UfMStarOutput]:
-        """Take in the next frame of streams of one module; their maps are of one size and kind.
-
-        Returns:
-            The output of each, as of a batch of one.
-
-        Raises:
-            ValueError, RuntimeError: as ``UfMStar.forward``; all streams are as they were.
-        """
+        """The outputs, each as of a batch of one, of streams of one module for their next frame; their maps are of one
+        size and kind. Errors as ``UfMStar.forward``; all streams are as they were then."""
         rows = [given.get(stream) for stream in range(self._count)]
         first = next(row for row in rows if row is not None)
         (module,) = {self.choose(stream, (one.depth.shape[0], one.depth.shape[1])) for stream, one in given.items()}

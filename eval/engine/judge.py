@@ -60,13 +60,7 @@ class Figures(Generic[Key]):
 
 class RunMetrics(FrameSink):
     """The figures of a run's row, ``UFM``, beside them those of its network alone, ``ALONE``, and of its ``POSTERIOR``.
-
-    All are of the pixels that the row uses; the others are masked.
-
-    Args:
-        key: of the row.
-        sums: of an earlier part of the run, from ``figures.state``.
-    """
+    All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run."""
 
     stage: str | None = "metrics"
 
@@ -154,13 +148,8 @@ class RowMetrics(FrameSink):
 
 
 class RegionMetrics(FrameSink):
-    """The figures of every row in every region of the images, and those of all regions together.
-
-    Args:
-        rows: their keys.
-        regions: their names.
-        region_of: [h, w] int64, at every pixel of a row's map, the number of its region.
-    """
+    """The figures of every row (by its key) in every region of the images, and those of all regions together.
+    ``region_of`` returns [h, w] int64, at every pixel of a row's map, the number of its region."""
 
     def __init__(
         self, rows: Sequence[str], regions: Sequence[str], region_of: Callable[[FrameResult, RowFrame], Tensor]

@@ -39,15 +39,7 @@ class PredictedMap(NamedTuple):
 
 
 class MapSource(DepthSource):
-    """Depth maps that exist already.
-
-    Args:
-        read: the map of a frame.
-        identity: plain values that distinguish these maps from others.
-        size: (h, w) to which the maps are brought; None = as they are.
-        is_truth: the maps are the sequence's own depth.
-        label, digest: see ``DepthSource``.
-    """
+    """Depth maps that exist already, brought to ``size`` (h, w) unless it is None; the rest as ``DepthSource``."""
 
     def __init__(
         self,

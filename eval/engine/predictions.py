@@ -162,14 +162,8 @@ class PredictionStore(Protocol):
 
 
 class FramePredictions:
-    """The predictions for one frame: each is looked up in memory, then in the store, then computed.
-
-    Args:
-        frame: which.
-        device: of the maps that are returned.
-        store: None = nothing is read or kept.
-        sequence: digest of the sequence, for the store.
-    """
+    """The predictions for one frame, on a device: each is looked up in memory, then in the store (None = there is
+    none), then computed. ``sequence`` is the digest of the sequence."""
 
     def __init__(self, frame: Frame, device: torch.device, store: PredictionStore | None, sequence: str) -> None:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence

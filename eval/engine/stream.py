@@ -141,17 +141,8 @@ class FrameStream:
                 row.source.prepare(frame)
 
     def next(self, frames: FramesAhead) -> _Frame:
-        """The way of the next frame; it stops where a network is needed, and where the rows' estimators are.
-
-        Yields:
-            The inferences, which may be made meanwhile; then the updates, which must be answered.
-
-        Returns:
-            What came of the frame.
-
-        Raises:
-            FrameError: without rows, the frame cannot be read.
-        """
+        """The way of the next frame: yields the inferences, which may be made meanwhile, and then the updates, which
+        must be answered; returns what came of the frame. Raises FrameError: without rows, the frame cannot be read."""
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if row.selects(number)]

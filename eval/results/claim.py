@@ -57,15 +57,8 @@ class Claim:
 
 
 def claim(place: Path, launch: str) -> Claim | None:
-    """Claim a place; None while another process, or an earlier call, has it.
-
-    Args:
-        place: an existing folder.
-        launch: the same for all processes that were started together.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Claim a place, an existing folder; None while another process, or an earlier call, has it. ``launch`` is the same
+    for all processes that were started together. Raises OSError: the folder cannot be written."""
     last, died = _last(place), False
     if last is not None:
         holder = _read(last)

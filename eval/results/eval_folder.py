@@ -49,14 +49,9 @@ class EvalFolder:
 
     @classmethod
     def open(cls, out: Path, about: Mapping[str, Any], *, resume: bool, overwrite: bool) -> EvalFolder:
-        """Make the folder, or go on in it; see ``OutputFolder.open``.
-
-        Args:
-            out: created if missing.
-            about: eval.json. Rows, sequences and networks are added to those of an earlier evaluation; suite, settings
-                and the networks of the same base must be the same.
-            resume: go on with the evaluation in the folder; without one, start.
-            overwrite: remove what an earlier evaluation left but for its cache of predictions, and start.
+        """Make the folder, or go on in it; see ``OutputFolder.open``. When going on, rows, sequences and networks of
+        ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the same
+        base must be the same. The cache of predictions is never removed.
 
         Raises:
             FolderError: the folder cannot be used as asked, or a process is at one of its sequences.

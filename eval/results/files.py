@@ -64,11 +64,8 @@ def remove_temporaries(paths: Iterable[Path]) -> None:
 
 
 def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:
-    """Write strict JSON (NaN and infinities become null) atomically and durably.
-
-    Args:
-        path: the file; its folder must exist.
-        data: mappings, sequences, dataclasses, NumPy arrays, tensors, paths, and plain values.
+    """Write strict JSON (NaN and infinities become null) atomically and durably: mappings, sequences, dataclasses,
+    NumPy arrays, tensors, paths, and plain values.
 
     Raises:
         TypeError: a value has no JSON form; the message names its place.

@@ -202,20 +202,9 @@ def remover(*patterns: str) -> Callable[[Path], None]:
 
 
 def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
-    """Hold a lock file until it is released or the process ends, however that happens.
-
-    On a network file system the lock holds between computers if it passes on ``flock``.
-
-    Args:
-        path: created if missing; its folder must exist.
-        wait: longest time [s] to wait for another holder.
-
-    Returns:
-        The lock; None where another process, or an earlier call, holds it.
-
-    Raises:
-        OSError: the file cannot be opened, or the file system does not support locks.
-    """
+    """Hold a lock file until it is released or the process ends, however that happens; None where another process, or
+    an earlier call, holds it for more than ``wait`` [s]. On a network file system the lock holds between computers if
+    it passes on ``flock``. Raises OSError: the file cannot be opened, or the file system does not support locks."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)

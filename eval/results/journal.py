@@ -23,15 +23,8 @@ _TURN, _UFM = "image_index", "ufm."
 
 
 class Journal(FrameSink):
-    """Writes every frame's maps to the run's folder, and commits it with the state that the next one depends on
-    (``FrameResult.state``).
-
-    Args:
-        key: of the row.
-        folder: of the run.
-        sums: the metrics' sums so far.
-        bare: the row's depth comes from maps.
-    """
+    """Writes every frame's maps to the run's folder, and commits it with the metrics' sums and the state that the next
+    one depends on (``FrameResult.state``). ``bare``: the row's depth comes from maps."""
 
     def __init__(
         self, key: str, folder: RunFolder, sums: Callable[[], dict[str, dict[str, Tensor]]], *, bare: bool

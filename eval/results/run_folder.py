@@ -83,13 +83,8 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path, identity: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
-        """Prepare the folder; see ``OutputFolder.open``.
-
-        Args:
-            path: created if missing.
-            identity: plain values that must be those of the run that is to be continued.
-            resume: go on where an earlier run in the folder stopped; without one, start.
-            overwrite: remove what an earlier run left, and start.
+        """Prepare the folder; see ``OutputFolder.open``. ``identity`` holds plain values that must be those of the run
+        that is to be continued.
 
         Raises:
             FolderError: the folder cannot be used as asked, or the state in it cannot be read.

@@ -169,11 +169,8 @@ class _Worker:
         self._in_hand: dict[SequenceTask, _InHand] = {}
 
     def tasks(self, queue: Iterable[WorkItem], taken: list[WorkItem]) -> Iterator[SequenceTask]:
-        """Claim one sequence of the queue after another; those with rows to compute are opened.
-
-        Args:
-            queue: in this order.
-            taken: gets the sequences that another process has.
+        """Claim one sequence of the queue after another; those with rows to compute are opened. ``taken`` gets the
+        sequences that another process has.
 
         Raises:
             Stopped: the caller asked to stop.

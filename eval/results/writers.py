@@ -47,12 +47,6 @@ class FrameWriter:
     The PNG scale is one for the whole run, so that a program that reads it once is right for all frames. It is chosen
     from the first frame (see ``fitting_unit``), or read back from the frames on disk when a run is continued; sigma's
     is a tenth of it. Pixels beyond the range are counted, and exact in the npz.
-
-    Args:
-        out_dir: created if missing.
-
-    Raises:
-        OSError: the folders cannot be made.
     """
 
     def __init__(self, out_dir: str | Path) -> None:
@@ -79,12 +73,8 @@ class FrameWriter:
         return [name for name in names if self.finished(name)]
 
     def write(self, name: str, *, valid: Tensor, **given: Tensor | None) -> WrittenFrame:
-        """Write one frame; none of its files appears before all are written.
-
-        Args:
-            name: file name without its ending, unique in the run.
-            valid: [H, W] bool, True where the pixel was used.
-            **given: the maps [H, W] of the npz by name; those that are None are left out.
+        """Write one frame; none of its files appears before all are written. The maps are [H, W]; those that are None
+        are left out, and ``valid`` is True where the pixel was used.
 
         Raises:
             ValueError: shapes or types disagree.
@@ -147,21 +137,12 @@ def fitting_unit(depth: NDArray[Any]) -> float:
 def encode_length_png(
     values: NDArray[Any], valid: NDArray[np.bool_], unit: float, *, quantity: str
 ) -> tuple[bytes, int]:
-    """Lengths as a 16-bit PNG with its scale as text.
+    """Lengths [H, W] [m] as a 16-bit PNG with its scale ``unit`` [m per count] as text: the file's content, and the
+    number of saturated pixels.
 
-    count = round(value / unit), 0 = invalid or not finite. A valid value below half a unit becomes 1,
-    so that it is not taken for invalid; one beyond the range becomes 65535.
-    Text keys: ``depth_scale`` = metres per count (also for sigma: it is a depth's), ``unit``,
-    ``quantity``, ``invalid``, ``saturated`` = number of pixels beyond the range.
-
-    Args:
-        values: [H, W] [m].
-        valid: [H, W] bool.
-        unit: metres per count.
-        quantity: "depth" or "sigma", a note for the reader.
-
-    Returns:
-        (the file's content, the number of saturated pixels).
+    count = round(value / unit), 0 = invalid or not finite. A valid value below half a unit becomes 1, so that it is not
+    taken for invalid; one beyond the range becomes 65535. Text keys: ``depth_scale`` = metres per count (also for
+    sigma: it is a depth's), ``unit``, ``quantity`` (a note for the reader), ``invalid``, ``saturated``.
     """
     import cv2
     from PIL.PngImagePlugin import PngInfo, putchunk
