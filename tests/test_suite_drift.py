@@ -14,8 +14,8 @@ from tiny_suite import row
 
 from ufmstar_torch.eval.bench.measure import measure
 from ufmstar_torch.eval.engine.anchors import anchor_sources
-from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.estimators import Estimate
+from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.engine.rows import RowRunner

@@ -427,7 +427,7 @@ def test_asked_to_stop_it_stops_between_frames(networks, sequence):
         ([row("Aleatoric"), row("Aleatoric", seed=4)], {}, "different ones"),
         ([row("Ensemble"), row("Evidential")], {}, "ensemble, evidential is missing"),
         ([row("Aleatoric")], {"confident": 0.0}, "confident"),
-        ],
+    ],
 )
 def test_what_cannot_be_judged_is_refused(networks, sequence, rows, options, told):
     with pytest.raises(ValueError, match=told):

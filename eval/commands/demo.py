@@ -65,14 +65,8 @@ DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=r
 
 
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
-    """Walk through the tour and leave pictures, mixture and summary in a folder.
-
-    Args:
-        options: what to show.
-        progress: called at the start of each stage and after every step of it.
-
-    Returns:
-        What summary.json holds; ``report.text`` makes a table of it.
+    """Walk through the tour and leave pictures, mixture and summary in a folder; what summary.json holds. ``progress``
+    is called at the start of each stage and after every step of it.
 
     Raises:
         FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
@@ -138,14 +132,9 @@ def surface_kinds(tour: Tour, frame: Frame) -> NDArray[np.int64]:
 
 
 def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
-    """Frames to show: half of them in each kind of room, spread evenly, familiar ones first.
-
-    Not the very first frame: nothing has been compared by then.
-
-    Args:
-        unfamiliar: of every frame, whether most of it shows an unfamiliar room.
-        rows: how many, at most.
-    """
+    """At most ``rows`` frames to show, given of every frame whether most of it shows an unfamiliar room: half of them
+    in each kind of room, spread evenly, familiar ones first. Not the very first frame: nothing has been compared by
+    then."""
     groups = [[i for i, is_new in enumerate(unfamiliar) if is_new == expected and i > 0] for expected in (False, True)]
     present = [group for group in groups if group]
     chosen: list[int] = []
@@ -178,15 +167,8 @@ class _RequireVariances(FrameSink):
 
 
 class _Walk(FrameSink):
-    """Collects times and the rows of the contact sheet, and reports the progress.
-
-    Args:
-        unfamiliar: of every frame, whether most of it shows an unfamiliar room.
-        progress: called at the start and after every frame.
-
-    Attributes:
-        ms: by row, the times of every frame by stage [ms].
-    """
+    """Collects the rows of the contact sheet and the times of every frame by row and stage [ms], and reports the
+    progress; ``unfamiliar``: of every frame, whether most of it shows an unfamiliar room."""
 
     def __init__(self, unfamiliar: list[bool], progress: Callable[[Progress], None]) -> None:
         self._unfamiliar, self._progress = unfamiliar, progress

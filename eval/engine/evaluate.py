@@ -21,9 +21,8 @@ from torch import Tensor
 from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
-from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.estimators import Estimator, Gaussians, make_estimator
-from ufmstar_torch.eval.engine.judge import RowMetrics
+from ufmstar_torch.eval.engine.judge import RowMetrics, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, drive_together

@@ -153,16 +153,8 @@ def _fused(cloud: Cloud, met: Tensor, observed: Tensor) -> Cloud:
 
 
 def _read_out(met: Tensor, pixel: Tensor, view: View) -> tuple[Tensor, Tensor]:
-    """Step 3: s^2 everywhere, S'_zz of this camera where a point landed, the newest of several.
-
-    Args:
-        met: [P, 9] fused points, oldest first.
-        pixel: [P] on which they landed.
-        view: the camera.
-
-    Returns:
-        variance [H, W] [m^2], NaN where not valid, and hit [H*W].
-    """
+    """Step 3: s^2 everywhere, S'_zz of this camera where a point landed, the newest of several; of fused points ``met``
+    [P, 9], oldest first, on pixels [P]. Returns variance [H, W] [m^2], NaN where not valid, and hit [H*W]."""
     axis = view.R_first_cam[:, 2].to(met.dtype)
     weight = torch.stack([axis[i] * axis[j] * (1 if i == j else 2) for i, j in zip(_ROW, _COLUMN, strict=True)])
     along_z = (met[:, 3:] * weight).sum(1).clamp_min(0)  # not below 0 by rounding

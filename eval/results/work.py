@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.engine.anchors import landmark_digests
-from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowResult, SequenceTask, evaluate_sequences
+from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.stream import Stopped

@@ -99,13 +99,8 @@ def render(room: BoxRoom, T_world_cam: Array, K: Array, height: int, width: int)
 
 
 def flicker(depth: Array, amount: float, rng: np.random.Generator) -> Array:
-    """What a network makes of a depth map: a smooth random relative error, new in every frame.
-
-    Args:
-        depth: [H, W] [m].
-        amount: its standard deviation relative to the depth.
-        rng: where the error comes from.
-    """
+    """What a network makes of a depth map [H, W] [m]: a smooth random relative error of standard deviation ``amount``,
+    new in every frame."""
     height, width = depth.shape
     y, x = np.linspace(0, 1, height)[:, None], np.linspace(0, 1, width)[None]
     a, b, c = rng.normal(size=3)

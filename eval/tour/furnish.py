@@ -41,15 +41,8 @@ class Furnished:
 
 
 def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np.random.Generator) -> Furnished:
-    """Furnishes a room.
-
-    Args:
-        room: its shell.
-        doors: those of this room.
-        way: [M, 2] x and z of all points where a camera may be [m].
-        palette: of the room.
-        rng: where the draws come from.
-    """
+    """Furnishes a room, whose doors are given, clear of ``way`` [M, 2], x and z of all points where a camera may be
+    [m]."""
     stock = Furnished()
     for door in doors:
         across = door.along * (door.width / 2 + 0.15) + np.abs(door.normal) * 0.5

@@ -21,14 +21,9 @@ _MISS = float("inf")
 
 
 def entry(kind: int, origin: Scalars, direction: Components, taper: float) -> Tensor:
-    """The ray parameter t > 0 at which rays first meet a unit shape from outside; infinity where they miss it.
-
-    Args:
-        kind: QUAD, BOX, ELLIPSOID or FRUSTUM.
-        origin: x, y, z of the rays' common origin, or of one origin per ray.
-        direction: x, y, z of the rays' directions, any shape.
-        taper: of a frustum.
-    """
+    """The ray parameter t > 0 at which rays first meet a unit shape (QUAD, BOX, ELLIPSOID or FRUSTUM with its
+    ``taper``) from outside; infinity where they miss it. Origin and direction are x, y, z, the origin common to all
+    rays or one per ray."""
     return _ENTRIES[kind](origin, direction, taper)
 
 

@@ -33,16 +33,9 @@ class Hits:
 
 
 def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float) -> Tensor:
-    """[3, P] linear RGB, about 0 to 1.
-
-    Args:
-        tour: what is seen.
-        surface: [P] int64 which primitive.
-        depth: [P] float32 along z [m].
-        direction: [3, P] float32 of the rays, with depth 1.
-        origin: [3] of the camera [m].
-        pixel_angle: size of a pixel at depth 1 [m].
-    """
+    """[3, P] linear RGB, about 0 to 1, of pixels that see the primitives ``surface`` [P] int64 of a tour at ``depth``
+    [P] float32 along z [m], on rays ``direction`` [3, P] float32 (of depth 1) from ``origin`` [3] [m]; ``pixel_angle``
+    is the size of a pixel at depth 1 [m]."""
     s = tour.surfaces
     group, order = torch.sort((s.rooms[:, 0] * 4 + s.kind)[surface] * _TEXTURES + s.texture[surface], stable=True)
     values, counts = torch.unique_consecutive(group, return_counts=True)
