@@ -405,7 +405,7 @@ class UncertainDepth(NetworksInTurn):
     def _count(self, images: int) -> None:
         """Images seen, as a number for the alternation and as a buffer for state_dict."""
         self._next = images
-        with torch.inference_mode(False):  # the buffer must outlive the caller's inference mode
+        with outliving():  # the buffer must outlive the caller's inference mode
             self.image_index = torch.full_like(self.image_index, images)
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
