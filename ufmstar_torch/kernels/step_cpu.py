@@ -25,7 +25,7 @@ from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.anchors_cpu import learn
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.regress_cpu import regress_maps
+from ufmstar_torch.kernels.regress_cpu import EPSILON, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
 from ufmstar_torch.kernels.stream_cpu import describe, join, match
@@ -45,7 +45,7 @@ _COUNTS += ("anchors", "anchors_used")
 
 class _Pairs(NamedTuple):
     """The matched pairs [P] of one stream; which segments [C] are new; how many segments there are, how many of them
-    are matched, how many new, and how many components the mixture had."""
+    are matched, how many new, and how many components the mixture had; the slots within reach of the frame [n]."""
 
     c: NDArray[np.int64]
     k: NDArray[np.int64]
@@ -55,6 +55,7 @@ class _Pairs(NamedTuple):
     matched: int
     created: int
     occupied: int
+    near: NDArray[np.int64]
 
 
 def step(
@@ -81,7 +82,10 @@ def step(
     after = first, started, frames, skipped = tuple(map(np.empty_like, before))
     mean_cam, covariance_cam = np.empty(slots[0].shape), np.empty(slots[1].shape)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    given = (camera, before, after, slots[:3], segments[:3], frame.size, thresholds, mean_cam, covariance_cam)
+    # Anchors and the neighbourhood look at every component.
+    narrow = config.regression == "exact" and not config.anchored
+    reach = (config.prior_weight, EPSILON[frame.depth.dtype] if narrow else 0.0)
+    given = (camera, before, after, slots[:3], segments[:3], frame.size, thresholds, reach, mean_cam, covariance_cam)
     with kernel("correspond"):
         pairs = [_Pairs(*found) for found in each(match, [(b, *given) for b in streams])]
     stage("correspond")
@@ -99,8 +103,12 @@ def step(
     with kernel("fuse"):
         distances = [_distance(b, pair, segments, regressed, config) for b, pair in enumerate(pairs)]
         joining = zip(streams, pairs, distances, strict=True)
-        dropped = each(
-            join, [(b, *given, pair[:3], d, pair.new, pair.occupied, settings, regressed) for b, pair, d in joining]
+        joined = each(
+            join,
+            [
+                (b, *given, pair[:3], d, pair.new, pair.occupied, pair.near, settings, regressed)
+                for b, pair, d in joining
+            ],
         )
     stage("fuse")
 
@@ -120,7 +128,7 @@ def step(
     stage("append")
 
     with kernel("regress_image"):
-        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels)
+        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, joined)
     result, residual, measured = after_regress(result, stream, frame, config, pixels)
     stage("regress")
 
@@ -129,7 +137,7 @@ def step(
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, smooth_maps
         )
-    _count(totals, frame, pairs, dropped, measured)
+    _count(totals, frame, pairs, [components for _, components in joined], measured)
     state_after = UfMStarState(
         **mixture,
         T_world_first=torch.from_numpy(first),
@@ -206,18 +214,19 @@ def _grown(value: Floats, capacity: int) -> Floats:
 
 
 def _count(
-    totals: NDArray[np.int64], frame: FrameInput, pairs: list[_Pairs], dropped: list[int], measured: Tensor
+    totals: NDArray[np.int64], frame: FrameInput, pairs: list[_Pairs], components: list[int], measured: Tensor
 ) -> None:
     """Write the statistics [n, B] that the step counts itself, in the order of ``_COUNTS``."""
     valid, shares = frame.valid.numpy(), measured.numpy()
-    for b, (pair, lost) in enumerate(zip(pairs, dropped, strict=True)):
+    for b, (pair, occupied) in enumerate(zip(pairs, components, strict=True)):
+        new = occupied - pair.occupied
         totals[:8, b] = (
-            pair.occupied + pair.created - lost,
+            occupied,
             pair.found,
             pair.matched,
             pair.c.size,
-            pair.created - lost,
-            lost + pair.found - pair.matched - pair.created,  # without a slot, or too near
+            new,
+            pair.found - pair.matched - new,  # without a slot, or too near
             np.count_nonzero(valid[b]),
             np.count_nonzero(shares[b] < unmeasured.HALF),
         )

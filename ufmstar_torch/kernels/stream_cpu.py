@@ -7,6 +7,7 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
+from ufmstar_torch.kernels.reach_cpu import reached
 from ufmstar_torch.kernels.rigid_cpu import move, relative
 from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
 
@@ -29,9 +30,9 @@ def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, wei
 
 
 @kernel
-def match(b, camera, before, after, mixture, segments, size, thresholds, mean_cam, covariance_cam):
-    """Step 3 of stream ``b``: M_(i-1) [B, K] into the camera frame, written to ``mean_cam`` and ``covariance_cam``, and
-    its pairs with C_i [B, C].
+def match(b, camera, before, after, mixture, segments, size, thresholds, reach, mean_cam, covariance_cam):
+    """Step 3 of stream ``b``: what the frame can reach of M_(i-1) [B, K] into the camera frame, written to ``mean_cam``
+    and ``covariance_cam``, and its pairs with C_i [B, C].
 
     Args:
         camera: fault [B], camera-to-world [B, 4, 4] and intrinsics [B, 3, 3] of this frame.
@@ -40,30 +41,32 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, mean_ca
         mixture, segments: mean, covariance and weight.
         size: H, W.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
+        reach: of :func:`reached`: prior weight, epsilon.
 
     Returns:
         The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
-        of them are matched, how many new, and how many components the mixture had.
+        of them are matched, how many new, and how many components the mixture had; the slots within reach [n].
     """
     fine, started = camera[0][b] == 0, before[1][b]
-    present, first = camera[1][b], after[0][b]
+    present, K, first = camera[1][b], camera[2][b], after[0][b]
     for i in range(4):
         for j in range(4):
             first[i, j] = present[i, j] if fine and not started else before[0][b, i, j]
     after[1][b], after[2][b], after[3][b] = started or fine, before[2][b] + fine, before[3][b] + (not fine)
-    weight, mean_c, weight_c = mixture[2][b], segments[0][b], segments[2][b]
+    mean, covariance, weight = mixture[0][b], mixture[1][b], mixture[2][b]
+    mean_c, cov_c, weight_c = segments[0][b], segments[1][b], segments[2][b]
     moved, turned = mean_cam[b], covariance_cam[b]
-    move(relative(first, present), mixture[0][b], mixture[1][b], weight, 0, np.empty(0, np.bool_), moved, turned)
-    pi, occupied = np.empty(weight.size), 0
+    motion, pi, chosen = relative(first, present), np.zeros(weight.size), np.zeros(weight.size, np.bool_)
+    near, occupied = reached(motion, mean, covariance, weight, K, size, *reach, weight_c.size)
+    for k in near:
+        pi[k], chosen[k] = weight[k], True
     for k in range(weight.size):
-        pi[k] = weight[k]
-        occupied += weight[k] > 0
-        if not weight[k] > 0:  # an empty slot holds zeros
-            for i in range(3):
-                moved[k, i] = 0.0
-                for j in range(3):
-                    turned[k, i, j] = 0.0
-    c, k, overlap = matches(moved, turned, pi, mean_c, segments[1][b], weight_c, camera[2][b], *size, *thresholds)
+        for i in range(3):
+            moved[k, i] = 0.0
+            for j in range(3):
+                turned[k, i, j] = 0.0
+    move(motion, mean, covariance, weight, weight.size, chosen, moved, turned)
+    c, k, overlap = matches(near, moved, turned, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
     new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
         new[c[i]] = False
@@ -73,11 +76,11 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, mean_ca
         # What is nearer than the near plane could never be matched again: it is not remembered.
         new[i] = new[i] and weight_c[i] > 0 and mean_c[i, 2] > thresholds[2]
         created += new[i]
-    return c, k, overlap, new, found, matched, created, occupied
+    return c, k, overlap, new, found, matched, created, occupied, near
 
 
 @kernel
-def join(b, present, first, before, after, segments, pairs, distance, new, occupied, settings, regressed):
+def join(b, present, first, before, after, segments, pairs, distance, new, occupied, near, settings, regressed):
     """Step 4 of stream ``b``: the mixture with the pairs fused and what is new appended, and the same in float64 as the
     regression takes it, in the camera frame.
 
@@ -89,6 +92,7 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
         pairs: c, k and overlap [P].
         distance: as :func:`fuse_pairs`.
         new: [C] which segments to append, from slot ``occupied`` on.
+        near: the slots within reach [n] of :func:`match`.
         settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`; the disagreement [m^2] of what was seen from one
             view, negative for its own.
         regressed: mean, covariance, weight, disagreement and features [B, K, ...] for the regression, one feature more
@@ -96,7 +100,7 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
             written, and the rest of the fields.
 
     Returns:
-        How many segments found no free slot.
+        The slots within reach, with those of the new components, and how many components the mixture has.
     """
     weighted, epsilon, stated = settings
     mean_c, cov_c, weight_c, features_c = segments[0][b], segments[1][b], segments[2][b], segments[3][b]
@@ -127,7 +131,13 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
         for f in range(last):
             more[k, f] = features[k, f]
         more[k, last] = 1.0 if seen_again else 0.0
-    return dropped
+    components = occupied - dropped
+    for c in range(new.size):
+        components += new[c]
+    slots_near = np.empty(near.size + components - occupied, np.int64)
+    for i in range(slots_near.size):
+        slots_near[i] = near[i] if i < near.size else occupied + i - near.size
+    return slots_near, components
 
 
 @part
