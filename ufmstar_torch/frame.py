@@ -231,7 +231,7 @@ def of_streams(cameras: Tensor, streams: int) -> Tensor:
     return cameras.double().expand(streams, *cameras.shape[-2:])
 
 
-# A call of torch takes microseconds, several times as many where a network ran before: none is made that changes nothing.
+# A call of torch takes microseconds, several times as many after a network: none is made that changes nothing.
 def _constant(value: Tensor) -> Tensor:
     """The tensor without its graph."""
     return value.detach() if value.requires_grad else value

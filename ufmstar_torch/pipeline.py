@@ -20,6 +20,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
 from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
 from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.stateful import outliving
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image

@@ -21,7 +21,7 @@ from ufmstar_torch.kernels.threads_cpu import each
 def check_values(
     maps: FrameMaps, pose: Tensor, intrinsics: Tensor, *, rotation_tolerance: float, max_depth: float
 ) -> FrameInput:
-    """As :func:`ufmstar_torch.frame.check_values`, for maps on the CPU. Depth that is valid everywhere is not copied."""
+    """As :func:`ufmstar_torch.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
     shape = b, *size = tuple(maps.depth.shape)
     depth = array(maps.depth).reshape(b, -1)
     none = np.empty((b, 0, depth.shape[1]), depth.dtype)
@@ -53,8 +53,8 @@ def check_values(
 @kernel
 def _stream(s, cameras, values, written):
     """Check stream ``s``: its camera to ``T`` and ``K`` with the rotation's ``deviation``, its maps to ``use`` and,
-    unless all pixels are valid, ``safe``; to ``counts`` [4, B] the code of the fault, and how many pixels lie beyond the
-    largest depth, are out of range and are valid."""
+    unless all pixels are valid, ``safe``; to ``counts`` [4, B] the code of the fault, and how many pixels lie beyond
+    the largest depth, are out of range and are valid."""
     pose, intrinsics, height, width, tolerance, farthest, focal, steps = cameras
     P, C = pose[s if len(pose) > 1 else 0], intrinsics[s if len(intrinsics) > 1 else 0]
     depth, mask, aleatoric, epistemic, features, limits = values

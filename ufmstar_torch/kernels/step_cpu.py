@@ -71,7 +71,7 @@ def step(
     """As :func:`ufmstar_torch.step.step`, for CPU tensors."""
     stage, kernel = (observer.stage, observer.kernel) if observer is not None else (_unobserved, nullcontext)
     streams = range(len(frame.depth))
-    camera = fault, present, intrinsics = array(frame.fault), array(frame.T_world_cam), array(frame.intrinsics)
+    camera = _, present, intrinsics = array(frame.fault), array(frame.T_world_cam), array(frame.intrinsics)
 
     segments, labels = _segment(frame, intrinsics, config, state.covariance.dtype, kernel)
     current_cam = GaussianMixture(*map(torch.from_numpy, segments))
