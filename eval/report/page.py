@@ -116,8 +116,7 @@ def write_page(
         datasets=join(list(results.datasets)),
         facts=[(f"{total:,}".replace(",", "\u202f") if total else "", word) for word, total in facts.items()],
         min_sequences=MIN_SEQUENCES,
-        left_out=f"{count(len(left_out), 'picture')} did not fit into this page: {', '.join(left_out)}."
-        * bool(left_out),
+        left_out=left_out,
     )
     path = results.out / PAGE
     write_atomic(path, lambda file: file.write(text.encode()))
