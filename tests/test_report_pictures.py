@@ -220,7 +220,7 @@ class TestCompare:
         one = example({"ufm": RowMaps(full(2.0), full(0.01)), "star": RowMaps(full(2.0), new)})
         left, top, width, height = largest_difference(one.rows["star"].sigma - one.rows["ufm"].sigma, ZOOM)
         assert (left + width, top + height, width, height) == (SHAPE[1], SHAPE[0], 5, 4)
-        with Image.open(tmp_path / draw_comparison(tmp_path, one, "ufm", "star", "ensemble").file) as picture:
+        with Image.open(tmp_path / draw_comparison(tmp_path, one, ["ufm", "star"], "ensemble").file) as picture:
             colours = np.asarray(picture.convert("RGB")).astype(int)
         # RdBu_r: red where UfM* says more; nowhere does it say less.
         assert ((colours[..., 0] > 80) & (colours[..., 1] < 20) & (colours[..., 2] < 50)).sum() > 500

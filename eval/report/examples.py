@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -156,7 +157,7 @@ def _load(
 ) -> list[Example]:
     """The examples of one frame, one for each camera that its rows have."""
     common = load_arrays(file, _SCENE)
-    cameras: dict[bytes, tuple[dict[str, NDArray], dict[str, RowMaps]]] = {}
+    cameras: dict[bytes, tuple[dict[str, Any], dict[str, RowMaps]]] = {}
     for row, row_file in row_files.items():
         stored = load_arrays(row_file, ("depth",))
         scene = {name: stored.get(name, common[name]) for name in _SCENE}

@@ -37,11 +37,14 @@ from ufmstar_torch.eval.report.style import (
     short_name,
     style_of,
 )
-from ufmstar_torch.eval.report.sweeps import Point, SweepLine, default_value, sweep_lines
+from ufmstar_torch.eval.report.sweeps import Point, Rest, SweepLine, default_value, sweep_lines
 
 SHOWN = (NLL, ECE_DELTA, ECE_Q)
 # Lines of the same method by what is fixed; they differ from all of ``style_of``'s.
-_FIXED = {(("anchors", TRACKED),): Style("#882255", "d"), (("anchors", TRUTH),): Style("#222222", "*")}
+_FIXED: dict[Rest, Style] = {
+    (("anchors", TRACKED),): Style("#882255", "d"),
+    (("anchors", TRUTH),): Style("#222222", "*"),
+}
 _OTHERS = (Style("#117733", "h"), Style("#88CCEE", "p"), Style("#999933", "<"), Style("#AA4499", ">"))
 # Beyond this an axis of NLLs is logarithmic: pixels of nearly no variance take their mean to any height.
 _HIGH = 50.0

@@ -125,7 +125,11 @@ def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int
 def mixture_writers(ufm: UfMStar) -> dict[str, Callable[[Path], object]]:
     """By file name, what writes the mixture in world coordinates: as splats, as ellipsoids, and exactly."""
     mixture, first = ufm.mixture, ufm.T_world_first
-    writers = {PLY: write_mixture_ply, ELLIPSOIDS: write_ellipsoids_ply, NPZ: write_mixture_npz}
+    writers: dict[str, Callable[..., object]] = {
+        PLY: write_mixture_ply,
+        ELLIPSOIDS: write_ellipsoids_ply,
+        NPZ: write_mixture_npz,
+    }
     return {name: partial(write, mixture=mixture, T_world_first=first) for name, write in writers.items()}
 
 
@@ -163,7 +167,8 @@ def panel(name: str, note: str, result: FrameResult) -> FramePanel:
     """
     star: Any = result.rows[UFM_STAR]
     maps: dict[str, Any] = {}
-    for prefix, estimate in (("", star.estimate), ("posterior_", result.rows[POSTERIOR].estimate)):
+    for prefix, row in (("", star), ("posterior_", result.rows[POSTERIOR])):
+        estimate: Any = row.estimate
         depth = estimate.depth.float().numpy()
         error = np.where(star.truth > 0, np.abs(depth - star.truth), np.nan).astype(np.float32)
         maps |= {prefix.rstrip("_") or "depth": depth, f"{prefix}error": error}

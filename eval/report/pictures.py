@@ -136,7 +136,7 @@ def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator
         for base in bases:
             pair = [row.slug for row in strip_rows(shown, base) if row.method.fusion != ALONE]
             if len(pair) == 2:
-                yield f"{frame}: comparison of {base}", partial(draw_comparison, folder, e, *pair, base)
+                yield f"{frame}: comparison of {base}", partial(draw_comparison, folder, e, pair, base)
 
 
 def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
@@ -250,9 +250,9 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
     return picture
 
 
-def draw_comparison(folder: Path, example: Example, ufm: str, ufm_star: str, base: str) -> Picture:
+def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: str) -> Picture:
     """Image, error, sigma by UfM and by UfM*, and UfM* minus UfM; below, the part where they differ most."""
-    scales = fit_strip_scales(example, [ufm, ufm_star])
+    scales, (ufm, ufm_star) = fit_strip_scales(example, pair), pair
     old, new = example.rows[ufm].sigma, example.rows[ufm_star].sigma
     difference = new - old
     box = largest_difference(difference, ZOOM)
@@ -268,7 +268,7 @@ def draw_comparison(folder: Path, example: Example, ufm: str, ufm_star: str, bas
     boxes = [_scaled(box, old.shape, picture.shape) for picture in maps.values()]
     whole = [Panel(picture, name, b) for (name, picture), b in zip(maps.items(), boxes, strict=True)]
     enlarged = [Panel(p[top : top + h, x : x + w]) for p, (x, top, w, h) in zip(maps.values(), boxes, strict=True)]
-    lines = [line for row in (ufm, ufm_star) for line in (f"{example.label(row)}:", *figures_of(example, row))]
+    lines = [line for row in pair for line in (f"{example.label(row)}:", *figures_of(example, row))]
     rows = [
         GridRow(example.sequence, [f"frame {example.frame}"], whole),
         GridRow("where they differ most", lines, enlarged),
@@ -283,7 +283,7 @@ def draw_comparison(folder: Path, example: Example, ufm: str, ufm_star: str, bas
         "enlarged below.",
         "Standard deviations and their difference,",
     )
-    picture = _picture(example, [ufm, ufm_star], COMPARE, base, words)
+    picture = _picture(example, pair, COMPARE, base, words)
     draw_grid(folder / picture.file, rows, bars, aspect=example.aspect)
     return picture
 
