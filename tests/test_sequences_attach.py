@@ -9,7 +9,6 @@ from layouts import quaternion_line
 
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.attach import frame_numbers, in_seconds
-from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose
 
 FRAMES = 6
@@ -165,4 +164,3 @@ def test_frames_per_second_go_with_a_trajectory(tmp_path, layout):
         open_sequence(path, fps=30)
     with pytest.raises(FileNotFoundError, match=r"no such file or folder: absent\.txt"):
         open_sequence(path, trajectory="absent.txt")
-    Options(trajectory="x", fps=30).only_attached(layout)

@@ -226,3 +226,21 @@ def test_a_file_that_claims_a_huge_image_is_a_frame_error(tmp_path, name):
     for read in (read_depth, read_color, image_size) if name == "d.png" else (read_depth,):
         with pytest.raises(FrameError, match="cannot be decoded"):
             read(path)
+
+
+@pytest.mark.parametrize("kind", [RuntimeError, MemoryError])
+def test_only_a_bare_exception_of_the_png_decoder_leaves_the_file_to_pillow(tmp_path, monkeypatch, kind):
+    """kornia_rs has no exception class of its own; an exception of another type is no damaged file."""
+    write_image(tmp_path / "a.png", np.full((4, 5, 3), 7, np.uint8))
+
+    def fails(error):
+        def read(*_):
+            raise error
+
+        monkeypatch.setattr("kornia_rs.io.read_image_png_u8", read)
+
+    fails(Exception("damaged"))
+    np.testing.assert_array_equal(read_color(tmp_path / "a.png"), np.full((4, 5, 3), 7, np.uint8))
+    fails(kind("no memory"))
+    with pytest.raises(kind, match="no memory"):
+        read_color(tmp_path / "a.png")

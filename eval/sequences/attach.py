@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, Skipped
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, list_files
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose, read_trajectory
 
@@ -33,21 +34,18 @@ UNKNOWN = np.full((4, 4), np.nan)
 
 
 def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options) -> Poses:
-    """The pose of each image, None where the trajectory has none.
+    """The pose [4, 4] (camera-to-world) of each image, None where the trajectory has none.
 
     Without timestamps in the trajectory, pose i belongs to the i-th image. With them, the pose is interpolated at the
     image's time. Whole numbers that are those in the images' names (``frame-000012``) are frame numbers, unless ``fps``
-    says otherwise. Timestamps in nanoseconds (ORB-SLAM3), microseconds or milliseconds are recognised by meeting the
-    images' times only then.
+    is given. Timestamps in nanoseconds (ORB-SLAM3), microseconds or milliseconds are recognised by meeting the images'
+    times only then.
 
     Args:
         names: of all images on disk, in order.
         times: [N] of the images [s], or None where only the names may hold them.
         trajectory: the poses.
         options: ``max_pose_gap``, ``fps`` and ``time_offset``.
-
-    Returns:
-        [4, 4] camera-to-world or None, for each name.
 
     Raises:
         ValueError: more or fewer poses than images; the images' times are not known; no image has a pose (both time
@@ -77,11 +75,7 @@ def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajector
 def _comparable(
     names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
 ) -> tuple[np.ndarray, Trajectory]:
-    """Times of images and poses in the same unit: seconds or frame numbers.
-
-    Raises:
-        ValueError: the images' times are not known.
-    """
+    """Times of images and poses in the same unit: seconds or frame numbers; ValueError where they are not known."""
     stamps = trajectory.timestamps
     assert stamps is not None
     numbers = None if options.fps is not None else _as_frame_numbers(names, stamps, times is not None)
@@ -140,16 +134,16 @@ def attach_given(
         if isinstance(frame, Skipped):
             out.append(frame)
         elif T is None:
-            out.append(Skipped(frame.name, no_pose(options)))
+            out.append(no_pose(frame.name, options))
         else:
             time = frame.timestamp if times is None else float(times[i])
             out.append(replace(frame, T_world_cam=T, timestamp=time))
     return out
 
 
-def no_pose(options: Options) -> str:
-    """Why an image without a pose is skipped."""
-    return f"no pose within {options.max_pose_gap:g} s around the image"  # see `interpolate_pose`; --max-pose-gap
+def no_pose(name: str, options: Options) -> Skipped:
+    """An image without a pose, see ``interpolate_pose``."""
+    return Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image")
 
 
 def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
@@ -198,6 +192,15 @@ def pair_by_name(names: Sequence[str], files: Iterable[Path]) -> dict[str, Path]
     name_of = _unique({name: _numbers(name) for name in names})
     pairs = {name_of[key]: file for key, file in file_of.items() if key in name_of}
     return {name: by_stem.get(name) or pairs[name] for name in names if name in by_stem or name in pairs}
+
+
+def pair_depth(names: Sequence[str], folder: Path) -> dict[str, Path]:
+    """The depth map in a folder of each frame name, where there is one; ValueError where no map has a partner."""
+    files = list_files(folder, DEPTH_SUFFIXES)
+    pairs = pair_by_name(names, files)
+    if files and not pairs:
+        raise ValueError(f"{folder}: no depth map ({files[0].name}, ...) is named like an image ({names[0]}, ...)")
+    return pairs
 
 
 def _numbers(stem: str) -> tuple[int | str, ...]:

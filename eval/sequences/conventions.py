@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,14 +15,8 @@ _NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 
 _OPENGL_FROM_CAMERA = np.diag([1.0, -1, -1, 1])
 
 
-@dataclass(frozen=True, eq=False)
-class Convention:
-    """A way to write poses.
-
-    Attributes:
-        description: in words.
-        convert: [..., 4, 4] as written -> camera-to-world, x right, y down, z forward.
-    """
+class Convention(NamedTuple):
+    """A way to write poses, in words, and the map of poses [..., 4, 4] to camera-to-world ones with our axes."""
 
     description: str
     convert: Callable[[np.ndarray], np.ndarray]

@@ -24,13 +24,8 @@ _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i.
-
-    Attributes:
-        depth_files: one for each frame.
-        variance_files: one for each frame, or empty.
-        scale: metres per unit of the depth files, or None (see :class:`DepthFolder`).
-    """
+    """Predicted depth of a sequence's frames, decoded lazily: ``maps[i]`` belongs to frame i; without variance files
+    there is no variance. The scale [m per unit] is that of :class:`DepthFolder`."""
 
     depth_files: tuple[Path, ...]
     variance_files: tuple[Path, ...] = ()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from ufmstar_torch.eval.sequences.layout import LAYOUTS, layouts_of, parts_of
 
@@ -12,15 +12,9 @@ from ufmstar_torch.eval.sequences.layout import LAYOUTS, layouts_of, parts_of
 _BETWEEN = "__"
 
 
-@dataclass(frozen=True)
-class Found:
-    """A sequence on disk, not opened yet.
-
-    Attributes:
-        name: its place below the root, "/" as "__"; unique among those found.
-        path: what ``open_sequence`` takes.
-        layout: likewise.
-    """
+class Found(NamedTuple):
+    """A sequence on disk, not opened yet: its place below the root, "/" as "__" (unique), and the arguments of
+    ``open_sequence``."""
 
     name: str
     path: Path

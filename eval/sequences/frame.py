@@ -201,7 +201,12 @@ def make_sequence(
         ValueError: no frame is usable (the reasons are counted in the message); two frames share a name;
             the intrinsics are malformed or belong to another image size.
     """
-    listed = [_skip_non_finite(frame) for frame in frames]
+    listed = [
+        Skipped(frame.name, "non-finite pose")
+        if isinstance(frame, Entry) and not np.isfinite(frame.T_world_cam).all()
+        else frame
+        for frame in frames
+    ]
     entries = tuple(frame for frame in listed if isinstance(frame, Entry))
     skipped = tuple(frame for frame in listed if isinstance(frame, Skipped))
     if not entries:
@@ -253,12 +258,6 @@ def fits(K: np.ndarray, size: Size) -> bool:
     """Whether K's principal point lies where a camera with images of ``size`` (H, W) can have it."""
     low, high = _CENTRE_RANGE
     return bool(low < K[0, 2] / size[1] < high and low < K[1, 2] / size[0] < high)
-
-
-def _skip_non_finite(frame: Entry | Skipped) -> Entry | Skipped:
-    if isinstance(frame, Entry) and not np.isfinite(frame.T_world_cam).all():
-        return Skipped(frame.name, "non-finite pose")
-    return frame
 
 
 def _load(name: str, what: str, load: Loader | None, size: Size | None) -> np.ndarray | None:

@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import attach, no_pose, pair_by_name, stem_times
+from ufmstar_torch.eval.sequences.attach import attach, no_pose, pair_depth, stem_times
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
     IMAGE_SUFFIXES,
-    common_size,
     depth_loader,
+    depth_size,
     first_image_size,
     list_files,
     read_color,
 )
-from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import depth_camera_matrix, read_intrinsics
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import associate, read_trajectory
 from ufmstar_torch.eval.sequences.tum import SCALE as TUM_SCALE
@@ -55,7 +55,7 @@ def detect(path: Path) -> bool:
     return has_trajectory and bool(_image_sources(path))
 
 
-def open_generic(path: Path, options: Options) -> FrameSequence:
+def read(path: Path, options: Options) -> FrameSequence:
     """Opens images or a video with a trajectory.
 
     Without timestamps in the trajectory, pose i belongs to the i-th image (numbers sorted by value).
@@ -69,7 +69,6 @@ def open_generic(path: Path, options: Options) -> FrameSequence:
         ValueError: images, trajectory or intrinsics are not found or found twice; more or fewer poses than
             images; no image has a pose (both time ranges are given); depth maps that fit no image.
     """
-    options.reject("generic", "T_color_depth")
     root = path if path.is_dir() else path.parent
     names, loaders, size, times = _images(path, options)
     trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
@@ -77,21 +76,18 @@ def open_generic(path: Path, options: Options) -> FrameSequence:
     depth_files = _depth_files(root, names, times, options)
     frames: list[Entry | Skipped] = []
     for i, (name, T) in enumerate(zip(names, poses, strict=True)):
-        if T is None:
-            frames.append(Skipped(name, no_pose(options)))
-            continue
+        time = None if times is None else float(times[i])
         load_depth = depth_loader(depth_files.get(name), options.depth_scale)
-        frames.append(Entry(name, T, loaders[i], load_depth, None if times is None else float(times[i])))
-    K = _intrinsics(root, options)
-    depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
+        frames.append(no_pose(name, options) if T is None else Entry(name, T, loaders[i], load_depth, time))
+    K, size_of_depth = _intrinsics(root, options), depth_size(frames)
     return make_sequence(
         path.resolve().stem if path.is_file() else path.resolve().name,
         "generic",
         frames,
         K,
         image_size=size,
-        depth_intrinsics=_depth_intrinsics(options, K, size, depth_size),
-        depth_size=depth_size,
+        depth_intrinsics=depth_camera_matrix(options.depth_intrinsics, K, size, size_of_depth),
+        depth_size=size_of_depth,
     )
 
 
@@ -103,7 +99,7 @@ def has_images_and_depth(path: Path) -> bool:
 def open_unposed(path: Path, options: Options) -> FrameSequence:
     """Opens images with depth maps for uses that need no poses, such as training.
 
-    As :func:`open_generic` without a trajectory. Images without a depth map are skipped. Without ``depth_scale``, maps
+    As :func:`read` without a trajectory. Images without a depth map are skipped. Without ``depth_scale``, maps
     beside TUM's ``depth.txt`` are in 1/5000 m.
 
     Returns:
@@ -133,7 +129,7 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
         frames,
         _intrinsics(path, options),
         image_size=size,
-        depth_size=common_size(frame.load_depth for frame in frames if isinstance(frame, Entry)),
+        depth_size=depth_size(frames),
         posed=False,
     )
 
@@ -200,24 +196,17 @@ def _depth_files(root: Path, names: list[str], times: np.ndarray | None, options
         folder = resolve(root, options.depth)
     if folder is None:
         return {}
-    files = list_files(folder, DEPTH_SUFFIXES)
-    pairs = pair_by_name(names, files)
-    depth_times = stem_times([file.stem for file in files]) if files and not pairs else None
-    if depth_times is not None and times is not None:
+    try:
+        return pair_depth(names, folder)
+    except ValueError:
+        files = list_files(folder, DEPTH_SUFFIXES)
+        depth_times = stem_times([file.stem for file in files])
+        if depth_times is None or times is None:
+            raise
         near = associate(times, depth_times + options.time_offset, options.max_time_difference)
-        pairs = {names[i]: files[j] for i, j in near.items()}
-    if files and not pairs:
-        raise ValueError(f"{folder}: no depth map ({files[0].name}, ...) is named like an image ({names[0]}, ...)")
-    return pairs
-
-
-def _depth_intrinsics(options: Options, K: np.ndarray, size: Size | None, depth_size: Size | None) -> np.ndarray | None:
-    """K of the depth maps, where it is given or follows from a size that is not the images'."""
-    if options.depth_intrinsics is not None:
-        return read_intrinsics(options.depth_intrinsics)
-    if depth_size is None or size is None or depth_size == size:
-        return None
-    return scale_intrinsics(K, size, depth_size)
+        if not near:
+            raise
+        return {names[i]: files[j] for i, j in near.items()}
 
 
 def _given_or_found(root: Path, given: str | Path | None, names: tuple[str, ...], option: str) -> Path:

@@ -25,7 +25,7 @@ _BORDER = 1e-6
 def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size) -> NDArray:
     """Every pixel of the second camera takes the value of the first one's pixel that its ray falls into.
 
-    Values are copied, never mixed: a mean over a depth edge is a place where nothing is. For an image that
+    Values are copied, never mixed: a mean over a depth edge lies on no surface. For an image that
     was resized and cropped this equals ``Preprocess.apply_depth``.
 
     Args:
@@ -46,14 +46,9 @@ def resample_nearest(values: NDArray, K_from: NDArray, K_to: NDArray, size: Size
 
 @lru_cache(maxsize=16)
 def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.intp], NDArray[np.bool_] | None]:
-    """Of every pixel [h, w] of the second camera the pixel of the first one, counted along its rows, and whether there
-    is one; None = everywhere. The same for all frames of a sequence.
-
-    Args:
-        mapping: [3, 3] float64 from pixels of the second camera to those of the first one.
-        size_from: (H, W) of the first camera.
-        size: (h, w) of the second one.
-    """
+    """Of every pixel [h, w] of the second camera the pixel of the first one (H, W), counted along its rows, and whether
+    there is one; None = everywhere. ``mapping`` [3, 3] float64 takes pixels of the second camera to the first one. The
+    same for all frames of a sequence."""
     M = np.frombuffer(mapping).reshape(3, 3)
     v, u = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float64)
     column = np.floor(M[0, 0] * u + M[0, 1] * v + M[0, 2] + 0.5 + _BORDER).astype(np.intp)
@@ -81,7 +76,7 @@ def depth_camera(frame: Frame) -> NDArray:
     if frame.depth_intrinsics is not None or frame.depth is None or frame.image is None:
         return frame.intrinsics if frame.depth_intrinsics is None else frame.depth_intrinsics
     try:
-        return scaled_to_map(frame.intrinsics, _size(frame.image), _size(frame.depth))
+        return scaled_to_map(frame.intrinsics, frame.image.shape[:2], frame.depth.shape[:2])
     except ValueError as error:
         raise FrameError(frame.name, f"the depth map has no camera: {error}") from error
 
@@ -98,10 +93,6 @@ def truth_at(frame: Frame, K: NDArray, size: Size) -> NDArray | None:
         FrameError: see ``depth_camera``.
     """
     return None if frame.depth is None else resample_nearest(frame.depth, depth_camera(frame), K, size)
-
-
-def _size(array: NDArray) -> Size:
-    return array.shape[0], array.shape[1]
 
 
 def register_depth(

@@ -11,6 +11,7 @@ import re
 import struct
 import zipfile
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import BinaryIO
@@ -20,7 +21,7 @@ import torch
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.exr import read_exr
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, Loader, Size
+from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
@@ -131,23 +132,18 @@ def image_size(path: str | Path) -> Size:
 def first_image_size(paths: Iterable[Path]) -> Size | None:
     """(H, W) of the first image whose header can be read; None where there is none."""
     for path in paths:
-        try:
+        with suppress(FrameError):  # raised again, and counted, when that frame is asked for
             return image_size(path)
-        except FrameError:  # raised again, and counted, when that frame is asked for
-            continue
     return None
 
 
-def common_size(loaders: Iterable[Loader | None]) -> Size | None:
-    """(H, W) of the first array that can be loaded; None where none can."""
-    for load in loaders:
-        if load is None:
-            continue
-        try:
-            array = load()
-        except FrameError:  # as above
-            continue
-        return array.shape[0], array.shape[1]
+def depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
+    """(H, W) of the first depth map that can be loaded; None where none can."""
+    for frame in frames:
+        if isinstance(frame, Entry) and frame.load_depth is not None:
+            with suppress(FrameError):  # as above
+                height, width = frame.load_depth().shape
+                return height, width
     return None
 
 
@@ -209,7 +205,8 @@ def _plain_png(path: Path, kind: tuple[int, ...]) -> np.ndarray | None:
             return np.asarray(io.read_image_png_u8(str(path), "rgb"))
         return np.asarray(io.read_image_png_u16(str(path), "mono"))[..., 0]
     except Exception as error:
-        if type(error) is not Exception:  # which is what it raises for a file that it cannot decode
+        # kornia_rs has no exception class of its own: it raises a bare Exception for a file that it cannot decode.
+        if type(error) is not Exception:
             raise
         return None
 

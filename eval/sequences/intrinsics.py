@@ -60,6 +60,22 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
+def camera_matrix(given: IntrinsicsLike | None, known: np.ndarray, known_size: Size, size: Size | None) -> np.ndarray:
+    """K [3, 3] of images of ``size``: the ``given`` one, or the layout's own of ``known_size``, scaled."""
+    return scale_intrinsics(known, known_size, size or known_size) if given is None else read_intrinsics(given)
+
+
+def depth_camera_matrix(
+    given: IntrinsicsLike | None, K: np.ndarray, size: Size | None, depth_size: Size | None
+) -> np.ndarray | None:
+    """K [3, 3] of the depth maps, where it is given or follows from a size that is not the images'; else None."""
+    if given is not None:
+        return read_intrinsics(given)
+    if depth_size is None or size is None or depth_size == size:
+        return None
+    return scale_intrinsics(K, size, depth_size)
+
+
 def scale_intrinsics(K: np.ndarray, old: Size, new: Size) -> np.ndarray:
     """K [3, 3] of images (H, W) ``old`` after they were resized to ``new``.
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Size, make_sequence
-from ufmstar_torch.eval.sequences.images import natural_key
-from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, make_sequence
+from ufmstar_torch.eval.sequences.images import depth_size, natural_key
+from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.options import Options
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def part_files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*/*.h5"), key=lambda path: (path.parent.name, natural_key(path)))
 
 
-def open_nyu(path: Path, options: Options) -> FrameSequence:
+def read(path: Path, options: Options) -> FrameSequence:
     """Opens a part, or a scene of it, as a sequence without poses; names are ``SCENE__NUMBER``.
 
     Raises:
@@ -54,7 +54,6 @@ def open_nyu(path: Path, options: Options) -> FrameSequence:
         ValueError: the images were cropped and ``intrinsics`` are not given; an option that files without poses have no
             use for; no file can be read.
     """
-    options.reject("nyu", "trajectory", "images", "depth", "depth_intrinsics", "fps", "T_color_depth")
     folder = parts(path)[0]
     files = _files(folder)
     scale = 1.0 if options.depth_scale is None else options.depth_scale
@@ -62,11 +61,8 @@ def open_nyu(path: Path, options: Options) -> FrameSequence:
         Entry(f"{file.parent.name}__{file.stem}", np.eye(4), partial(_image, file), partial(_depth, file, scale))
         for file in files
     ]
-    size = _first_size(files)
-    if options.intrinsics is None:
-        K = scale_intrinsics(pinhole(*INTRINSICS), NATIVE_SIZE, size or NATIVE_SIZE)
-    else:
-        K = read_intrinsics(options.intrinsics)
+    size = depth_size(entries)
+    K = camera_matrix(options.intrinsics, pinhole(*INTRINSICS), NATIVE_SIZE, size)
     name = "_".join(["nyu", *folder.resolve().parts[-1 if folder.name in PARTS else -2 :]])
     return make_sequence(name, "nyu", entries, K, image_size=size, depth_size=size, posed=False)
 
@@ -114,14 +110,3 @@ def _image(path: Path) -> np.ndarray:
 def _depth(path: Path, scale: float) -> np.ndarray:
     depth = (read_h5(path)[1] * np.float64(scale)).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-
-def _first_size(files: list[Path]) -> Size | None:
-    """(H, W) of the first file that can be read."""
-    for file in files:
-        try:
-            rgb, _ = read_h5(file)
-        except FrameError:  # raised again, and counted, when that frame is asked for
-            continue
-        return rgb.shape[1], rgb.shape[2]
-    return None

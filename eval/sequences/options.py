@@ -1,4 +1,4 @@
-"""The options of ``open_sequence`` as one value, so that every reader takes the same argument."""
+"""The options of ``open_sequence`` as one value, which every reader takes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,27 @@ from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """What a user may override; see :func:`~ufmstar_torch.eval.sequences.layout.open_sequence`.
+    """What a user may override.
+
+    Attributes:
+        intrinsics: instead of the layout's own [px]: a file, a 3x3 matrix, or fx, fy, cx, cy.
+        depth_intrinsics: the same of the depth maps (7-Scenes, ScanNet, generic).
+        trajectory: file in TUM or KITTI format whose camera-to-world poses, with our axes, replace the layout's own:
+            those of ORB-SLAM3, BundleFusion, ... Inside the sequence's folder, or else from the working folder.
+        images: folder of images or video file (generic).
+        depth: folder of depth maps (generic, KITTI-360).
+        depth_scale: metres per unit of the depth files, instead of the layout's own.
+        max_time_difference: between paired colour and depth images [s] (TUM, generic).
+        max_pose_gap: poses are interpolated between samples at most this far apart [s]; at 0.1 s a hand
+            that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
+        fps: frames per second of images without timestamps, or instead of the video's own, where a trajectory has
+            timestamps. Images of a layout that numbers them are counted by that number.
+        time_offset: added to the images' times [s].
+        register: warp 7-Scenes' depth into the colour camera.
+        T_color_depth: [4, 4] depth to colour camera [m] (7-Scenes).
+        drive: name or number of the drive, where the path is KITTI-360's root.
+        scans: laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving
+            things smear.
 
     Raises:
         ValueError: a number is out of its range.
@@ -43,11 +63,6 @@ class Options:
             raise ValueError(f"fps must be positive frames per second, got {self.fps}")
         if self.scans is not None and (self.scans < 0 or self.scans != int(self.scans)):
             raise ValueError(f"scans must be a number of laser scans on either side, at least 0, got {self.scans}")
-
-    def only_attached(self, layout: str) -> None:
-        """Raises ValueError where ``fps`` was given and no trajectory, to which it would belong."""
-        if self.trajectory is None:
-            self.reject(layout, "fps")
 
     def reject(self, layout: str, *names: str) -> None:
         """Raises ValueError where an option was given that the layout has no use for."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,15 +14,9 @@ from ufmstar_torch.eval.sequences.intrinsics import pinhole
 JOURNAL = "frames.jsonl"
 
 
-@dataclass(frozen=True, eq=False)
-class OwnOutput:
-    """An output folder of a run.
-
-    Attributes:
-        frames: the folder of its maps, NAME.npz.
-        intrinsics: [3, 3] of the map of every finished frame, by name [px].
-        skipped: why the others were skipped, by name.
-    """
+class OwnOutput(NamedTuple):
+    """The maps NAME.npz of a run: their folder, the intrinsics [3, 3] of each finished frame's map by name [px], and
+    why the other frames were skipped, by name."""
 
     frames: Path
     intrinsics: Mapping[str, np.ndarray]
@@ -48,11 +42,8 @@ def own_output(path: Path) -> OwnOutput | None:
 
 
 def read_journal(content: bytes, file: Path) -> list[dict]:
-    """The lines of frames.jsonl, each with "name" and "state", and "intrinsics" or "reason".
-
-    Args:
-        content: of the file, or a part of it.
-        file: its name, for the message.
+    """The lines of frames.jsonl, each with "name" and "state", and "intrinsics" or "reason"; ``file`` names it in
+    messages.
 
     Raises:
         ValueError: another line; it is named.
@@ -60,18 +51,18 @@ def read_journal(content: bytes, file: Path) -> list[dict]:
     records = []
     for number, line in enumerate(content.splitlines(), start=1):
         try:
-            record = json.loads(line)
+            records.append(json.loads(line))
         except ValueError:
-            record = None
-        if not (isinstance(record, dict) and isinstance(record.get("name"), str) and _has_outcome(record)):
-            raise ValueError(
-                f"{file}, line {number} is not the record of a frame: {line[:60].decode(errors='replace')}"
-            )
-        records.append(record)
+            records.append(None)
+        if not _is_record(records[-1]):
+            shown = line[:60].decode(errors="replace")
+            raise ValueError(f"{file}, line {number} is not the record of a frame: {shown}")
     return records
 
 
-def _has_outcome(record: Mapping) -> bool:
+def _is_record(record: Any) -> bool:
+    if not (isinstance(record, dict) and isinstance(record.get("name"), str)):
+        return False
     if record.get("state") == "skipped":
         return isinstance(record.get("reason"), str)
     K = record.get("intrinsics")

@@ -15,8 +15,8 @@ from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
-    common_size,
     depth_loader,
+    depth_size,
     first_image_size,
     list_files,
     read_color,
@@ -34,7 +34,7 @@ def detect(path: Path) -> bool:
     return all((path / folder).is_dir() for folder in ("color", "pose", "intrinsic"))
 
 
-def open_scannet(path: Path, options: Options) -> FrameSequence:
+def read(path: Path, options: Options) -> FrameSequence:
     """Opens a SensReader export; depth comes as it is, with ``depth_intrinsics``.
 
     Exports with resized images keep the original ``intrinsic_color.txt``: intrinsics that fit 1296x968
@@ -44,20 +44,18 @@ def open_scannet(path: Path, options: Options) -> FrameSequence:
         ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file.
         FileNotFoundError: no ``intrinsic_color.txt`` and ``intrinsics`` is not given.
     """
-    options.reject("scannet", "images", "depth", "T_color_depth")
-    options.only_attached("scannet")
     images = list_files(path / "color", IMAGE_SUFFIXES)
     frames = [_frame(path, image, options) for image in images]
     if not images:
         raise ValueError(f"scannet sequence {path.name!r}: the folder color/ holds no image")
     frames = attach_given(frames, path, options)
     color_size = first_image_size(images) or _NATIVE_COLOR
-    depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
+    size = depth_size(frames)
     K = _intrinsics(options.intrinsics, path / "intrinsic" / "intrinsic_color.txt", _NATIVE_COLOR, color_size)
     K_depth = None
-    if depth_size is not None:
+    if size is not None:
         file = path / "intrinsic" / "intrinsic_depth.txt"
-        K_depth = _intrinsics(options.depth_intrinsics, file, _NATIVE_DEPTH, depth_size)
+        K_depth = _intrinsics(options.depth_intrinsics, file, _NATIVE_DEPTH, size)
     return make_sequence(
         path.resolve().name,
         "scannet",
@@ -65,7 +63,7 @@ def open_scannet(path: Path, options: Options) -> FrameSequence:
         K,
         image_size=color_size,
         depth_intrinsics=K_depth,
-        depth_size=depth_size,
+        depth_size=size,
     )
 
 

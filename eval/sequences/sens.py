@@ -15,7 +15,7 @@ import zlib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ufmstar_torch.eval.sequences import scannet
 from ufmstar_torch.eval.sequences.attach import attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import decode_color
-from ufmstar_torch.eval.sequences.intrinsics import read_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import camera_matrix
 from ufmstar_torch.eval.sequences.options import Options
 
 LOOKED_FOR = "a .sens file, or a folder that holds one (and no SensReader export)"
@@ -39,15 +39,11 @@ _MICROSECOND = 1e-6
 _BEYOND = "beyond the end of the truncated file"
 
 
-@dataclass(frozen=True, eq=False)
-class SensHeader:
-    """The header before the frames; sizes are (H, W), matrices [4, 4]."""
+class SensHeader(NamedTuple):
+    """The header before the frames; sizes are (H, W), matrices [3, 3]."""
 
-    sensor: str
     K_color: np.ndarray
     K_depth: np.ndarray
-    color_compression: str
-    depth_compression: str
     color_size: Size
     depth_size: Size
     units_per_metre: float
@@ -81,7 +77,7 @@ def detect(path: Path) -> bool:
     return path.suffix.lower() == _SUFFIX and path.is_file()
 
 
-def open_sens(path: Path, options: Options) -> FrameSequence:
+def read(path: Path, options: Options) -> FrameSequence:
     """Opens a ``.sens`` file; depth comes as it is, with ``depth_intrinsics``, as from a SensReader export.
 
     Frames are called by their number. In a truncated file, those before the break are used and the others skipped.
@@ -90,35 +86,31 @@ def open_sens(path: Path, options: Options) -> FrameSequence:
         ValueError: not version 4; compressions other than jpeg or png and zlib_ushort; a broken header; no usable
             frame.
     """
-    options.reject("sens", "images", "depth", "T_color_depth")
-    options.only_attached("sens")
     file = _files(path)[0] if path.is_dir() else path
     with file.open("rb") as opened:
-        header = read_header(opened, file)
-        _check_compression(header, file)
+        header = _read_header(opened, file)
         located = _index(opened, file, header.frames)
     scale = options.depth_scale or 1 / header.units_per_metre
     frames = [_frame(i, one, header.depth_size, scale) for i, one in enumerate(located)]
     times = [np.nan if isinstance(f, Skipped) or f.timestamp is None else f.timestamp for f in frames]
     frames = attach_given(frames, file.parent, options, np.array(times) if np.isfinite(times).all() else None)
     beyond = [Skipped(str(i), _BEYOND) for i in range(len(frames), header.frames)]
-    K, K_depth = header.K_color[:3, :3], header.K_depth[:3, :3]
     return make_sequence(
         file.resolve().stem,
         "sens",
         [*frames, *beyond],
-        K if options.intrinsics is None else read_intrinsics(options.intrinsics),
+        camera_matrix(options.intrinsics, header.K_color, header.color_size, None),
         image_size=header.color_size,
-        depth_intrinsics=K_depth if options.depth_intrinsics is None else read_intrinsics(options.depth_intrinsics),
+        depth_intrinsics=camera_matrix(options.depth_intrinsics, header.K_depth, header.depth_size, None),
         depth_size=header.depth_size,
     )
 
 
-def read_header(file: BinaryIO, path: Path) -> SensHeader:
+def _read_header(file: BinaryIO, path: Path) -> SensHeader:
     """The header of a file that is opened at its beginning; the frames follow.
 
     Raises:
-        ValueError: it is cut off, of another version, or holds impossible values.
+        ValueError: it is cut off, of another version, holds impossible values, or compressions that are not read here.
     """
     version = _unpack(file, path, "<I")[0]
     if version != _VERSION:
@@ -126,7 +118,7 @@ def read_header(file: BinaryIO, path: Path) -> SensHeader:
     length = _unpack(file, path, "<Q")[0]
     if length > _MAX_NAME:
         raise ValueError(f"{path}: no .sens file, its sensor's name would have {length} bytes")
-    sensor = _take(file, path, length).decode("utf-8", "replace")
+    _take(file, path, length)
     matrices = np.array(_unpack(file, path, "<64f"), dtype=np.float64).reshape(4, 4, 4)
     color, depth, color_w, color_h, depth_w, depth_h, units, frames = _unpack(file, path, "<2i4IfQ")
     if min(color_w, color_h, depth_w, depth_h) == 0 or not 1 <= units < np.inf or frames > _MAX_FRAMES:
@@ -134,29 +126,18 @@ def read_header(file: BinaryIO, path: Path) -> SensHeader:
             f"{path}: broken header: {frames} frames, images of {color_w}x{color_h}, depth of {depth_w}x{depth_h}, "
             f"{units:g} units per metre"
         )
-    return SensHeader(
-        sensor=sensor,
-        K_color=matrices[0],
-        K_depth=matrices[2],
-        color_compression=_COLOR.get(color, "unknown"),
-        depth_compression=_DEPTH.get(depth, "unknown"),
-        color_size=(color_h, color_w),
-        depth_size=(depth_h, depth_w),
-        units_per_metre=float(units),
-        frames=int(frames),
-    )
+    kinds = _COLOR.get(color, "unknown"), _DEPTH.get(depth, "unknown")
+    if kinds[0] not in ("jpeg", "png") or kinds[1] != "zlib_ushort":
+        raise ValueError(
+            f"{path}: colour is {kinds[0]} and depth {kinds[1]}; of a .sens file, jpeg or png with zlib_ushort can be "
+            "read: export it with ScanNet's SensReader"
+        )
+    sizes = (color_h, color_w), (depth_h, depth_w)
+    return SensHeader(matrices[0, :3, :3], matrices[2, :3, :3], *sizes, float(units), int(frames))
 
 
 def _files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.glob(f"*{_SUFFIX}") if p.is_file() and not p.name.startswith("."))
-
-
-def _check_compression(header: SensHeader, path: Path) -> None:
-    if header.color_compression not in ("jpeg", "png") or header.depth_compression != "zlib_ushort":
-        raise ValueError(
-            f"{path}: colour is {header.color_compression} and depth {header.depth_compression}; of a .sens file, "
-            "jpeg or png with zlib_ushort can be read: export it with ScanNet's SensReader"
-        )
 
 
 _Located = tuple[np.ndarray, float | None, _Block, _Block]

@@ -10,16 +10,18 @@ https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
-from ufmstar_torch.eval.sequences.images import common_size, first_image_size, natural_key, read_color, read_map
-from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.images import depth_size, first_image_size, natural_key, read_color, read_map
+from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import read_pose
 
@@ -29,7 +31,8 @@ _K_COLOR = (525.0, 525.0, 320.0, 240.0)
 _K_DEPTH = (585.0, 585.0, 320.0, 240.0)
 _MILLIMETRE = 1e-3
 _NO_DEPTH = 65535
-_BASELINE = 0.025  # [m] the colour camera sits to the right of the depth camera
+# [m] An approximation: the colour camera sits 2.5 cm to the right of the depth camera and looks the same way.
+_T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _FRAME = re.compile(r"(frame-\d+)\.(color\.png|color\.jpg|depth\.png|pose\.txt)")
 
 
@@ -38,14 +41,7 @@ def detect(path: Path) -> bool:
     return path.is_dir() and any(path.glob("frame-*.pose.txt"))
 
 
-def approximate_T_color_depth() -> np.ndarray:
-    """[4, 4] from the depth into the colour camera: -2.5 cm along x, no rotation (an approximation)."""
-    T = np.eye(4)
-    T[0, 3] = -_BASELINE
-    return T
-
-
-def open_seven_scenes(path: Path, options: Options) -> FrameSequence:
+def read(path: Path, options: Options) -> FrameSequence:
     """Opens a 7-Scenes sequence folder (``seq-NN``).
 
     With ``register`` (the default) depth is warped into the colour camera, and ``T_world_cam`` is the
@@ -56,20 +52,17 @@ def open_seven_scenes(path: Path, options: Options) -> FrameSequence:
     Raises:
         ValueError: no usable frame, or a malformed pose file.
     """
-    options.reject("7scenes", "images", "depth")
-    options.only_attached("7scenes")
     files: dict[str, dict[str, Path]] = {}
     for file in sorted(path.iterdir(), key=natural_key):
         found = _FRAME.fullmatch(file.name)
         if found:
             files.setdefault(found[1], {})[found[2].split(".")[0]] = file
     color_size = first_image_size(kinds["color"] for kinds in files.values() if "color" in kinds) or _NATIVE_SIZE
-    depth_size = common_size(partial(read_kinect, kinds["depth"]) for kinds in files.values() if "depth" in kinds)
-    K_color = _intrinsics(options.intrinsics, _K_COLOR, color_size)
-    K_depth = _intrinsics(options.depth_intrinsics, _K_DEPTH, depth_size or _NATIVE_SIZE)
-    T_color_depth = approximate_T_color_depth() if options.T_color_depth is None else options.T_color_depth
-    scale = options.depth_scale or _MILLIMETRE
-    frames = [_frame(name, kinds, scale, options) for name, kinds in files.items()]
+    frames = [_frame(name, kinds, options.depth_scale or _MILLIMETRE, options) for name, kinds in files.items()]
+    own_size = depth_size(frames)
+    K_color = camera_matrix(options.intrinsics, pinhole(*_K_COLOR), _NATIVE_SIZE, color_size)
+    K_depth = camera_matrix(options.depth_intrinsics, pinhole(*_K_DEPTH), _NATIVE_SIZE, own_size)
+    T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
     if options.register:
         frames = [_registered(frame, K_depth, K_color, T_color_depth, color_size) for frame in frames]
     frames = attach_given(frames, path, options)
@@ -80,7 +73,7 @@ def open_seven_scenes(path: Path, options: Options) -> FrameSequence:
         K_color,
         image_size=color_size,
         depth_intrinsics=None if options.register else K_depth,
-        depth_size=color_size if options.register else depth_size,
+        depth_size=color_size if options.register else own_size,
     )
 
 
@@ -107,20 +100,9 @@ def _registered(
 ) -> Entry | Skipped:
     if isinstance(frame, Skipped):
         return frame
-    T_world_color = frame.T_world_cam @ np.linalg.inv(T_color_depth)
-    load = frame.load_depth
-    if load is not None:
-        load = partial(_load_registered, load, K_depth, K_color, T_color_depth, size)
-    return Entry(frame.name, T_world_color, frame.load_image, load)
+    load = frame.load_depth and partial(_load_registered, frame.load_depth, K_depth, K_color, T_color_depth, size)
+    return replace(frame, T_world_cam=frame.T_world_cam @ np.linalg.inv(T_color_depth), load_depth=load)
 
 
-def _load_registered(
-    load: Loader, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size
-) -> np.ndarray:
-    return register_depth(load(), K_depth, K_color, T_color_depth, size)
-
-
-def _intrinsics(given: IntrinsicsLike | None, default: tuple[float, float, float, float], size: Size) -> np.ndarray:
-    if given is not None:
-        return read_intrinsics(given)
-    return scale_intrinsics(pinhole(*default), _NATIVE_SIZE, size)
+def _load_registered(load: Loader, *cameras: Any) -> np.ndarray:
+    return register_depth(load(), *cameras)

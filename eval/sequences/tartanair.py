@@ -16,13 +16,13 @@ from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     IMAGE_SUFFIXES,
-    common_size,
     depth_loader,
+    depth_size,
     first_image_size,
     list_files,
     read_color,
 )
-from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
+from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import read_trajectory
 
@@ -36,15 +36,13 @@ def detect(path: Path) -> bool:
     return bool(trajectory_folders(path))
 
 
-def open_tartanair(path: Path, options: Options) -> FrameSequence:
+def read(path: Path, options: Options) -> FrameSequence:
     """Opens a TartanAir trajectory (left camera). A given ``trajectory`` has our axes already.
 
     Raises:
         ValueError: no usable frame; several trajectories below ``path``; another number of poses than of
             images; a malformed pose line.
     """
-    options.reject("tartanair", "images", "depth", "depth_intrinsics", "T_color_depth")
-    options.only_attached("tartanair")
     folders = trajectory_folders(path)
     if len(folders) > 1:
         raise ValueError(f"{path} holds the trajectories {[folder.name for folder in folders]}: open one of them")
@@ -56,13 +54,9 @@ def open_tartanair(path: Path, options: Options) -> FrameSequence:
     frames = _frames(folder, images, CONVENTIONS["ned"].convert(trajectory.T_world_cam), options.depth_scale)
     frames = attach_given(frames, folder, options)
     size = first_image_size(images) or _NATIVE_SIZE
-    if options.intrinsics is None:
-        K = scale_intrinsics(pinhole(*_K), _NATIVE_SIZE, size)
-    else:
-        K = read_intrinsics(options.intrinsics)
-    depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
+    K = camera_matrix(options.intrinsics, pinhole(*_K), _NATIVE_SIZE, size)
     name = path.resolve().name if folder == path else f"{path.resolve().name}_{folder.name}"
-    return make_sequence(name, "tartanair", frames, K, image_size=size, depth_size=depth_size)
+    return make_sequence(name, "tartanair", frames, K, image_size=size, depth_size=depth_size(frames))
 
 
 def trajectory_folders(path: Path) -> list[Path]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach, no_pose
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
-from ufmstar_torch.eval.sequences.images import common_size, depth_loader, first_image_size, read_color
+from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, read_color
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import associate, numbered_lines, read_trajectory
@@ -35,7 +35,7 @@ def detect(path: Path) -> bool:
     return (path / "rgb.txt").is_file() and (path / "groundtruth.txt").is_file()
 
 
-def open_tum(path: Path, options: Options) -> FrameSequence:
+def read(path: Path, options: Options) -> FrameSequence:
     """Opens a TUM RGB-D sequence.
 
     A colour image is skipped where it is missing on disk or no pose is known at its time (the samples
@@ -47,7 +47,6 @@ def open_tum(path: Path, options: Options) -> FrameSequence:
             ``intrinsics`` is not given; a malformed line (named by file and number).
     """
     given = options.trajectory
-    options.reject("tum", "images", "depth", "depth_intrinsics", "fps", "T_color_depth")
     color_times, color_files = read_file_list(path / "rgb.txt")
     trajectory = read_trajectory(path / "groundtruth.txt" if given is None else resolve(path, given))
     times = color_times + options.time_offset
@@ -59,14 +58,13 @@ def open_tum(path: Path, options: Options) -> FrameSequence:
         if not (path / file).is_file():
             frames.append(Skipped(name, "missing image file"))
         elif T is None:
-            frames.append(Skipped(name, no_pose(options)))
+            frames.append(no_pose(name, options))
         else:
             load_depth = depth_loader(depth_files.get(i), options.depth_scale, SCALE)
             frames.append(Entry(name, T, partial(read_color, path / file), load_depth, float(times[i])))
     size = first_image_size(path / file for file in color_files)
     K = _default_intrinsics(path, size) if options.intrinsics is None else read_intrinsics(options.intrinsics)
-    depth_size = common_size(frame.load_depth for frame in frames if isinstance(frame, Entry))
-    return make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size)
+    return make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size(frames))
 
 
 def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:

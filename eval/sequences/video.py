@@ -29,8 +29,6 @@ class Video:
     """
 
     def __init__(self, path: str | Path) -> None:
-        import cv2
-
         self.path = Path(path)
         if not self.path.is_file():
             raise FileNotFoundError(f"no such video: {self.path}")
@@ -40,11 +38,11 @@ class Video:
             raise ValueError(error) from error
         self._capture: Any = capture
         self._next = 0
+        import cv2
+
         self.fps = float(capture.get(cv2.CAP_PROP_FPS))
-        self.size: Size = (
-            int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)),
-            int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)),
-        )
+        height, width = capture.get(cv2.CAP_PROP_FRAME_HEIGHT), capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+        self.size: Size = int(height), int(width)
         named = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self._length = named if named > 0 else self._count()
         if self._length == 0 or 0 in self.size:
