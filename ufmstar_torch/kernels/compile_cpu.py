@@ -23,3 +23,8 @@ part: Any = register_jitable(error_model="numpy")
 leaf: Any = register_jitable(error_model="numpy", _nrt=False)
 # A leaf in which multiply and add are joined where the processor can: one rounding less, not one more.
 contracted: Any = register_jitable(error_model="numpy", _nrt=False, fastmath={"contract"})
+
+# A kernel and a leaf whose sums may be taken in any order, so that they run in vectors.
+_ANY_ORDER = {"reassoc", "contract", "nsz"}
+reordered: Any = njit(cache=True, nogil=True, error_model="numpy", fastmath=_ANY_ORDER)
+reordered_leaf: Any = register_jitable(error_model="numpy", _nrt=False, fastmath=_ANY_ORDER)
