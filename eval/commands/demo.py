@@ -45,7 +45,6 @@ from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.results.summary import versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
@@ -71,11 +70,11 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     Raises:
         FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
         FileNotFoundError, CheckpointError: the networks cannot be loaded.
-        ValueError: the device does not exist, or the networks state no variance.
+        ValueError: the networks state no variance.
         OSError: the results cannot be written.
     """
     started = perf_counter()
-    device = torch.zeros((), device=require_device(options.device)).device
+    device = torch.zeros((), device=options.device).device
     with _weights(options.weights) as file:
         info, members = read_info(file), load_trained(file)
         digest = sha256(file)
