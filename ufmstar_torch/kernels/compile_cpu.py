@@ -15,11 +15,11 @@ from numba.extending import register_jitable
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 kernel: Any = njit(**OPTIONS)
-part: Any = register_jitable(error_model="numpy")
+part: Any = register_jitable(error_model="numpy", no_cfunc_wrapper=True)
 
 # A part that allocates nothing; the kernel that calls it holds its arrays. numba counts the references of every view of
 # an array (``table[i]`` as an argument, say) by an atomic operation, which takes as long as some forty others; here
 # it is compiled out, and a function that allocates is refused.
-leaf: Any = register_jitable(error_model="numpy", _nrt=False)
+leaf: Any = register_jitable(error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
 # A leaf in which multiply and add are joined where the processor can: one rounding less, not one more.
-contracted: Any = register_jitable(error_model="numpy", _nrt=False, fastmath={"contract"})
+contracted: Any = register_jitable(error_model="numpy", no_cfunc_wrapper=True, _nrt=False, fastmath={"contract"})
