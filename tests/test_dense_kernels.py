@@ -140,7 +140,7 @@ def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene)
     image, _, others = scene
     pixel = np.array([[40.0, 30.0], [60.0, 44.0]])
     point = np.concatenate([pixel, np.ones((2, 1))], 1) @ np.linalg.inv(K).T * 2.0
-    kept = (point, np.tile(np.eye(4), (2, 1, 1)), np.full(2, 0.01), patches(image, pixel))
+    kept = (point, np.tile(np.eye(4), (2, 1, 1)), np.full(2, 0.01), patches(image, pixel), np.ones(2, np.bool_))
     for view, T in zip(others, MOVED, strict=True):
         result, depth, spread, shown = sight(view, *kept, T, K)
         cam = (point - T[:3, 3]) @ T[:3, :3]

@@ -257,7 +257,7 @@ def _pixels(small: NDArray[np.uint8], cell: int, taken: NDArray[np.float64]) -> 
 
     shape = (-(-small.shape[0] // cell), -(-small.shape[1] // cell))
     pixel, strength = np.zeros((*shape, 2)), np.zeros(shape)
-    best_pixels(small, cell, pixel, strength)
     column, row = (taken / cell).astype(np.int64).T
-    strength[row, column] = 0
+    strength[row, column] = -1
+    best_pixels(small, cell, pixel, strength)
     return pixel[strength > 0]

@@ -91,13 +91,12 @@ class Keyframes:
     ) -> NDArray[np.float64]:
         """[n] share of a grid of points at a depth before the camera T that the views show."""
         height, width = self._image[0].shape
-        u, v = np.meshgrid((np.arange(4) + 0.5) * width / 4, (np.arange(4) + 0.5) * height / 4)
-        rays = np.stack([u.ravel(), v.ravel(), np.ones(16)], -1) @ np.linalg.inv(K).T
-        world = depth * rays @ T[:3, :3].T + T[:3, 3]
-        cam = np.einsum("nji,npj->npi", pose[:, :3, :3], world[None] - pose[:, None, :3, 3])
-        z = np.maximum(cam[..., 2], 1e-6)
-        pu, pv = (cam @ K[:2].T / z[..., None]).transpose(2, 0, 1)
-        inside = (cam[..., 2] > 0.2 * depth) & (pu > 0) & (pv > 0) & (pu < width - 1) & (pv < height - 1)
+        v, u = (np.indices((4, 4)).reshape(2, -1) + 0.5) / 4
+        rays = np.linalg.inv(K) @ np.stack([u * width, v * height, np.ones(16)])
+        into = K @ pose[:, :3, :3].transpose(0, 2, 1)
+        moved = into @ (T[:3, 3] - pose[:, :3, 3])[..., None]
+        x, y, z = np.moveaxis(into @ (depth * T[:3, :3] @ rays) + moved, 1, 0)
+        inside = (z > 0.2 * depth) & (x > 0) & (y > 0) & (x < (width - 1) * z) & (y < (height - 1) * z)
         return np.asarray(inside.mean(1))
 
     def images(self, keyframes: list[int]) -> NDArray[np.uint8]:

@@ -105,26 +105,23 @@ class Memory:
         from ufmstar_torch.kernels.sight_cpu import sight
 
         self.frame += 1
-        used = np.flatnonzero(self._used)
-        pixel, depth, spread, shown = sight(
-            image, self._point[used], self._pose[used], self._sigma[used], self._patch[used], T_world_cam, K
-        )
-        self._seen[used[shown > 0]] = self.frame
-        self._failed[used[shown > 0]] = 0
-        self._failed[used[shown < 0]] += 1
-        self._forget(used[shown < 0])
-        # In every cell the one that is confirmed most often, the least uncertain one of them.
-        order = np.lexsort((spread / np.maximum(depth, 1e-9), -self.confirmed[used]))
-        order = order[shown[order] > 0]
-        column, row = (pixel[order] / cell).astype(np.int64).T
-        _, first = np.unique(row * 100_000 + column, return_index=True)
-        kept = order[first]
-        self._used[np.setdiff1d(used[order], used[kept])] = False
-        slot = used[kept]
+        kept = self._point, self._pose, self._sigma, self._patch, self._used
+        pixel, depth, spread, shown = sight(image, *kept, T_world_cam, K)
+        self._seen[shown > 0], self._failed[shown > 0] = self.frame, 0
+        hidden = np.flatnonzero(shown < 0)
+        self._failed[hidden] += 1
+        self._forget(hidden)
+        slot = np.flatnonzero(shown > 0)
+        # Of those in one cell, the one that is confirmed most often is kept; of equal ones, the least uncertain.
+        column, row = (pixel[slot] / cell).astype(np.int64).T
+        order = np.lexsort((spread[slot] / depth[slot], -self.confirmed[slot], column, row))
+        first = np.diff(row[order] * image.shape[1] + column[order], prepend=-1) > 0
+        self._used[slot[order[~first]]] = False
+        slot = slot[order[first]]
+        pixel, depth, spread = pixel[slot], depth[slot], spread[slot]
         moved = np.linalg.norm(self._pose[slot, :3, 3] - T_world_cam[:3, 3], axis=1)
-        due = moved >= _DUE * depth[kept] * np.minimum(1 + self.confirmed[slot], _SELDOM)
-        rho = 1 / depth[kept]
-        return Sighted(slot, pixel[kept], rho, np.square(spread[kept] * rho * rho), due)
+        due = moved >= _DUE * depth * np.minimum(1 + self.confirmed[slot], _SELDOM)
+        return Sighted(slot, pixel, 1 / depth, np.square(spread / np.square(depth)), due)
 
     def forget(self) -> None:
         """Forget all landmarks, and keep the running estimate."""

@@ -188,13 +188,13 @@ class PoseErrors:
         shows: NDArray[np.bool_],
         shares: NDArray[np.int64],
     ) -> None:
-        for column, share in enumerate(shares):
-            shown = shows[:, column]
-            if shown.sum() >= _ENOUGH:
-                left = np.median(beside[shown, column]) / _MEDIAN_SQUARE - np.median(noise[shown, column])
-                self._left[share] = self._faded(self._left[share], max(left, 0.0))
-        if len(residual) >= _ENOUGH:
-            self._disagreement = self._faded(self._disagreement, np.median(residual) / _MEDIAN_SQUARE)
+        if len(residual) < _ENOUGH:
+            return
+        left = (_medians(beside, shows) / _MEDIAN_SQUARE - _medians(noise, shows)).clip(0)
+        for share, each, count in zip(shares, left, shows.sum(0), strict=True):
+            if count >= _ENOUGH:
+                self._left[share] = self._faded(self._left[share], each)
+        self._disagreement = self._faded(self._disagreement, np.median(residual) / _MEDIAN_SQUARE)
 
     def _prior(self, width: int) -> NDArray[np.float64]:
         """[4, 4] covariance of the camera's errors before the first frame."""
@@ -202,6 +202,13 @@ class PoseErrors:
 
     def _faded(self, before: float, now: float) -> float:
         return self._memory * before + (1 - self._memory) * float(now)
+
+
+def _medians(values: NDArray[np.float64], where: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """[V] of the columns of [N, V] values, the greater one of two in the middle; 0 of none."""
+    ordered = np.sort(np.where(where, values, np.inf), axis=0)
+    middle = np.minimum(where.sum(0) // 2, len(values) - 1)
+    return np.where(where.any(0), ordered[middle, np.arange(values.shape[1])], 0.0)
 
 
 _HELD = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.dense_cpu import compiled
+from ufmstar_torch.kernels.compile_cpu import reordered
 
 # Two anchors are alike within so many standard deviations of their difference, or this share of the inverse depth.
 _SIGMAS, _SHARE = 3.0, 0.05
@@ -48,7 +48,7 @@ def beside(
     return moved, alone
 
 
-@compiled
+@reordered
 def _beside(image, pixel, rho, variance, cell, lies_in, moved, alone):
     for n in range(len(pixel)):
         lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
@@ -85,7 +85,7 @@ def _beside(image, pixel, rho, variance, cell, lies_in, moved, alone):
             moved[n, 1] += np.sign(apart) * _INTO * ev
 
 
-@compiled
+@reordered
 def _gradient(image, u, v):
     """Direction of the gradient around a pixel, of either sign: the structure tensor's main axis. 0 without one."""
     uu = uv = vv = 0.0

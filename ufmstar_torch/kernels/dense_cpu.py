@@ -3,25 +3,27 @@
 On the CPU (numba). A pixel x of the image and an inverse depth rho [1/m] project into a keyframe at
 p(rho) = (H x + rho b)/(.)_z, with H = K R K^-1 and b = K t of the relative pose. The patch around x, warped by dp/dx,
 is compared with windows of the keyframe along the line, a pixel apart; from the best one, Gauss-Newton steps along the
-line refine the position. Windows have an even side: their centres lie between pixels, and eight values are what a
-processor multiplies at once. ``tests/oracle_dense.py`` is the same in NumPy.
+line refine the position. Windows have an even side: their centres lie between pixels, and a row of eight pixels is
+copied at once; loops run over all pixels of a window, which compilers turn into vectors.
+``tests/oracle_dense.py`` is the same in NumPy.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-# NumPy's error model: no test for zero before every division. Sums may be taken in any order.
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+from ufmstar_torch.kernels.compile_cpu import reordered, reordered_leaf
 
 # [px] Side of the windows that are compared, and where the first of their pixels lies from the centre.
 SIDE, FIRST = 8, -3.5
 COUNT = SIDE * SIDE
+# A template is a pixel wider than the window on each side; its pixels from the centre.
+WIDE = SIDE + 2
+_RIGHT = np.tile(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
+_DOWN = np.repeat(np.arange(WIDE, dtype=np.float32) + np.float32(FIRST - 1), WIDE)
 # [gray levels] Least standard deviation of a window that is compared: below it, there is noise and nothing else.
 LEAST_CONTRAST = 2.0
 # [px] Pixels nearer to the border are not measured.
@@ -131,13 +133,15 @@ def measure(image: NDArray[np.uint8], pixel: NDArray[np.float64], views: Views, 
     return Measured(rho, variance, agreed, contradicted, value, noise, along, speed, slope, across, across_noise)
 
 
-@compiled
+@reordered
 def best_pixels(image, cell, pixel, strength):
     """In every cell [C, R] the pixel (u, v) [C, R, 2] of the largest squared gradient, and that gradient [C, R], 0
-    where there is none. Cells are ``cell`` px wide."""
+    where there is none. Cells are ``cell`` px wide; those whose ``strength`` is negative are left as they are."""
     height, width = image.shape
     for j in range(strength.shape[0]):
         for i in range(strength.shape[1]):
+            if strength[j, i] < 0:
+                continue
             best, at_u, at_v = np.int32(0), 0, 0
             for v in range(max(j * cell, MARGIN), min((j + 1) * cell, height - MARGIN)):
                 for u in range(max(i * cell, MARGIN), min((i + 1) * cell, width - MARGIN)):
@@ -148,15 +152,20 @@ def best_pixels(image, cell, pixel, strength):
             pixel[j, i, 0], pixel[j, i, 1], strength[j, i] = at_u, at_v, best
 
 
-@compiled
+@reordered
 def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, contradicted, each):
     start, first_low, first_high, sigmas, least_score, least_rival, match = numbers
-    template, patch = np.empty((SIDE + 2, SIDE + 2), np.float32), np.empty((SIDE, SIDE), np.float32)
-    along_u, along_v = np.empty((SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.float32)
-    scores, place, out = np.empty(LONGEST + 1, np.float32), np.empty(4), np.empty(6)
+    height, width = image.shape
+    flat = image.reshape(image.size)
+    place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
+    template, patch = np.empty(WIDE * WIDE, np.float32), np.empty(COUNT, np.float32)
+    along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
+    rows = np.empty((2, SIDE + 1), np.uint64)
+    scores, best, out = np.empty(LONGEST + 1, np.float32), np.empty(4), np.empty(6)
     for n in range(len(pixel)):
         u, v, weight = pixel[n, 0], pixel[n, 1], 0.0
         for k in range(len(keys)):
+            key = keys[k].reshape(image.size)
             first = agreed[n] == 0
             at = start if first else rho[n]
             x, y = H[k, 0, 0] * u + H[k, 0, 1] * v + H[k, 0, 2], H[k, 1, 0] * u + H[k, 1, 1] * v + H[k, 1, 2]
@@ -167,15 +176,17 @@ def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, co
                 half = max(sigmas * np.sqrt(variance[n] + noise[k] / speed**2), 1 / speed)
                 low, high = at - half, at + half
             if not (
-                warped(image, u, v, H[k], b[k], at, template)
+                _warped(flat, width, height, u, v, H[k], b[k], at, place, share, template)
                 and normalised(template, patch, along_u, along_v)
-                and _search(patch, keys[k], x, y, z, b[k], low, high, scores, place)
+                and _search(patch, key, width, height, x, y, z, b[k], low, high, rows, scores, best)
             ):
                 continue
-            if place[2] < least_score or (first and 1 - place[3] < least_rival * (1 - place[2])):
+            if best[2] < least_score or (first and 1 - best[3] < least_rival * (1 - best[2])):
                 continue
-            eu, ev, speed = _speed(x, y, z, b[k], _inverse_depth(x, y, z, b[k], place[0], place[1]))
-            if not _refined(patch, along_u, along_v, keys[k], place[0], place[1], eu, ev, out) or out[5] < least_score:
+            eu, ev, speed = _speed(x, y, z, b[k], _inverse_depth(x, y, z, b[k], best[0], best[1]))
+            if not _refined(patch, along_u, along_v, key, width, height, best[0], best[1], eu, ev, rows, out):
+                continue
+            if out[5] < least_score:
                 continue
             # Of the normalised window: G along and across the line; the variance of a pixel from what is left over.
             g_ee, g_ep, g_pp, pixel_noise = out[1], out[2], out[3], match * 2 * (1 - out[5]) / (COUNT - 4)
@@ -183,7 +194,7 @@ def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, co
             schur = g_pp - g_ep * slope
             along = pixel_noise / g_ee + LEAST_MATCH
             spread = (along + noise[k] * (1 + slope * slope)) / (speed * speed)
-            value = _inverse_depth(x, y, z, b[k], place[0] + out[0] * eu, place[1] + out[0] * ev)
+            value = _inverse_depth(x, y, z, b[k], best[0] + out[0] * eu, best[1] + out[0] * ev)
             if not first and (value - rho[n]) ** 2 > sigmas * sigmas * (spread + variance[n]):
                 contradicted[n] += 1
                 continue
@@ -197,7 +208,7 @@ def _measure(image, pixel, keys, H, b, noise, numbers, rho, variance, agreed, co
             weight += 1 / spread
 
 
-@compiled
+@reordered_leaf
 def _speed(x, y, z, b, rho):
     """Direction in which a point moves with its inverse depth, and how fast [px m]."""
     over = 1 / (z + rho * b[2])
@@ -207,17 +218,17 @@ def _speed(x, y, z, b, rho):
     return du / speed, dv / speed, speed
 
 
-@compiled
+@reordered_leaf
 def _inverse_depth(x, y, z, b, u, v):
     """Of a position near the line, by the axis along which the line moves faster."""
     du, dv = b[0] - u * b[2], b[1] - v * b[2]
     return (u * z - x) / du if abs(du) > abs(dv) else (v * z - y) / dv
 
 
-@compiled
-def warped(image, u, v, H, b, rho, template):
-    """The patch around (u, v) as a view sees it at inverse depth rho, a pixel wider than the window on each side. False
-    where it leaves the image or changes its scale too much."""
+@reordered_leaf
+def _warped(flat, width, height, u, v, H, b, rho, place, share, template):
+    """The template around (u, v) as a view sees it at inverse depth rho; see :func:`sampled`. False where it leaves the
+    image or changes its scale too much."""
     z = H[2, 0] * u + H[2, 1] * v + H[2, 2] + rho * b[2]
     if z <= 1e-6:
         return False
@@ -228,58 +239,73 @@ def warped(image, u, v, H, b, rho, template):
     if not z * z / LARGEST_SCALE**2 < determinant < z * z * LARGEST_SCALE**2:
         return False
     over = z / determinant
-    a, b_, c, d = d * over, -b_ * over, -c * over, a * over
-    height, width = image.shape
-    far_u, far_v = (abs(a) + abs(b_)) * (1 - FIRST), (abs(c) + abs(d)) * (1 - FIRST)
-    if not (far_u <= u < width - 1 - far_u and far_v <= v < height - 1 - far_v):
+    return sampled(flat, width, height, u, v, d * over, -b_ * over, -c * over, a * over, place, share, template)
+
+
+@reordered_leaf
+def sampled(flat, width, height, u, v, a, b, c, d, place, share, template):
+    """The pixels of an image at (u, v) + ((a, b), (c, d)) x, for the pixels x of a template, bilinear. ``place`` and
+    ``share`` hold where they are. False where one lies outside."""
+    far_u, far_v = (abs(a) + abs(b)) * (1 - FIRST), (abs(c) + abs(d)) * (1 - FIRST)
+    if not (far_u <= u < width - 1.01 - far_u and far_v <= v < height - 1.01 - far_v):  # .01: for rounding
         return False
-    one = np.float32(1)
-    for j in range(SIDE + 2):
-        for i in range(SIDE + 2):
-            right, down = i + FIRST - 1, j + FIRST - 1
-            su, sv = u + a * right + b_ * down, v + c * right + d * down
-            iu, iv = int(su), int(sv)
-            fu, fv = np.float32(su - iu), np.float32(sv - iv)
-            upper = (one - fu) * np.float32(image[iv, iu]) + fu * np.float32(image[iv, iu + 1])
-            lower = (one - fu) * np.float32(image[iv + 1, iu]) + fu * np.float32(image[iv + 1, iu + 1])
-            template[j, i] = (one - fv) * upper + fv * lower
+    u, v, a, b, c, d = np.float32(u), np.float32(v), np.float32(a), np.float32(b), np.float32(c), np.float32(d)
+    for k in range(WIDE * WIDE):
+        su, sv = u + a * _RIGHT[k] + b * _DOWN[k], v + c * _RIGHT[k] + d * _DOWN[k]
+        iu, iv = np.int32(su), np.int32(sv)
+        share[0, k], share[1, k] = su - np.float32(iu), sv - np.float32(iv)
+        place[k] = np.uint32(iv * np.int32(width) + iu)
+    for k in range(WIDE * WIDE):
+        upper_at = np.uint64(place[k])
+        lower_at = upper_at + np.uint64(width)
+        upper, lower = np.float32(flat[upper_at]), np.float32(flat[lower_at])
+        upper += share[0, k] * (np.float32(flat[upper_at + np.uint64(1)]) - upper)
+        lower += share[0, k] * (np.float32(flat[lower_at + np.uint64(1)]) - lower)
+        template[k] = upper + share[1, k] * (lower - upper)
     return True
 
 
-@compiled
+@reordered_leaf
 def normalised(template, patch, along_u, along_v):
     """The window of a template with mean 0 and length 1; its gradients, of mean 0 [1/px]. False without contrast."""
     mean = mean_u = mean_v = squares = np.float32(0)
     half = np.float32(0.5)
     for j in range(SIDE):
         for i in range(SIDE):
-            patch[j, i] = template[j + 1, i + 1]
-            along_u[j, i] = half * (template[j + 1, i + 2] - template[j + 1, i])
-            along_v[j, i] = half * (template[j + 2, i + 1] - template[j, i + 1])
-            mean += patch[j, i]
-            mean_u += along_u[j, i]
-            mean_v += along_v[j, i]
+            k, at = j * SIDE + i, (j + 1) * WIDE + i + 1
+            patch[k] = template[at]
+            along_u[k] = half * (template[at + 1] - template[at - 1])
+            along_v[k] = half * (template[at + WIDE] - template[at - WIDE])
+    for k in range(COUNT):
+        mean += patch[k]
+        mean_u += along_u[k]
+        mean_v += along_v[k]
     mean, mean_u, mean_v = mean / np.float32(COUNT), mean_u / np.float32(COUNT), mean_v / np.float32(COUNT)
-    for j in range(SIDE):
-        for i in range(SIDE):
-            patch[j, i] -= mean
-            squares += patch[j, i] * patch[j, i]
+    for k in range(COUNT):
+        patch[k] -= mean
+        squares += patch[k] * patch[k]
     if squares <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
         return False
     over = np.float32(1 / np.sqrt(squares))
-    for j in range(SIDE):
-        for i in range(SIDE):
-            patch[j, i] *= over
-            along_u[j, i] = (along_u[j, i] - mean_u) * over
-            along_v[j, i] = (along_v[j, i] - mean_v) * over
+    for k in range(COUNT):
+        patch[k] *= over
+        along_u[k] = (along_u[k] - mean_u) * over
+        along_v[k] = (along_v[k] - mean_v) * over
     return True
 
 
-@compiled
-def _search(patch, key, x, y, z, b, low, high, scores, place):
+@reordered_leaf
+def _copied(key, at, width, rows):
+    """Rows of SIDE pixels of an image, the first of them from ``at`` on, a row in each number of ``rows``."""
+    for j in range(len(rows)):
+        rows[j] = key[at : at + SIDE].view(np.uint64)[0]
+        at += width
+
+
+@reordered_leaf
+def _search(patch, key, width, height, x, y, z, b, low, high, rows, scores, place):
     """The best window between two inverse depths; its centre on the line (u, v), its ZNCC, and the ZNCC of its rival,
     the best one more than APART steps away, in ``place``. False where there is none."""
-    height, width = key.shape
     z_low, z_high = z + low * b[2], z + high * b[2]
     if z_low <= 1e-3 or z_high <= 1e-3:
         return False
@@ -295,7 +321,8 @@ def _search(patch, key, x, y, z, b, low, high, scores, place):
         left, top = int(np.floor(u_low + s * du + FIRST + 0.5)), int(np.floor(v_low + s * dv + FIRST + 0.5))
         scores[s] = -2
         if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
-            scores[s] = _score(patch, key, left, top)
+            _copied(key, top * width + left, width, rows[0])
+            scores[s] = zncc(patch, rows[0].view(np.uint8))
             if scores[s] > best:
                 best, at = scores[s], s
     if at < 0:
@@ -308,59 +335,59 @@ def _search(patch, key, x, y, z, b, low, high, scores, place):
     return True
 
 
-@compiled
-def _score(patch, key, left, top):
-    """ZNCC of the patch with a window; -1 where the window has no contrast."""
+@reordered_leaf
+def zncc(patch, window):
+    """Of a normalised patch and a window; -1 where the window has no contrast."""
     total = squares = cross = np.float32(0)
-    for j in range(SIDE):
-        for i in range(SIDE):
-            value = np.float32(key[top + j, left + i])
-            total += value
-            squares += value * value
-            cross += patch[j, i] * value
+    for k in range(COUNT):
+        value = np.float32(window[k])
+        total += value
+        squares += value * value
+        cross += patch[k] * value
     deviation = squares - total * total / np.float32(COUNT)
     if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
         return np.float32(-1)
     return cross / np.sqrt(deviation)
 
 
-@compiled
-def _refined(patch, along_u, along_v, key, u, v, eu, ev, out):
+@reordered_leaf
+def _refined(patch, along_u, along_v, key, width, height, u, v, eu, ev, rows, out):
     """Gauss-Newton steps along (eu, ev) from the centre (u, v). ``out``: the way gone [px]; G along, between and across
     the line [1/px^2]; gradient across times residual [1/px]; ZNCC. False where it leaves the image or the match."""
-    height, width = key.shape
     cu, cv = np.float32(eu), np.float32(ev)
     g_ee = g_ep = g_pp = own_e = own_p = np.float32(0)
-    for j in range(SIDE):
-        for i in range(SIDE):
-            e, p = cu * along_u[j, i] + cv * along_v[j, i], cu * along_v[j, i] - cv * along_u[j, i]
-            g_ee += e * e
-            g_ep += e * p
-            g_pp += p * p
-            own_e += e * patch[j, i]
-            own_p += p * patch[j, i]
+    for k in range(COUNT):
+        e, p = cu * along_u[k] + cv * along_v[k], cu * along_v[k] - cv * along_u[k]
+        g_ee += e * e
+        g_ep += e * p
+        g_pp += p * p
+        own_e += e * patch[k]
+        own_p += p * patch[k]
     if g_ee <= 1e-9:
         return False
-    gone, one = 0.0, np.float32(1)
+    gone, one, copied = 0.0, np.float32(1), -1
+    here, right = rows[0].view(np.uint8), rows[1].view(np.uint8)
     for step in range(STEPS + 1):
         left, top = u + gone * eu + FIRST, v + gone * ev + FIRST
         iu, iv = int(np.floor(left)), int(np.floor(top))
         if iu < 0 or iv < 0 or iu + SIDE >= width or iv + SIDE >= height:
             return False
+        if iv * width + iu != copied:
+            copied = iv * width + iu
+            _copied(key, copied, width, rows[0])
+            _copied(key, copied + 1, width, rows[1])
         fu, fv = np.float32(left - iu), np.float32(top - iv)
         w00, w01, w10, w11 = (one - fv) * (one - fu), (one - fv) * fu, fv * (one - fu), fv * fu
         total = squares = cross = down_u = down_v = np.float32(0)
-        window = key[iv : iv + SIDE + 1, iu : iu + SIDE + 1]
-        for j in range(SIDE):
-            for i in range(SIDE):
-                upper = w00 * np.float32(window[j, i]) + w01 * np.float32(window[j, i + 1])
-                lower = w10 * np.float32(window[j + 1, i]) + w11 * np.float32(window[j + 1, i + 1])
-                value = upper + lower
-                total += value
-                squares += value * value
-                cross += patch[j, i] * value
-                down_u += along_u[j, i] * value
-                down_v += along_v[j, i] * value
+        for k in range(COUNT):
+            upper = w00 * np.float32(here[k]) + w01 * np.float32(right[k])
+            lower = w10 * np.float32(here[k + SIDE]) + w11 * np.float32(right[k + SIDE])
+            value = upper + lower
+            total += value
+            squares += value * value
+            cross += patch[k] * value
+            down_u += along_u[k] * value
+            down_v += along_v[k] * value
         deviation = squares - total * total / np.float32(COUNT)
         if deviation <= COUNT * LEAST_CONTRAST * LEAST_CONTRAST:
             return False

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.dense_cpu import Views, compiled
+from ufmstar_torch.kernels.compile_cpu import reordered
+from ufmstar_torch.kernels.dense_cpu import Views
 
 # Rounds of Student-t weights, and their degrees of freedom.
 ROUNDS, STUDENT = 3, 4.0
@@ -51,7 +52,7 @@ def linearised(
     return on_line, across
 
 
-@compiled
+@reordered
 def _linearised(pixel, rho, along, slope, H, b, K, K_inverse, on_line, across):
     fx, fy = K[0, 0], K[1, 1]
     moved = np.empty((2, EACH))
@@ -138,7 +139,7 @@ def solved(shown: Shown, precision: NDArray[np.float64], start: NDArray[np.float
     return Solution(error, covariance, rho, common, residual, beside)
 
 
-@compiled
+@reordered
 def _solved(
     change, value, weight, across_change, across, across_weight,
     precision, right, error, covariance, mean_change, rho, common, residual, beside,
@@ -173,7 +174,7 @@ def _solved(
             common[n] += mean_change[n, c] * total
 
 
-@compiled
+@reordered
 def _equations(
     change, value, weight, residual, across_change, across, across_weight, beside, student, A, r, mean_change, mean
 ):
@@ -215,7 +216,7 @@ def _equations(
             row[c] /= total
 
 
-@compiled
+@reordered
 def _inverse(A, inverse):
     """Of a symmetric positive definite matrix, whose lower triangle is given and changed, by L L^T."""
     size = len(A)

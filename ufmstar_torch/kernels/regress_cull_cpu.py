@@ -16,16 +16,21 @@ _LOG2_E = math.log2(math.e)
 
 
 @kernel
-def in_view(mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero):
+def in_view(
+    slots, occupied, mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero
+):
     """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
+
+    Args:
+        slots: [n] increasing, the only ones that are looked at.
+        occupied: how many components the mixture has, others than those included.
 
     Returns:
         Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n and more], the terms of the
         sum [n, 9], and the settings (prior weight and mean, epsilon, log2 of the least threshold).
     """
-    index, whitening, log_peak = prepare(mean, covariance, weight)
-    least = math.log2(_PRIOR * prior_weight)
-    limit = _limit(epsilon, index.size) + least
+    index, whitening, log_peak = prepare(slots.copy(), mean, covariance, weight)
+    least, limit = math.log2(_PRIOR * prior_weight), negligible(prior_weight, epsilon, occupied)
     fields, constants = np.empty((index.size, FIELDS)), np.empty((index.size, _TERMS), np.array(zero).dtype)
     n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
     packed = np.empty((FIELDS, _padded(n)), constants.dtype)
@@ -34,6 +39,12 @@ def in_view(mean, covariance, weight, m, features, K, height, width, prior_weigh
             packed[i, k] = fields[k, i]
     pad(packed, n)
     return index[:n], fields, packed, constants, (prior_weight, prior_mean, epsilon, least)
+
+
+@leaf
+def negligible(prior_weight, epsilon, count):
+    """log2 of the density that one of ``count`` components must exceed somewhere in an image to be looked at."""
+    return _limit(epsilon, count) + math.log2(_PRIOR * prior_weight)
 
 
 @leaf

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.kernels.compile_cpu import reordered
 from ufmstar_torch.kernels.dense_cpu import (
     COUNT,
     FARTHEST,
-    FIRST,
     LARGEST_SCALE,
-    LEAST_CONTRAST,
     MARGIN,
     SIDE,
-    compiled,
+    WIDE,
     normalised,
-    warped,
+    sampled,
+    zncc,
 )
 
 # Least ZNCC of a landmark's patch with the image that shows it.
@@ -24,17 +24,19 @@ SHOWN = 0.8
 
 def patches(image: NDArray[np.uint8], pixel: NDArray[np.float64]) -> NDArray[np.float32]:
     """[N, SIDE, SIDE] the windows around pixels [N, 2], ``MARGIN`` from the border or more, of mean 0 and length 1."""
-    out = np.zeros((len(pixel), SIDE, SIDE), np.float32)
+    out = np.zeros((len(pixel), COUNT), np.float32)
     _patches(image, pixel, out)
-    return out
+    return out.reshape(-1, SIDE, SIDE)
 
 
-@compiled
+@reordered
 def _patches(image, pixel, out):
-    template, along_u = np.empty((SIDE + 2, SIDE + 2), np.float32), np.empty((SIDE, SIDE), np.float32)
-    along_v, H, b = np.empty((SIDE, SIDE), np.float32), np.eye(3), np.zeros(3)
+    height, width = image.shape
+    flat, template = image.reshape(image.size), np.empty(WIDE * WIDE, np.float32)
+    place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
+    along_u, along_v = np.empty(COUNT, np.float32), np.empty(COUNT, np.float32)
     for n in range(len(pixel)):
-        if warped(image, pixel[n, 0], pixel[n, 1], H, b, 0.0, template):
+        if sampled(flat, width, height, pixel[n, 0], pixel[n, 1], 1.0, 0.0, 0.0, 1.0, place, share, template):
             normalised(template, out[n], along_u, along_v)
 
 
@@ -44,6 +46,7 @@ def sight(
     pose: NDArray[np.float64],
     sigma: NDArray[np.float64],
     patch: NDArray[np.float32],
+    used: NDArray[np.bool_],
     T_world_cam: NDArray[np.float64],
     K: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
@@ -55,6 +58,7 @@ def sight(
         pose: [N, 4, 4] of the cameras that measured them [m].
         sigma: [N] of the distance from those, as a share.
         patch: [N, SIDE, SIDE], see :func:`patches`.
+        used: [N] which are landmarks.
         T_world_cam: [4, 4] of the image [m].
         K: [3, 3] [px].
 
@@ -65,16 +69,19 @@ def sight(
     n = len(point)
     pixel, depth, spread, shown = np.zeros((n, 2)), np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
     camera = (np.ascontiguousarray(K @ T_world_cam[:3, :3].T), np.ascontiguousarray(T_world_cam[:3, 3]))
-    _sight(image, point, pose, sigma, patch, *camera, np.linalg.inv(K), pixel, depth, spread, shown)
+    patch = patch.reshape(n, COUNT)
+    _sight(image, point, pose, sigma, patch, used, *camera, np.linalg.inv(K), pixel, depth, spread, shown)
     return pixel, depth, spread, shown
 
 
-@compiled
-def _sight(image, point, pose, sigma, patch, P, centre, K_inverse, pixel, depth, spread, shown):
+@reordered
+def _sight(image, point, pose, sigma, patch, used, P, centre, K_inverse, pixel, depth, spread, shown):
     height, width = image.shape
-    one = np.float32(1)
+    flat, template = image.reshape(image.size), np.empty(WIDE * WIDE, np.float32)
+    place, share = np.empty(WIDE * WIDE, np.uint32), np.empty((2, WIDE * WIDE), np.float32)
+    window = np.empty(COUNT, np.float32)
     p, error, rotated, into = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
-    for n in range(len(point)):
+    for n in np.flatnonzero(used):
         for i in range(3):
             p[i] = 0.0
             for j in range(3):
@@ -106,21 +113,9 @@ def _sight(image, point, pose, sigma, patch, P, centre, K_inverse, pixel, depth,
         pixel[n, 0], pixel[n, 1], depth[n], spread[n] = p[0], p[1], z, abs(error[2])
         if not 1 / LARGEST_SCALE**2 < determinant < LARGEST_SCALE**2 or shift_u**2 + shift_v**2 > FARTHEST**2:
             continue
-        far_u, far_v = (abs(a) + abs(b)) * -FIRST, (abs(c) + abs(d)) * -FIRST
-        if not (far_u <= p[0] < width - 1 - far_u and far_v <= p[1] < height - 1 - far_v):
+        if not sampled(flat, width, height, p[0], p[1], a, b, c, d, place, share, template):
             continue
-        total = squares = cross = np.float32(0)
         for j in range(SIDE):
             for i in range(SIDE):
-                su, sv = p[0] + a * (i + FIRST) + b * (j + FIRST), p[1] + c * (i + FIRST) + d * (j + FIRST)
-                iu, iv = int(su), int(sv)
-                fu, fv = np.float32(su - iu), np.float32(sv - iv)
-                upper = (one - fu) * np.float32(image[iv, iu]) + fu * np.float32(image[iv, iu + 1])
-                lower = (one - fu) * np.float32(image[iv + 1, iu]) + fu * np.float32(image[iv + 1, iu + 1])
-                value = (one - fv) * upper + fv * lower
-                total += value
-                squares += value * value
-                cross += patch[n, j, i] * value
-        deviation = squares - total * total / np.float32(COUNT)
-        alike = deviation > COUNT * LEAST_CONTRAST * LEAST_CONTRAST and cross > SHOWN * np.sqrt(deviation)
-        shown[n] = 1 if alike else -1
+                window[j * SIDE + i] = template[(j + 1) * WIDE + i + 1]
+        shown[n] = 1 if zncc(patch[n], window) > SHOWN else -1

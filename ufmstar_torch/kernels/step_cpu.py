@@ -24,7 +24,7 @@ from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.anchors_cpu import learn
-from ufmstar_torch.kernels.regress_cpu import regress_maps
+from ufmstar_torch.kernels.regress_cpu import EPSILON, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
 from ufmstar_torch.kernels.stream_cpu import describe, join, match
@@ -60,7 +60,7 @@ class _Slots(NamedTuple):
 
 class _Pairs(NamedTuple):
     """The matched pairs [P] of one stream; which segments [C] are new; how many segments there are, how many of them
-    are matched, how many new, and how many components the mixture had."""
+    are matched, how many new, and how many components the mixture had; the slots within reach of the frame [n]."""
 
     c: NDArray[np.int64]
     k: NDArray[np.int64]
@@ -70,6 +70,12 @@ class _Pairs(NamedTuple):
     matched: int
     created: int
     occupied: int
+    near: NDArray[np.int64]
+
+    def after(self, dropped: int) -> tuple[NDArray[np.int64], int]:
+        """The slots within reach with those of the new components, and how many are occupied."""
+        components = self.occupied + self.created - dropped
+        return np.append(self.near, np.arange(self.occupied, components)), components
 
 
 def step(
@@ -94,11 +100,14 @@ def step(
     old, segments, K = _Slots.of(state), _Slots.of(current_cam), frame.intrinsics.contiguous().numpy()
     mean_cam, covariance_cam = np.zeros(old.mean.shape), np.zeros(old.covariance.shape)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
+    # Anchors and the neighbourhood look at every component.
+    narrow = config.regression == "exact" and not config.anchored
+    reach = (config.prior_weight, EPSILON[frame.depth.dtype] if narrow else 0.0)
     with kernel("correspond"):
         matching = [
             (
                 first[b], present[b], *old.stream(b)[:3], *segments.stream(b)[:3], K[b], frame.size, thresholds,
-                mean_cam[b], covariance_cam[b],
+                reach, mean_cam[b], covariance_cam[b],
             )
             for b in range(len(K))
         ]  # fmt: skip
@@ -139,8 +148,9 @@ def step(
     mixture_cam = unmeasured.before_regression(mixture_cam, config)
     stage("append")
 
+    near = [pair.after(lost) for pair, lost in zip(pairs, dropped, strict=True)]
     with kernel("regress_image"):
-        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels)
+        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, near)
     result, residual, measured = after_regress(result, stream, frame, config, pixels)
     stage("regress")
 

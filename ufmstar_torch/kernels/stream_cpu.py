@@ -7,6 +7,7 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
+from ufmstar_torch.kernels.reach_cpu import reached
 from ufmstar_torch.kernels.rigid_cpu import move, relative
 from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
 
@@ -30,26 +31,28 @@ def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, wei
 
 @kernel
 def match(
-    first, present, mean, covariance, weight, mean_c, cov_c, weight_c, K, size, thresholds, mean_cam, covariance_cam
-):
-    """Step 3: M_(i-1) [K] into the camera frame, written to ``mean_cam`` and ``covariance_cam``, and its pairs with
-    C_i [C].
+    first, present, mean, covariance, weight, mean_c, cov_c, weight_c, K, size, thresholds, reach, mean_cam,
+    covariance_cam,
+):  # fmt: skip
+    """Step 3: what the frame can reach of M_(i-1) [K] into the camera frame, written to ``mean_cam`` and
+    ``covariance_cam``, and its pairs with C_i [C].
 
     Args:
         first, present: [4, 4] camera-to-world of the stream's first camera and of this one.
         size: H, W.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
+        reach: of :func:`reached`: prior weight, epsilon.
 
     Returns:
         The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
-        of them are matched, how many new, and how many components the mixture had.
+        of them are matched, how many new, and how many components the mixture had; the slots within reach [n].
     """
-    move(relative(first, present), mean, covariance, weight, 0, np.empty(0, np.bool_), mean_cam, covariance_cam)
-    pi, occupied = np.empty(weight.size), 0
-    for k in range(weight.size):
-        pi[k] = weight[k]
-        occupied += weight[k] > 0
-    c, k, overlap = matches(mean_cam, covariance_cam, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
+    motion, pi, chosen = relative(first, present), np.zeros(weight.size), np.zeros(weight.size, np.bool_)
+    near, occupied = reached(motion, mean, covariance, weight, K, size, *reach, weight_c.size)
+    for k in near:
+        pi[k], chosen[k] = weight[k], True
+    move(motion, mean, covariance, weight, weight.size, chosen, mean_cam, covariance_cam)
+    c, k, overlap = matches(near, mean_cam, covariance_cam, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
     new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
         new[c[i]] = False
@@ -59,7 +62,7 @@ def match(
         # What is nearer than the near plane could never be matched again: it is not remembered.
         new[i] = new[i] and weight_c[i] > 0 and mean_c[i, 2] > thresholds[2]
         created += new[i]
-    return c, k, overlap, new, found, matched, created, occupied
+    return c, k, overlap, new, found, matched, created, occupied, near
 
 
 @kernel
