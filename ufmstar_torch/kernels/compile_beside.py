@@ -41,13 +41,14 @@ class Compiler(event.Listener):
     """
 
     def __init__(self, jobs: Sequence[Job]) -> None:
-        self._jobs, self._begun = jobs, False
+        self._jobs, self._begun, self._collects = jobs, False, False
         self._process: subprocess.Popen[bytes] | None = None
 
     def on_start(self, event: event.Event) -> None:
         """A function is about to be compiled here."""
         if not self._begun:
-            self._begun = True
+            self._begun, self._collects = True, gc.isenabled()
+            gc.disable()  # a tenth of the time goes into it
             if self._jobs and event.data["dispatcher"].stats.cache_path is not None and _spare():
                 self._process = _started(self._jobs)
 
@@ -60,7 +61,9 @@ class Compiler(event.Listener):
             self._process.wait()
 
     def stop(self) -> None:
-        """End the other process."""
+        """End the other process; collect garbage again."""
+        if self._collects:
+            gc.enable()
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -86,10 +89,10 @@ def _started(jobs: Sequence[Job]) -> subprocess.Popen[bytes] | None:
 
 def main(jobs: str) -> None:
     """Run jobs, as JSON."""
-    gc.disable()  # a tenth of the time; the process is short
     for module, function, arguments in json.loads(jobs):
         getattr(importlib.import_module(module), function)(**arguments)
 
 
 if __name__ == "__main__":
+    gc.disable()  # as above
     main(sys.argv[1])

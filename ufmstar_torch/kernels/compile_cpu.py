@@ -13,15 +13,17 @@ from typing import Any
 from numba import njit
 from numba.extending import register_jitable
 
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
-def _kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+
+def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile at the first call, and keep the result on disk; in memory alone where no folder can be written to."""
 
     def decorated(function: Callable[..., Any]) -> Any:
         try:
-            return njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+            return njit(cache=True, **_OPTIONS, **options)(function)
         except RuntimeError:  # numba: "no locator available"
-            return njit(nogil=True, error_model="numpy", **options)(function)
+            return njit(**_OPTIONS, **options)(function)
 
     return decorated
 
@@ -30,7 +32,7 @@ def _inner(**options: Any) -> Any:
     return register_jitable(error_model="numpy", no_cfunc_wrapper=True, **options)
 
 
-kernel = _kept(no_cfunc_wrapper=True)
+kernel = kept()
 part = _inner()
 
 # A part that allocates nothing; the kernel that calls it holds its arrays. numba counts the references of every view of
@@ -42,5 +44,5 @@ contracted = _inner(_nrt=False, fastmath={"contract"})
 
 # A kernel and a leaf whose sums may be taken in any order, so that they run in vectors.
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
-reordered = _kept(fastmath=_ANY_ORDER)
+reordered = kept(fastmath=_ANY_ORDER)
 reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
