@@ -17,7 +17,7 @@ HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetr
 HEAVY += ("numba",)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "disagree", "fuse", "regress", "mixture", "step", "frame")
-REFERENCE += ("anchors", "evidence", "hook", "output", "state", "fixed_order", "merge")
+REFERENCE += ("anchors", "evidence", "hook", "output", "state", "fixed_order", "merge", "occlude")
 
 
 def layer_of(path: Path) -> str:

@@ -102,11 +102,13 @@ def step(
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     # Anchors and the neighbourhood look at every component.
     narrow = config.regression == "exact" and not config.anchored
-    reach = (config.prior_weight, EPSILON[frame.depth.dtype] if narrow else 0.0)
+    epsilon, ratio = EPSILON[frame.depth.dtype] if narrow else 0.0, config.occlusion_depth
+    reach = (config.prior_weight, epsilon, float("inf") if ratio is None else ratio)
+    depth = frame.depth.contiguous().numpy()
     with kernel("correspond"):
         matching = [
             (
-                first[b], present[b], *old.stream(b)[:3], *segments.stream(b)[:3], K[b], frame.size, thresholds,
+                first[b], present[b], *old.stream(b)[:3], *segments.stream(b)[:3], K[b], depth[b], thresholds,
                 reach, mean_cam[b], covariance_cam[b],
             )
             for b in range(len(K))

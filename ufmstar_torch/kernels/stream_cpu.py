@@ -7,6 +7,7 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
+from ufmstar_torch.kernels.occlude_cpu import visible
 from ufmstar_torch.kernels.reach_cpu import reached
 from ufmstar_torch.kernels.rigid_cpu import move, relative
 from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
@@ -31,7 +32,7 @@ def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, wei
 
 @kernel
 def match(
-    first, present, mean, covariance, weight, mean_c, cov_c, weight_c, K, size, thresholds, reach, mean_cam,
+    first, present, mean, covariance, weight, mean_c, cov_c, weight_c, K, depth, thresholds, reach, mean_cam,
     covariance_cam,
 ):  # fmt: skip
     """Step 3: what the frame can reach of M_(i-1) [K] into the camera frame, written to ``mean_cam`` and
@@ -39,20 +40,22 @@ def match(
 
     Args:
         first, present: [4, 4] camera-to-world of the stream's first camera and of this one.
-        size: H, W.
+        depth: [H, W], 0 where there is none.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
-        reach: of :func:`reached`: prior weight, epsilon.
+        reach: prior weight, epsilon of :func:`reached`, and ratio of :func:`visible` (infinite: nothing is hidden).
 
     Returns:
         The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
         of them are matched, how many new, and how many components the mixture had; the slots within reach [n].
     """
     motion, pi, chosen = relative(first, present), np.zeros(weight.size), np.zeros(weight.size, np.bool_)
-    near, occupied = reached(motion, mean, covariance, weight, K, size, *reach, weight_c.size)
+    near, occupied = reached(motion, mean, covariance, weight, K, depth.shape, reach[0], reach[1], weight_c.size)
     for k in near:
         pi[k], chosen[k] = weight[k], True
     move(motion, mean, covariance, weight, weight.size, chosen, mean_cam, covariance_cam)
-    c, k, overlap = matches(near, mean_cam, covariance_cam, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
+    if reach[2] < np.inf:
+        near = visible(near, pi, mean_cam, covariance_cam, K, depth, reach[2], reach[0])
+    c, k, overlap = matches(near, mean_cam, covariance_cam, pi, mean_c, cov_c, weight_c, K, *depth.shape, *thresholds)
     new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
         new[c[i]] = False
