@@ -96,3 +96,11 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_examples(out, *KITCHEN, ENSEMBLE)
     assert write_report(out).undrawn == {}
     return out
+
+
+@pytest.fixture(scope="session")
+def results(evaluation: Path):
+    """The results of :func:`evaluation`, with sums."""
+    from ufmstar_torch.eval.report.data import load_results
+
+    return load_results(evaluation)

@@ -267,6 +267,6 @@ def _view(state: UfMStarState, frame: FrameInput, b: int, config: UfMStarConfig)
     near, far = [0, 0, 1, -config.near_plane * (1 - 1e-6)], [0, 0, -1, float(depth) * (1 + 1e-6)]
     planes = [np.array([*sides, *rest], dtype=np.float64) @ move for rest in ([near], [[0, 0, 1, 0], far])]
     if config.occlusion_depth is None:
-        return View(*planes)
+        return View(planes[0], planes[1])
     seen = seen_depth(frame.depth[b : b + 1], frame.valid[b : b + 1])[0].cpu().numpy()
-    return View(*planes, Screen(move[:3], K.numpy(), seen, BLOCK, config.occlusion_depth))
+    return View(planes[0], planes[1], Screen(move[:3], K.numpy(), seen, BLOCK, config.occlusion_depth))

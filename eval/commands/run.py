@@ -28,7 +28,7 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
-from ufmstar_torch.eval.report.outputs import Finished, common_scales, draw_sheet, draw_video, write_mixture
+from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.journal import Journal, MapWriter, row_state
 from ufmstar_torch.eval.results.run_folder import RunFolder
@@ -269,18 +269,19 @@ def _outputs(
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
         return {}
-    write_mixture(folder.path, _ufm(job, folder))
+    for name, write in mixture_writers(_ufm(job, folder)).items():
+        write(folder.path / name)
     write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).figures.curves())
     made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = Finished(folder.path, job.sequence, done, with_error)
     try:
         if job.sheet or job.video:
-            scales = common_scales(finished)
+            columns = common_columns(finished)
         if job.sheet:
-            draw_sheet(finished, scales, f"{job.sequence.name}: {_counts(folder, job)}")
+            draw_sheet(finished, columns, f"{job.sequence.name}: {_counts(folder, job)}")
             made["contact_sheet.png"] = None
-        for drawn in draw_video(finished, scales) if job.video else ():
+        for drawn in draw_video(finished, columns) if job.video else ():
             progress(Progress("pictures", drawn, len(done), None, 0))
             if stop():
                 raise Stopped

@@ -75,7 +75,7 @@ def _table(run: Mapping[str, Any], label: str, relative: bool, kind: str) -> Tab
         if row["base"] == b
     ]
     network = run["networks"][bases[0]]
-    return Table.of(
+    return Table(
         f"efficiency-{''.join(c if c.isalnum() else '-' for c in label.lower())}",
         f"Efficiency of uncertainty, {label}",
         "Method",
@@ -104,7 +104,7 @@ def _paper_table(quoted: PaperTable) -> Table:
     alone = f"Depth alone: {quoted.alone['latency_ms']} ms, {quoted.alone['memory_mb']} MB."
     notes = (alone, f"Measured by the paper on {quoted.measured_on}.")
     title = f"The paper's table 2, {quoted.network}"
-    return Table.of(f"paper-efficiency-{quoted.network}", title, "Method", _columns(False), lines, notes)
+    return Table(f"paper-efficiency-{quoted.network}", title, "Method", _columns(False), lines, notes)
 
 
 def _columns(relative: bool) -> list[Column]:

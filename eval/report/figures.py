@@ -14,9 +14,7 @@ from ufmstar_torch.eval.report.figures_cost import draw_latency, draw_stages, dr
 from ufmstar_torch.eval.report.figures_error import draw_entropy, draw_error
 from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
 from ufmstar_torch.eval.report.pictures import DRAWING_ERRORS
-from ufmstar_torch.eval.report.style import (
-    save_figure,
-)
+from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.sweeps import sweeps
 
 SVG, PNG = "svg", "png"
@@ -43,7 +41,7 @@ def write_figures(results: Results, kind: str, undrawn: dict[str, str]) -> list[
     folder = results.out / "figures"
     folder.mkdir(exist_ok=True)
     written = []
-    for name, draw in _figures(results):
+    for name, draw in figures_of(results):
         path = folder / f"{re.sub(r'[^A-Za-z0-9.-]+', '-', name.replace('/', '_'))}.{kind}"
         try:
             figure = draw()
@@ -55,7 +53,7 @@ def write_figures(results: Results, kind: str, undrawn: dict[str, str]) -> list[
     return written
 
 
-def _figures(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
+def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Name and function of every figure; the function returns None where there is nothing to draw."""
     for dataset in results.datasets:
         yield f"calibration {dataset}", partial(draw_calibration, results, dataset)
