@@ -37,6 +37,7 @@ from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.ufm import UfMConfig
@@ -51,7 +52,6 @@ from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
 from ufmstar_torch.models.trained import load_trained, read_info
 from ufmstar_torch.pipeline import NetworksInTurn
-from ufmstar_torch.ufmstar import UfMStar
 
 # Of "mixed" tours: what the networks were trained on, and what they never saw.
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
@@ -229,7 +229,7 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
 
     progress(Progress("rooms", 0, len(sequence), None, 0))
     with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(UfMStar(_POSTERIOR, device=device).warm_up, (64, 64), progress=compiling)
+        compiled = beside.submit(warm_up_command, _POSTERIOR, device, compiling, dense=True)
         for index in range(len(sequence)):
             frames.append(sequence[index])
             progress(Progress("rooms", index + 1, len(sequence), None, 0))

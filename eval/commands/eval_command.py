@@ -260,8 +260,12 @@ def launch_from(options: EvalOptions) -> LaunchOptions:
 
 
 def _evaluate(options: EvalOptions) -> int:
-    from ufmstar_torch import UfMStar
+    import torch
+
+    from ufmstar_torch import UfMStarConfig
+    from ufmstar_torch.anchors.landmarks import DENSE
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.results.launch import evaluate_suite
 
@@ -269,8 +273,12 @@ def _evaluate(options: EvalOptions) -> int:
         job, launch = job_from(options), launch_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-        if any(row.method.fusion == UFM_STAR for row in job.suite.rows):
-            UfMStar().warm_up((32, 32), progress=partial(bars.frames, "kernels, compiled on the first run"))
+        rows = [row for row in job.suite.rows if row.method.fusion == UFM_STAR]
+        if rows:
+            anchors = {row.setting.anchors for row in rows}
+            config = UfMStarConfig(anchored=anchors != {""}, posterior=any(row.setting.posterior for row in rows))
+            shown = partial(bars.frames, "kernels, compiled on the first run")
+            warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
         outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
     if outcome.reports:
         return _report(outcome, options.threads, draws=not options.output.no_report)

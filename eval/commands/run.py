@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
@@ -27,6 +28,7 @@ from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Stopped
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
 from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
@@ -179,7 +181,8 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     def compiling(done: int, total: int) -> None:
         progress(Progress("kernels", done, total, None, 0))
 
-    UfMStar(job.config, device=job.device).warm_up((32, 32), progress=compiling)
+    dense = job.config.anchored and isinstance(job.landmarks(), DenseEvidence)
+    warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
     position = folder.checkpoint.position
     row = job.row(folder.checkpoint.module, position)
     metrics = RunMetrics(UFM, folder.checkpoint.metrics)
