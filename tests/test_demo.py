@@ -242,7 +242,7 @@ def test_pixels_belong_to_the_room_they_show():
     tour = make_tour(SEED, "mixed")
     frames = tour_sequence(SEED, frames=30, size=SIZE, style="mixed")
     both = 0
-    for entry in frames.entries[::5]:
+    for entry in frames.entries[::3]:
         view = render(tour, torch.from_numpy(entry.T_world_cam), torch.from_numpy(frames.intrinsics), *SIZE)
         result = surface_kinds(
             tour, Frame(0, "", None, view.depth.float().numpy(), entry.T_world_cam, frames.intrinsics)
