@@ -44,13 +44,14 @@ class _Open(NamedTuple):
 
 @kernel
 def scan_rows(
-    z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, owner
+    z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, runs
 ):
     """Scanline segmentation of the rows from ``first`` to ``last``, each on its own.
 
     Finished segments go to ``table`` and ``table_int``, from row ``first * most`` on, with at most ``most`` of an image
-    row. ``spans`` [H, 2] receives where a row's segments begin and end, ``owner`` [H, W] 1 + the place of the segment
-    that a pixel belongs to, or 0.
+    row. Pixels go to ``runs``, from row ``first * W`` on: where a run of pixels of one segment begins in the image row,
+    and 1 + the place of the segment or 0. ``spans`` [H, 4] receives where a row's segments begin and end, and likewise
+    its runs.
     """
     width = z.shape[1]
     row = np.empty(width), np.empty(width), np.empty(width), np.zeros(width, np.bool_), np.zeros(width)
@@ -59,16 +60,16 @@ def scan_rows(
         rx[u] = (u - cx) / fx
     place = np.empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
     older, older_int = np.empty((limits.max_open, 10)), np.empty((limits.max_open, 5), np.int64)
-    end = first * segments_of_row(width, limits)
+    end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
-        spans[v, 0] = end
+        spans[v, 0], spans[v, 2] = end, pixels
         _usable(z, use, spread, v, limits.max_depth, row[0], row[4])
         _thresholds(row[0], rx, slope, limits, row[1], row[2], spare, row[3])
-        end = _scanline(
+        end, pixels = _scanline(
             row, rx, (v - cy) / fy, slope, lengths2, edges, limits, spread.size > 0, older, older_int, table,
-            table_int, end, place, owner, v,
+            table_int, end, place, runs, pixels,
         )  # fmt: skip
-        spans[v, 1] = end
+        spans[v, 1], spans[v, 3] = end, pixels
 
 
 @leaf
@@ -112,14 +113,14 @@ def _thresholds(depth, rx, slope, limits, x, tau_z, tau_x, near):
 @leaf
 def _scanline(
     row, rx, ry, slope, lengths2, edges, limits, spread, older, older_int, segments, segments_int, done,
-    place, owner, v,
+    place, runs, run,
 ):  # fmt: skip
-    """Scanline segmentation of row v.
+    """Scanline segmentation of a row.
 
     ``row`` are depth, x, tau_z, which pixels are near the one before, and variances, which are 0 without ``spread``.
-    Writes the finished segments from ``done`` on and, to row v of ``owner``, 1 + the place of a pixel's segment or 0;
-    returns the end of the finished segments. The newest open segment lives in registers, the others in a ring of
-    max_open - 1 places, ``front`` being the newest of them. ``place`` is scratch.
+    Writes the finished segments from ``done`` on and the runs from ``run`` on; returns the end of both. The newest open
+    segment lives in registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
+    ``place`` is scratch.
     """
     depth, x_of, tau_z, near, s2 = row
     y_factor = 1.0 + ry * ry
@@ -127,10 +128,11 @@ def _scanline(
     front = waiting = started = n = right = left = nearest = u = k = ZERO
     x0 = z0 = w2 = dx = dz = dxx = dxz = dzz = 0.0
     low, high, length2 = 0.0, edges[0], lengths2[0]  # of depth bin k
+    first_run = run
     while u < depth.size:
         z, x = depth[u], x_of[u]
         if z == 0.0:
-            owner[v, u] = 0
+            run = _begun(runs, first_run, run, u, 0)
             u += 1
             continue
         if not (z > low and z <= high):
@@ -152,7 +154,7 @@ def _scanline(
             if q >= 0:
                 match = _extended(_load(older, older_int, q), x, z, u, k, y_factor, rx[u], s2[u])
                 _store(older, older_int, q, match)
-                owner[v, u] = match.born
+                run = _begun(runs, first_run, run, u, match.born)
                 u += 1
                 continue
             if n > 0:
@@ -191,8 +193,7 @@ def _scanline(
             w2 = ex * ex + y_factor * (ez * ez)
             dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
             u += 1
-        for i in range(begin, u):
-            owner[v, i] = started
+        run = _begun(runs, first_run, run, begin, started)
         n, right = n + u - begin, u - 1
     if n > 0:
         newest = _Open(n, left, right, nearest, started, x0, z0, x_of[right], depth[right], w2, dx, dz, dxx, dxz, dzz)
@@ -201,9 +202,18 @@ def _scanline(
         q = front - i if front >= i else front - i + room
         done = _finish(_load(older, older_int, q), limits.sparse, segments, segments_int, done, place)
     place[0] = 0
-    for u in range(depth.size):
-        owner[v, u] = place[owner[v, u]]
-    return done
+    for i in range(first_run, run):
+        runs[i, 1] = place[runs[i, 1]]
+    return done, run
+
+
+@leaf
+def _begun(runs, first, run, u, owner):
+    """The end of the runs after pixel u of ``owner``, which begins one unless the run before is the owner's."""
+    if run > first and runs[run - 1, 1] == owner:
+        return run
+    runs[run, 0], runs[run, 1] = u, owner
+    return run + 1
 
 
 @leaf
