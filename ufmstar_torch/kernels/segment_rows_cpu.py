@@ -54,8 +54,7 @@ def scan_rows(
     its runs.
     """
     width = z.shape[1]
-    row = np.empty(width), np.empty(width), np.empty(width), np.zeros(width, np.bool_), np.zeros(width)
-    rx, spare = np.empty(width), np.empty(width)
+    row, rx = (np.empty(width), np.empty(width), np.empty(width), np.zeros(width)), np.empty(width)
     for u in range(width):
         rx[u] = (u - cx) / fx
     place = np.empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
@@ -63,8 +62,8 @@ def scan_rows(
     end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
         spans[v, 0], spans[v, 2] = end, pixels
-        _usable(z, use, spread, v, limits.max_depth, row[0], row[4])
-        _thresholds(row[0], rx, slope, limits, row[1], row[2], spare, row[3])
+        _usable(z, use, spread, v, limits.max_depth, row[0], row[3])
+        _thresholds(row[0], rx, slope, limits, row[1], row[2])
         end, pixels = _scanline(
             row, rx, (v - cy) / fy, slope, lengths2, edges, limits, spread.size > 0, older, older_int, table,
             table_int, end, place, runs, pixels,
@@ -92,22 +91,23 @@ def _usable(z, use, spread, v, max_depth, depth, s2):
 
 
 @leaf
-def _thresholds(depth, rx, slope, limits, x, tau_z, tau_x, near):
-    """Of a row: x, tau_z (-1 for a pixel that takes no part), tau_x, and which pixels are near the one before."""
+def _thresholds(depth, rx, slope, limits, x, tau_z):
+    """Of a row: x, and tau_z (-1 for a pixel that takes no part)."""
     for u in range(depth.size):
         x[u] = rx[u] * depth[u]
-    low, high, highest = limits.noise_floor, limits.noise_thresh, limits.line_thresh
+    low, high = limits.noise_floor, limits.noise_thresh
     for u in range(depth.size):
         t = 6.0 * (slope * depth[u] * depth[u])
         t = t if t > low else low
         t = t if t < high else high
         tau_z[u] = t if depth[u] > 0 else -1.0
-    for u in range(depth.size):
-        t = slope * depth[u] * depth[u]
-        t = t if t > low else low
-        tau_x[u] = t if t < highest else highest
-    for u in range(1, depth.size):
-        near[u] = (abs(depth[u] - depth[u - 1]) < tau_z[u]) & (abs(x[u] - x[u - 1]) < tau_x[u])
+
+
+@leaf
+def _near(x, z, last_x, last_z, tau_z, slope, limits):
+    """Whether a point is near the one before: within tau_z and tau_x."""
+    tau_x = min(max(slope * z * z, limits.noise_floor), limits.line_thresh)
+    return (abs(z - last_z) < tau_z) & (abs(x - last_x) < tau_x)
 
 
 @leaf
@@ -117,12 +117,12 @@ def _scanline(
 ):  # fmt: skip
     """Scanline segmentation of a row.
 
-    ``row`` are depth, x, tau_z, which pixels are near the one before, and variances, which are 0 without ``spread``.
+    ``row`` are depth, x, tau_z and variances, which are 0 without ``spread``.
     Writes the finished segments from ``done`` on and the runs from ``run`` on; returns the end of both. The newest open
     segment lives in registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
     ``place`` is scratch.
     """
-    depth, x_of, tau_z, near, s2 = row
+    depth, x_of, tau_z, s2 = row
     y_factor = 1.0 + ry * ry
     room = limits.max_open - 1
     front = waiting = started = n = right = left = nearest = u = k = ZERO
@@ -146,9 +146,7 @@ def _scanline(
         if fits and n > limits.n_check:
             fits = dx != 0 and abs(z0 + dz * (x - x0) / dx - z) < tau_z[u]
         elif fits:
-            fits = abs(z - depth[right]) < tau_z[u] and abs(x - x_of[right]) < min(
-                max(slope * z * z, limits.noise_floor), limits.line_thresh
-            )
+            fits = _near(x, z, x_of[right], depth[right], tau_z[u], slope, limits)
         if not fits:
             q = _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, tau_z[u], length2, limits)
             if q >= 0:
@@ -179,7 +177,8 @@ def _scanline(
         short = u if spread else min(depth.size, max(u, begin + limits.n_check - n + 1))
         while u < short:
             ex, ez = x_of[u] - x0, depth[u] - z0
-            if not (near[u] & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
+            near = _near(x_of[u], depth[u], x_of[u - 1], depth[u - 1], tau_z[u], slope, limits)
+            if not (near & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
                 break
             w2 = ex * ex + y_factor * (ez * ez)
             dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
@@ -237,8 +236,7 @@ def _fits(o, x, z, u, slope, tau_z, length2, limits):
     if u - o.u_right > limits.occlusion_gap or not o.w2 < length2:
         return False
     if o.n <= limits.n_check:
-        tau_x = min(max(slope * z * z, limits.noise_floor), limits.line_thresh)
-        return abs(z - o.z_right) < tau_z and abs(x - o.x_right) < tau_x
+        return _near(x, z, o.x_right, o.z_right, tau_z, slope, limits)
     return o.dx != 0 and abs(o.z_left + o.dz * (x - o.x_left) / o.dx - z) < tau_z
 
 
