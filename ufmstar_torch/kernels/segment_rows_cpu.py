@@ -175,7 +175,7 @@ def _scanline(
         u += 1
         # What follows without a gap in the same depth bin, by the same rules: until n_check, then by the line.
         short = u if spread else min(depth.size, max(u, begin + limits.n_check - n + 1))
-        while u < short:
+        while 0 <= u < short:  # the index is not negative: no wrap-around to compile
             ex, ez = x_of[u] - x0, depth[u] - z0
             near = _near(x_of[u], depth[u], x_of[u - 1], depth[u - 1], tau_z[u], slope, limits)
             if not (near & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
@@ -184,7 +184,7 @@ def _scanline(
             dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
             u += 1
         stop = depth.size if u == short and not spread else u
-        while u < stop:
+        while 0 <= u < stop:
             ex, ez = x_of[u] - x0, depth[u] - z0
             off = abs(z0 + dz * ex / dx - depth[u])
             if not ((off < tau_z[u]) & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
