@@ -57,7 +57,7 @@ def test_values_against_the_oracle_over_frames(tier):
         np.testing.assert_allclose(out.depth[0], expected, rtol=1e-8)
         np.testing.assert_allclose(out.variance[0], variance, rtol=1e-7)
         assert float(out.calibration) == pytest.approx(oracle.ratio(state, "calibration"), rel=1e-7)
-        assert float(out.unseen) == pytest.approx(0.06 + oracle.ratio(state, "unseen"), rel=1e-7)
+        assert float(out.unseen) == pytest.approx(0.02 + oracle.ratio(state, "unseen"), rel=1e-7)
 
 
 def test_the_model_fits_the_compiled_window():
