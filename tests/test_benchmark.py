@@ -263,14 +263,13 @@ def test_a_peer_that_fails():
 @pytest.mark.slow
 def test_the_faster_runtime_of_a_network_is_taken():
     """Exported by torch, both give the same depth."""
-    forward = fastest(small_network().folded(), 64)
-    about = forward.about
+    forward, about = fastest(small_network().folded(), 64)
     names = {"torch": "torch", "onnx": "onnxruntime"}
     assert about["runtimes"].keys() == names.keys()
     assert about["runtime"] == names[min(about["runtimes"], key=about["runtimes"].get)]
     assert about["version"] == (torch.__version__ if about["runtime"] == "torch" else versions()["onnxruntime"])
     assert about["apart"] < 1e-3
-    assert forward.call().shape == (1, 64, 64)
+    assert forward().shape == (1, 64, 64)
 
 
 def test_floors_grow_with_what_they_count():

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 from random_gaussians import as_lists, mixture
 
 import oracle
@@ -14,6 +15,7 @@ import scenes
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.kernels import regress_cpu
+from ufmstar_torch.kernels.vectors_cpu import vectors
 from ufmstar_torch.regress import distribute, regress, regress_image, sample_pixels, shares, smooth
 
 pytestmark = pytest.mark.numerics
@@ -97,6 +99,25 @@ def crowded(seed: int):
     sign = 1 - 2 * (torch.arange(300) % 10 == 0).double()[:, None]
     scale = 10 ** (-3 * torch.rand(300, generator=generator, dtype=torch.float64))
     return m.replace(mean=near * sign, covariance=m.covariance * scale[:, None, None]), depth
+
+
+@pytest.mark.parametrize(("dtype", "least", "tolerance"), [(np.float32, -120, 4e-7), (np.float64, -1000, 4e-15)])
+def test_powers_of_two_as_vectors(dtype, least, tolerance):
+    @vectors
+    def write(code, t, out):
+        for row in range(0, 1024, code.lanes):
+            out.store(t.load(row).exp2(), row)
+
+    @njit
+    def powers(t, out):
+        write(t, out)
+
+    t = np.concatenate([np.linspace(least, 126, 1020), [-np.inf, np.nan, -1e30, 2.0 * least]]).astype(dtype)
+    out = np.empty_like(t)
+    powers(t, out)
+    exact = np.exp2(t[:1020].astype(np.longdouble))
+    assert np.abs(out[:1020] / exact - 1).max() < tolerance
+    np.testing.assert_allclose(out[1020:].astype(np.longdouble), np.exp2(np.longdouble(least)), rtol=tolerance)
 
 
 @pytest.mark.parametrize("weight", [1.0, 1e-3, 1e3])

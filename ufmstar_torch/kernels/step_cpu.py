@@ -84,8 +84,9 @@ def step(
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     # Anchors and the neighbourhood look at every component.
     narrow = config.regression == "exact" and not config.anchored
-    reach = (config.prior_weight, EPSILON[frame.depth.dtype] if narrow else 0.0)
-    given = (camera, before, after, slots[:3], segments[:3], frame.size, thresholds, reach, mean_cam, covariance_cam)
+    ratio = float("inf") if config.occlusion_depth is None else config.occlusion_depth
+    reach, depth = (config.prior_weight, EPSILON[frame.depth.dtype] if narrow else 0.0, ratio), array(frame.depth)
+    given = (camera, before, after, slots[:3], segments[:3], depth, thresholds, reach, mean_cam, covariance_cam)
     with kernel("correspond"):
         pairs = [_Pairs(*found) for found in each(match, [(b, *given) for b in streams])]
     stage("correspond")
