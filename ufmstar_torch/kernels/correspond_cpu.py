@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import part
 
 
-@kernel
+@part
 def matches(slots, mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening):
     """The matched pairs of one stream, as :func:`ufmstar_torch.correspond.correspond` states them.
 

@@ -46,21 +46,24 @@ def reached(motion, mean, covariance, weight, K, size, prior_weight, epsilon, mo
     if epsilon == 0:
         return index[:occupied], occupied
     least = negligible(prior_weight, epsilon, occupied + more)
-    sides = np.empty((5, 3))  # x outside: n . x > 0, in camera coordinates
-    sides[0], sides[1] = (-K[0, 0], 0.0, -(K[0, 2] + _WIDER)), (K[0, 0], 0.0, K[0, 2] + 1 - size[1] - _WIDER)
-    sides[2], sides[3] = (0.0, -K[1, 1], -(K[1, 2] + _WIDER)), (0.0, K[1, 1], K[1, 2] + 1 - size[0] - _WIDER)
-    sides[4] = (0.0, 0.0, -1.0)
-    planes = np.empty((5, 4))  # the same of the mixture's coordinates
-    for i in range(5):
-        for j in range(4):
-            planes[i, j] = (
-                sides[i, 0] * motion[0, j] + sides[i, 1] * motion[1, j] + sides[i, 2] * motion[2, j]
-            )  # fmt: skip
+    planes = np.empty((5, 4))  # outside: n . x > 0
+    _plane(planes, 0, motion, -K[0, 0], 0.0, -(K[0, 2] + _WIDER))
+    _plane(planes, 1, motion, K[0, 0], 0.0, K[0, 2] + 1 - size[1] - _WIDER)
+    _plane(planes, 2, motion, 0.0, -K[1, 1], -(K[1, 2] + _WIDER))
+    _plane(planes, 3, motion, 0.0, K[1, 1], K[1, 2] + 1 - size[0] - _WIDER)
+    _plane(planes, 4, motion, 0.0, 0.0, -1.0)
     n = 0
     for i in range(occupied):
         index[n] = index[i]
         n += not _outside(planes, mean, covariance, weight, index[i], least)
     return index[:n], occupied
+
+
+@leaf
+def _plane(planes, i, motion, x, y, z):
+    """Plane i through the camera, of the normal (x, y, z) in its axes, in the mixture's coordinates."""
+    for j in range(4):
+        planes[i, j] = x * motion[0, j] + y * motion[1, j] + z * motion[2, j]
 
 
 @leaf
