@@ -97,9 +97,7 @@ def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit]
         bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
         tables = spans[b], table[b], table_int[b]
         for first, last in itertools.pairwise(rows):
-            scans.append(
-                (z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, runs[b])
-            )
+            scans.append((z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, runs[b]))
         joins.append((width, fy, cy, slope, bins[0], limits, *tables))
     each(scan_rows, scans)
     joined = each(join_rows, joins)
