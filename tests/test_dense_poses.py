@@ -112,7 +112,7 @@ def test_wrong_poses_are_corrected_and_what_remains_is_stated():
 
 
 def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
-    """The usual errors are known here, and the camera: 8 mm of some 10 cm between the nearest views. Half is the present view's."""
+    """The usual errors are known here, and the camera: 8 mm of some 10 cm between the nearest views."""
     sizes = []
     for seed in range(40):
         rng, errors, error = np.random.default_rng(seed), PoseErrors(3, 0.8), np.zeros((3, 10))
