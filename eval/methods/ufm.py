@@ -264,11 +264,8 @@ class UfM(StatefulModule):
         return s2
 
     def _streams(self, frame: FrameInput) -> tuple[list[Cloud], dict[str, Tensor]]:
-        """The clouds and the rest of the state, fresh at the start.
-
-        Raises:
-            ValueError: the frame has another number of streams or lies on another device.
-        """
+        """The clouds and the rest of the state, fresh at the start. Raises ValueError: the frame has another number of
+        streams or lies on another device."""
         streams, device, held = frame.depth.shape[0], frame.depth.device, len(self.points)
         if held == 0:
             fresh = _empty(streams, self.moments.dtype, device)
