@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numba import njit
 from numpy.typing import NDArray
+
+from ufmstar_torch.kernels.compile_cpu import kept
 
 Array = NDArray[Any]
 Taps = tuple[Array, Array]
 _PULSES = 256  # rows at a time: memory
-compiled: Any = njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+compiled = kept(fastmath={"contract"})
 
 
 def resample(

@@ -16,22 +16,24 @@ THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
 KERNELS = Path(__file__).resolve().parents[1] / "ufmstar_torch" / "kernels"
 MAX_WORKERS = 4  # each takes up to 3 GB
 COMPILE = """
+import gc, sys
 import torch
 from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch.eval.engine.warm_up import metrics, preprocessing
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.models import Preprocess
-Preprocess(size=(8, 8)).apply_image(torch.zeros(1, 3, 16, 16, dtype=torch.uint8))
-for dtype in (torch.float32, torch.float64):
-    depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
-    K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
-    SequenceMetrics().update(depth, depth, depth)
-    ufm = UfMStar(UfMStarConfig(backend="numba", merge=1.0, merge_every=1))
-    for _ in range(2):
-        ufm(depth, pose, K)
+gc.disable()
+dtype = getattr(torch, sys.argv[1])
+depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
+K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+ufm = UfMStar(UfMStarConfig(backend="numba", merge=1.0, merge_every=1))
+for _ in range(2):
+    ufm(depth, pose, K)
+preprocessing()
+SequenceMetrics().update(depth, depth, depth)
 """
 
 
-COMPILER: pytest.StashKey[subprocess.Popen[bytes]] = pytest.StashKey()
+COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
 
 settings.register_profile("fast", deadline=None, max_examples=25)
 settings.register_profile("thorough", deadline=None, max_examples=150, print_blob=True)
@@ -41,13 +43,13 @@ settings.load_profile("fast")  # --hypothesis-profile=thorough loads the other o
 def pytest_configure(config: pytest.Config) -> None:
     """Start to compile the kernels while the workers of pytest-xdist collect the tests."""
     if config.getoption("tx", None) and not config.option.collectonly and not _compiled():
-        config.stash[COMPILER] = subprocess.Popen([sys.executable, "-c", COMPILE])
+        dtypes = ("float32", "float64")
+        config.stash[COMPILERS] = [subprocess.Popen([sys.executable, "-c", COMPILE, dtype]) for dtype in dtypes]
 
 
 def pytest_xdist_node_collection_finished(node) -> None:
     """No test starts before the kernels are compiled: numba's cache is shared by the workers."""
-    compiler = node.config.stash.get(COMPILER, None)
-    if compiler is not None:
+    for compiler in node.config.stash.get(COMPILERS, []):
         compiler.wait()
 
 
@@ -96,3 +98,11 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_examples(out, *KITCHEN, ENSEMBLE)
     assert write_report(out).undrawn == {}
     return out
+
+
+@pytest.fixture(scope="session")
+def results(evaluation: Path):
+    """The results of :func:`evaluation`, with sums."""
+    from ufmstar_torch.eval.report.data import load_results
+
+    return load_results(evaluation)

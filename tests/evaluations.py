@@ -35,7 +35,7 @@ def rows_of(*names: str) -> list[Row]:
 # The evaluation that all tests of the report share (``out`` in conftest.py).
 ENSEMBLE = rows_of("Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble")
 SCENES = [("scannet", f"scene000{i}_00") for i in range(5)]
-KITCHEN = ("7-scenes", "kitchen&_50% $a$ <b>")
+KITCHEN = ("7-scenes", r"kitchen&_50% $a$ \frac{ ^$ <b>")
 LATER = ("scannet", "scene0009_00")
 HOSTILE = "<script>alert('x')</script>&\"amp;"
 TITLE = f"Title $x$ {HOSTILE}"

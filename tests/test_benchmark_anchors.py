@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from ufmstar_torch import UfMStarConfig, cli
+from ufmstar_torch import cli
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench import benchmark
-from ufmstar_torch.eval.bench.anchors import PARTS, TrackedTour, measure_anchors, measure_tracker
-from ufmstar_torch.eval.bench.frames import RenderedRoom
+from ufmstar_torch.eval.bench.anchors import PARTS, TrackedTour, measure_tracker
 from ufmstar_torch.eval.bench.text import format_report
 from ufmstar_torch.eval.bench.timing import pinned_threads
 from ufmstar_torch.eval.commands import bench_command
@@ -139,10 +138,6 @@ def test_the_report_in_words(report):
 def test_impossible_numbers(capsys):
     assert cli.main(["bench", "--anchors", "0", "--skip-compile"]) == 2
     assert "--anchors must be at least 1" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="points must be at least 1"):
-        measure_anchors(
-            RenderedRoom(), UfMStarConfig(), points=0, frames=1, history=1, in_view=1, step_size=48, tour=SMALL
-        )
     with pytest.raises(ValueError, match="the path has 400"):
         SMALL.frames(401)
 

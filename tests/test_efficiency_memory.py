@@ -9,7 +9,7 @@ import torch
 from efficiency_cases import network
 from onnx_files import small_network, write_fastdepth
 
-from ufmstar_torch.eval.bench.memory import NetworkMemory, overhead_percent, weight_bytes
+from ufmstar_torch.eval.bench.memory import overhead_percent, weight_bytes
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, depth_alone, timed_networks
 from ufmstar_torch.eval.bench.race import MultiviewStep, NetworkInput
 from ufmstar_torch.eval.methods.method import Method
@@ -46,12 +46,6 @@ def test_100k_points_of_ufm_are_4_megabytes_and_the_smoothing_map_a_fifth():
     assert star["bytes_end"] == 64 * star["count_end"] > 0
 
 
-@pytest.mark.parametrize(("u", "d"), [(-1, 2), (1, -2), (0, 0)])
-def test_overhead_needs_amounts(u, d):
-    with pytest.raises(ValueError, match="must be amounts"):
-        overhead_percent(u, d)
-
-
 def test_fastdepth_has_the_papers_weights():
     full = FastDepth()
     assert f"{sum(p.nbytes for p in full.parameters()) / 1e6:.1f}" == "15.8"
@@ -75,16 +69,13 @@ def test_ten_members_are_90_percent():
     members = [network(offset=0.1 * n) for n in range(10)]
     memory = TimedNetwork("ensemble", members, "Linear").memory()
     head = weight_bytes(members[0].head)
-    assert memory == NetworkMemory(8, 9 * 8 + 10 * head)  # the backbone has two weights
-    equal = NetworkMemory.of([FastDepth(norm=False) for _ in range(3)], FastDepth(norm=False))
-    assert overhead_percent(equal.uncertainty, equal.depth) == pytest.approx(200 / 3)
+    assert memory == {"depth": 8, "uncertainty": 9 * 8 + 10 * head}  # the backbone has two weights
+    assert overhead_percent(9, 1) == pytest.approx(90)
 
 
 def test_shared_tensors_count_once():
     one = network()
     assert weight_bytes(one, one, one.backbone) == weight_bytes(one)
-    with pytest.raises(ValueError, match="less than"):
-        NetworkMemory.of([one.head], one)
 
 
 def fast_depth(method, dropout=0.0):
@@ -101,8 +92,8 @@ def test_a_batch_ensemble_adds_its_factors_and_the_head():
     plain = fast_depth("aleatoric")
     head = plain.head.weight.nbytes  # its bias is among the members' biases
     memory = one.memory()
-    assert memory.depth == weight_bytes(plain.backbone)
-    assert memory.uncertainty == factors + biases + head
+    assert memory["depth"] == weight_bytes(plain.backbone)
+    assert memory["uncertainty"] == factors + biases + head
     x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
     torch.testing.assert_close(one.predict(DEPTH, x, K).depth, one.predict(ONCE, x, K).depth, rtol=1e-4, atol=1e-4)
 
@@ -111,7 +102,7 @@ def test_mc_dropout_adds_a_head_and_depth_alone_does_not_sample():
     sampling = MonteCarloDropout(fast_depth("aleatoric", dropout=0.2))
     one = TimedNetwork("mc_dropout", [sampling], "FastDepth", samples=3)
     x, K = torch.rand(1, 3, 64, 64), torch.eye(3)[None]
-    assert one.memory().uncertainty == weight_bytes(sampling.network.head)
+    assert one.memory()["uncertainty"] == weight_bytes(sampling.network.head)
     assert torch.equal(one.predict(DEPTH, x, K).depth, one.predict(DEPTH, x, K).depth)
     assert not torch.equal(one.predict(ONCE, x, K).depth, one.predict(ONCE, x, K).depth)
     assert one.predict(EVERY, x, K).epistemic_variance.max() > 0
@@ -124,7 +115,7 @@ def test_a_graph_of_onnx_runtime_is_depth_alone_and_weighs_what_its_file_does(tm
     timed = TimedNetwork("depth_only", [network], "FastDepth")
     assert timed.depth is network
     assert timed.why_whole is None
-    assert timed.memory() == NetworkMemory(path.stat().st_size, 0)
+    assert timed.memory() == {"depth": path.stat().st_size, "uncertainty": 0}
 
 
 def test_depth_alone_is_the_same_depth_from_a_copy():
@@ -136,11 +127,11 @@ def test_depth_alone_is_the_same_depth_from_a_copy():
     assert prediction.aleatoric_variance is None
     assert not {p.data_ptr() for p in alone.parameters()} & {p.data_ptr() for p in whole.parameters()}
     lazy = LazyMember(lambda: whole, whole.preprocess)
-    assert TimedNetwork("evidential", [lazy], "FastDepth").memory().uncertainty == weight_bytes(whole.head)
+    assert TimedNetwork("evidential", [lazy], "FastDepth").memory()["uncertainty"] == weight_bytes(whole.head)
 
 
 def test_a_depth_only_row_is_not_charged_for_a_head_that_it_ignores():
-    assert TimedNetwork("depth_only", [network()], "Linear").memory().uncertainty == 0
+    assert TimedNetwork("depth_only", [network()], "Linear").memory()["uncertainty"] == 0
 
 
 def test_networks_are_checked():

@@ -8,6 +8,7 @@ import threading
 import warnings
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -33,7 +34,9 @@ def pairs_of(previous, current, config, stream: int):
     """The compiled list of one stream's pairs: c, k and beta."""
     fields = [v[stream].numpy() for m in (previous, current) for v in (m.mean, m.covariance, m.weight)]
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, gaussian.PIXEL_VARIANCE)
-    return map(torch.from_numpy, correspond_cpu.matches(*fields, K.numpy(), *SIZE, *thresholds))
+    return map(
+        torch.from_numpy, correspond_cpu.matches(np.arange(previous.capacity), *fields, K.numpy(), *SIZE, *thresholds)
+    )
 
 
 @given(st.integers(0, 10**6), st.floats(0.05, 1.0), st.floats(0.05, 1.0))

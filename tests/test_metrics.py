@@ -27,7 +27,6 @@ from ufmstar_torch.eval.metrics import (
 )
 from ufmstar_torch.eval.metrics.base import SumMetric
 from ufmstar_torch.eval.metrics.calibration import interval_confidence
-from ufmstar_torch.eval.metrics.sequence import over_sequences
 
 
 class TestAgainstIndependentImplementations:
@@ -363,11 +362,6 @@ class TestSequence:
         rng = np.random.default_rng(0)
         hits = [abs(m - 1.0) <= h for m, h in (mean_and_ci(rng.normal(1.0, 2.0, 6)) for _ in range(2000))]
         assert np.mean(hits) == pytest.approx(0.95, abs=0.02)
-
-    def test_over_sequences(self) -> None:
-        got = over_sequences([{"a": 1.0, "b": 2.0}, {"a": 3.0}])
-        assert got["a"] == mean_and_ci([1.0, 3.0])
-        assert got["b"][0] == 2.0
 
 
 class TestErrors:

@@ -18,7 +18,6 @@ from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
-from ufmstar_torch.eval.report.figures import write_figures
 from ufmstar_torch.eval.report.figures_calibration import (
     MOST_SEQUENCES,
     chosen_sequences,
@@ -28,6 +27,7 @@ from ufmstar_torch.eval.report.figures_calibration import (
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
 from ufmstar_torch.eval.report.figures_error import ONE_METRE, density, draw_entropy, draw_error, entropy_range
 from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
+from ufmstar_torch.eval.report.means import difference, mean_of
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.style import (
     label_ends,
@@ -37,7 +37,7 @@ from ufmstar_torch.eval.report.style import (
     spread_apart,
     style_of,
 )
-from ufmstar_torch.eval.report.sweeps import Point, change, level, points, sweeps
+from ufmstar_torch.eval.report.sweeps import Point, sweep_lines, sweeps
 from ufmstar_torch.eval.report.write import write_report
 
 ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")
@@ -180,21 +180,24 @@ def swept() -> Results:
     return in_memory({(row, ("d", s)): {"nll": levels[s] + values[row], "ece_delta": 0.1} for row, s in pairs})
 
 
+def points_of(results: Results) -> tuple[Point, ...]:
+    """Of plain UfM* over the rotation noise."""
+    lines = sweep_lines(results, "ensemble", "rotation_noise")
+    return next(line.points for line in lines if line.method == UFM_STAR.method and not line.rest)
+
+
 class TestSweeps:
     def test_points_rise_and_seeds_are_averaged_first(self, swept):
         assert sweeps(swept) == [("ensemble", "rotation_noise")]
-        result = points(swept, UFM_STAR.method, "rotation_noise")
+        result = points_of(swept)
         assert [point.value for point in result] == [0.0, 2.0, 5.0]
         assert [len(point.rows) for point in result] == [1, 2, 1]
-        mean = level(swept, result[1], NLL)
+        mean = mean_of(result[1].records, NLL)
         assert (mean.value, mean.sequences) == (pytest.approx(5.2), 5)
         deviation = math.sqrt((4.0**2 + 1.0**2 + 5.0**2 + 1.0**2 + 1.0**2) / 4)
         assert mean.half == pytest.approx(2.7764451051977934 * deviation / math.sqrt(5))
-
-    def test_the_change_is_in_pairs(self, swept):
-        still = Point(0.0, (noisy(0.0),))
-        result = change(swept, points(swept, UFM_STAR.method, "rotation_noise")[2], still, NLL)
-        assert (result.value, result.half) == (pytest.approx(0.5), pytest.approx(0.0, abs=1e-9))
+        change = difference(result[2].records, result[0].records, NLL)
+        assert (change.value, change.half) == (pytest.approx(0.5), pytest.approx(0.0, abs=1e-9))
 
     def test_lines_bands_and_the_base_alone(self, swept):
         figure = draw_sweep(swept, "ensemble", "rotation_noise")
@@ -203,7 +206,7 @@ class TestSweeps:
         np.testing.assert_allclose(line.get_xdata(), [0, 2, 5])
         np.testing.assert_allclose(line.get_ydata(), [5.0, 5.2, 5.5])
         assert (dashed.get_linestyle(), set(dashed.get_ydata())) == ("--", {7.0})
-        half = level(swept, points(swept, UFM_STAR.method, "rotation_noise")[0], NLL).half
+        half = mean_of(points_of(swept)[0].records, NLL).half
         band = above.collections[0].get_paths()[0].vertices
         assert band[:, 1].min() == pytest.approx(5.0 - half)
         np.testing.assert_allclose(drawn(below)["UfM*-Ensemble"].get_ydata(), [0, 0.2, 0.5], atol=1e-12)
@@ -311,12 +314,4 @@ def test_the_files_say_what_they_are(tmp_path):
     assert {f"figures/{kind}.png" for kind in kinds} <= names
     assert all((out / name).stat().st_size > 1000 for name in names if name.endswith(".png"))
     with pytest.raises(ValueError, match="figures must be svg or png, got 'jpg'"):
-        write_figures(in_memory({}), "jpg", {})
-
-
-@pytest.mark.parametrize("name", ["a$b$c", "$", r"\frac{$x$", "50% _ ^ {"])
-def test_names_of_folders_are_no_formulas(tmp_path, name):
-    out = write_evaluation(tmp_path / "o", ROWS[:1] + ROWS[2:3], [(name.replace("/", ""), name)], suite="own")
-    report = write_report(out)
-    assert report.undrawn == {}
-    assert len([path for path in report.files if path.suffix == ".svg"]) >= 5
+        write_report(out, pictures="jpg")

@@ -17,7 +17,7 @@ from evaluations import HOSTILE, KITCHEN, LATER, TITLE, rows_of, write_evaluatio
 from ufmstar_torch import cli
 from ufmstar_torch.eval.metrics import mean_and_ci
 from ufmstar_torch.eval.report import figures as figures_module
-from ufmstar_torch.eval.report.data import Failed, Results, load_results
+from ufmstar_torch.eval.report.data import Failed, Results
 from ufmstar_torch.eval.report.findings import best_rows, caveats, compare, comparisons, headlines
 from ufmstar_torch.eval.report.page import command, write_page
 from ufmstar_torch.eval.results.record import Record
@@ -168,16 +168,8 @@ class TestFindings:
     def test_settings_of_an_ablation(self) -> None:
         results = results_of({"UfM*-Ensemble": ALONE})
         changed = tuple(
-            Record(
-                "own",
-                "d",
-                f"s{n}",
-                "FastDepth",
-                "UfM*-Ensemble",
-                {"ema_alpha": 1.0},
-                figures=figures(0.5 * n + 1.0 + 0.01 * n),
-            )
-            for n in range(5)
+            replace(record, setting={"ema_alpha": 1.0}, figures=figures(0.51 * n + 1.0))
+            for n, record in enumerate(results.records)
         )
         both = Results(results.out, results.about, (*results.records, *changed))
         (nll, *_) = (s for s in headlines(both) if s.startswith("NLL"))
@@ -197,11 +189,6 @@ class TestFindings:
         assert caveats(results_of({"Ensemble": [figures(2.0)] * 5})) == [
             "n = 5: the figures are means over 5 sequences, each counting the same."
         ]
-
-
-@pytest.fixture(scope="module")
-def results(evaluation: Path) -> Results:
-    return load_results(evaluation)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,11 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.figures import write_figures
+from ufmstar_torch.eval.report.figures import figures_of
 from ufmstar_torch.eval.report.figures_sweep import draw_sweep
+from ufmstar_torch.eval.report.means import mean_of
 from ufmstar_torch.eval.report.names import ECE_DELTA
-from ufmstar_torch.eval.report.sweeps import default_value, level, points, sweep_lines, sweeps
+from ufmstar_torch.eval.report.sweeps import default_value, sweep_lines, sweeps
 
 STAR = Method.parse("UfM*-DepthOnly")
 SEQUENCES = {"a": 0.3, "b": 0.4, "c": 0.5, "d": 0.6, "e": 0.7}  # ECE_delta of plain UfM*
@@ -88,13 +88,15 @@ def test_every_setting_that_the_suite_varies_is_swept(results):
     ],
 )
 def test_anchored_rows_are_a_line_that_goes_through_the_row_without_noise(results, name, values):
-    anchored = [line for line in sweep_lines(results, "depth_only", name) if dict(line.rest) == {"anchors": "tracked"}]
+    lines = sweep_lines(results, "depth_only", name)
+    anchored = [line for line in lines if dict(line.rest) == {"anchors": "tracked"}]
     assert [point.value for point in anchored[0].points] == pytest.approx(values)
     at_default = anchored[0].at(default_value(name))
     assert at_default.rows == (row(anchors="tracked"),)
     assert anchored[0].words == "anchored"
     # And no row of another line is among those of plain UfM*.
-    assert all(not r.setting.anchors for point in points(results, STAR, name) for r in point.rows)
+    (alone,) = (line for line in lines if line.method == STAR and not line.rest)
+    assert all(not r.setting.anchors for point in alone.points for r in point.rows)
 
 
 def test_numbers_of_anchors_begin_with_none(results):
@@ -133,7 +135,7 @@ def test_pose_noise_has_lines_of_both_and_their_difference_at_the_same_value(res
 def test_the_band_of_a_line_with_anchors_is_its_interval(results):
     axes = draw_sweep(results, "depth_only", "rotation_drift").axes[1]
     line = next(result for result in sweep_lines(results, "depth_only", "rotation_drift") if result.rest)
-    mean = level(results, line.points[0], ECE_DELTA)
+    mean = mean_of(line.points[0].records, ECE_DELTA)
     values = np.array(list(SEQUENCES.values())) / 2
     assert (mean.value, mean.sequences) == (pytest.approx(values.mean()), 5)
     assert mean.half == pytest.approx(2.7764451051977934 * values.std(ddof=1) / math.sqrt(5))
@@ -195,11 +197,6 @@ def test_nlls_beyond_measure_leave_the_others_to_be_seen():
     assert low < 0 < 1e30 < high < 1e31
 
 
-def test_the_report_draws_them(results, tmp_path):
-    rows = [r for r in suite_named("ablation-anchors").rows if not (r.setting.pose_noise or r.setting.track_noise)]
-    few = [r for r in rows if not {"anchor_half_life", "anchor_shrinkage"} & set(r.setting.to_dict())]
-    names = {path.name for path in write_figures(replace(results_of(few), out=tmp_path), "svg", {})}
-    assert {name for name in names if name.startswith("sweep")} == {
-        "sweep-depth-only-anchor-count.svg",
-        "sweep-changes-depth-only.svg",
-    }
+def test_the_report_has_them(results):
+    names = {name for name, _ in figures_of(results) if name.startswith("sweep")}
+    assert names >= {f"sweep depth_only {name}" for name in VARIED} | {"sweep changes depth_only"}

@@ -7,7 +7,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -41,7 +40,7 @@ from ufmstar_torch.eval.methods.suite import names, suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import Results, ResultsError, load_results, setting_of
 from ufmstar_torch.eval.report.efficiency import paper_efficiency_tables
-from ufmstar_torch.eval.report.means import better, difference, has_variance, mean_of, references
+from ufmstar_torch.eval.report.means import Mean, better, difference, has_variance, mean_of, references
 from ufmstar_torch.eval.report.names import ECE_DELTA, NLL, SPEARMAN, row_label
 from ufmstar_torch.eval.report.paper import paper_tables
 from ufmstar_torch.eval.report.table import (
@@ -71,14 +70,9 @@ ALONE, UFM, UFM_100K, UFM_STAR = ENSEMBLE
 T_4 = 2.7764451051977934  # 97.5 % quantile of Student's t with 4 degrees of freedom, from a table
 
 
-@pytest.fixture(scope="module")
-def out(evaluation: Path) -> Path:
-    return evaluation
-
-
-@pytest.fixture(scope="module")
-def results(out: Path) -> Results:
-    return load_results(out)
+def less(results: Results, row: Row, reference: Row) -> Mean:
+    """The paired difference in NLL."""
+    return difference(results.of(row), results.of(reference), NLL)
 
 
 class TestMainTable:
@@ -105,7 +99,7 @@ class TestMainTable:
         four = in_memory({(row, ("d", s)): {"nll": ord(s) / 9} for row in (ALONE, UFM_STAR) for s in "abcd"})
         assert main_table(four).notes[1] == "4 sequences, fewer than 5: no confidence intervals."
         assert all(cell.half == "" for line in main_table(four).lines for cell in line.cells)
-        assert better(difference(four, UFM_STAR, ALONE, NLL), NLL) is None
+        assert better(less(four, UFM_STAR, ALONE), NLL) is None
 
     def test_the_papers_figures_stand_beside_ours(self, results):
         cells = parsed(markdown(main_table(results)))["UfM*-Ensemble"]
@@ -141,7 +135,7 @@ class TestMainTable:
         cells = parsed(markdown(main_table(result)))
         assert cells["DepthOnly"]["NLL ↓"] == cells["DepthOnly"]["ECE_q ↓"] == "–"
         assert cells["DepthOnly"]["δ₁ ↑"] == cells["UfM*-DepthOnly"]["δ₁ ↑"] != "–"
-        assert not has_variance(result, rows[0])
+        assert not has_variance(result.of(rows[0]))
         assert list(references(result, rows[1])) == []
         assert difference_table(result).is_empty
 
@@ -174,12 +168,12 @@ class TestMarks:
 
     def test_a_table_with_a_cell_too_few_is_refused(self):
         with pytest.raises(ValueError, match="1 cells for 2 columns"):
-            Table.of("t", "", "", [Column("", "a", "a"), Column("", "b", "b")], [Line(0, "x", False, (Cell("1"),))])
+            Table("t", "", "", [Column("", "a", "a"), Column("", "b", "b")], [Line(0, "x", False, (Cell("1"),))])
 
 
 class TestLatex:
-    def test_structure(self, out):
-        for path in sorted((out / "tables").glob("*.tex")):
+    def test_structure(self, evaluation):
+        for path in sorted((evaluation / "tables").glob("*.tex")):
             for text in path.read_text().split("% needs")[1:]:
                 check_latex(text)
 
@@ -187,7 +181,7 @@ class TestLatex:
         cells = (Cell("0.96", "0.19", bold=True), Cell("0.12"), Cell())
         columns = [Column("Ours", "NLL", "NLL"), Column("Ours", "E", "E"), Column("Paper", "P", "P")]
         lines = [Line(block, "UfM*-MCD", True, cells) for block in (0, 1)]
-        text = latex(Table.of("t", "A & B", "Method", columns, lines))
+        text = latex(Table("t", "A & B", "Method", columns, lines))
         assert r"\textbf{UfM$^*$-MCD} & $\mathbf{0.96} \pm 0.19$ & $0.12$ & -- \\" in text
         assert r" & \multicolumn{2}{c}{Ours} & Paper \\" in text
         assert r"\cmidrule(lr){2-3}\cmidrule(lr){4-4}" in text
@@ -226,10 +220,10 @@ class TestTextOfUsers:
         first = (out / "tables" / "sequences-d.csv").read_text().splitlines()[1]
         assert first.startswith('"d, =HYPERLINK(1): 40 frames",Ensemble,')
 
-    def test_csv_of_a_table(self, out):
-        with (out / "tables" / "main.csv").open() as file:
+    def test_csv_of_a_table(self, evaluation):
+        with (evaluation / "tables" / "main.csv").open() as file:
             rows = {row["Method"]: row for row in csv.DictReader(file)}
-        cells = parsed((out / "tables" / "main.md").read_text())
+        cells = parsed((evaluation / "tables" / "main.md").read_text())
         for label, row in rows.items():
             value, _, half = cells[label]["NLL ↓"].partition(" ± ")
             assert (row["Ours: NLL ↓"], row["Ours: NLL ↓ ±"]) == (value, half)
@@ -244,17 +238,17 @@ class TestDifferences:
         figures = {(ALONE, ("d", s)): {"nll": v, "ece_delta": 0.2} for s, v in levels.items()}
         figures |= {(UFM_STAR, ("d", s)): {"nll": v + gains[s]} for s, v in levels.items()}
         result = in_memory(figures)
-        mean = difference(result, UFM_STAR, ALONE, NLL)
+        mean = less(result, UFM_STAR, ALONE)
         assert (mean.value, mean.sequences) == (pytest.approx(-0.5), 5)
         assert mean.half == pytest.approx(T_4 * 0.05 * math.sqrt(2.5) / math.sqrt(5))
         assert mean_of(result.of(ALONE), NLL).half == pytest.approx(T_4 * 2 * math.sqrt(2.5) / math.sqrt(5))
         assert better(mean, NLL) is True
         assert better(mean, SPEARMAN) is False  # there, more is better
-        assert better(difference(result, ALONE, UFM_STAR, NLL), NLL) is False
+        assert better(less(result, ALONE, UFM_STAR), NLL) is False
 
     def test_on_common_sequences_only(self):
         figures = {(ALONE, ("d", s)): {"nll": 1.0} for s in "ab"} | {(UFM, ("d", s)): {"nll": 3.0} for s in "bc"}
-        mean = difference(in_memory(figures), UFM, ALONE, NLL)
+        mean = less(in_memory(figures), UFM, ALONE)
         assert (mean.value, mean.sequences) == (2.0, 1)
         assert math.isnan(mean.half)
         assert better(mean, NLL) is None  # one sequence says nothing about others
@@ -262,7 +256,7 @@ class TestDifferences:
     def test_within_the_interval_is_neither_better_nor_worse(self):
         figures = {(ALONE, ("d", s)): {"nll": 1.0} for s in "abcde"}
         figures |= {(UFM, ("d", s)): {"nll": v} for s, v in zip("abcde", (0.0, 2.0, 1.3, 0.5, 1.8), strict=True)}
-        assert better(difference(in_memory(figures), UFM, ALONE, NLL), NLL) is None
+        assert better(less(in_memory(figures), UFM, ALONE), NLL) is None
 
     def test_the_table(self):
         figures = {(ALONE, ("d", s)): {"nll": n, "ece_delta": 0.1} for n, s in enumerate("abcde")}
@@ -307,7 +301,7 @@ class TestSums:
         references = {name for name in merged.curves if name.startswith("nll_by_error")}
         assert references == {"nll_by_error:Ensemble", "nll_by_error:UfM-Ensemble-100K"}
 
-    def test_the_same_bits_whoever_wrote_what(self, results, out, tmp_path):
+    def test_the_same_bits_whoever_wrote_what(self, results, evaluation, tmp_path):
         other = write_evaluation(tmp_path / "o", ENSEMBLE, [], title=TITLE, unfinished=[*SCENES, KITCHEN, LATER])
         for dataset, sequence in [KITCHEN, *reversed(SCENES)]:
             write_sequence(other, "paper-table-1", dataset, sequence, ENSEMBLE[::-1])
@@ -319,15 +313,15 @@ class TestSums:
             # As text, since the NaN of an empty bin equals nothing.
             assert repr(sorted(merged.curves.items())) == repr(sorted(results.merged[key].curves.items()))
         write_report(other, figures=False)
-        assert (other / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
-        assert (other / "tables" / "main.md").read_bytes() == (out / "tables" / "main.md").read_bytes()
+        assert (other / "results.csv").read_bytes() == (evaluation / "results.csv").read_bytes()
+        assert (other / "tables" / "main.md").read_bytes() == (evaluation / "tables" / "main.md").read_bytes()
 
 
 class TestTidy:
-    def test_a_line_for_each_figure(self, results, out):
-        with (out / "results.csv").open() as file:
+    def test_a_line_for_each_figure(self, results, evaluation):
+        with (evaluation / "results.csv").open() as file:
             lines = list(csv.DictReader(file))
-        stored = json.loads((out / "results.json").read_text())
+        stored = json.loads((evaluation / "results.json").read_text())
         assert len(lines) == len(stored["lines"])
         for record in results.records:
             mine = [line for line in lines if (line["method"], line["sequence"]) == (record.method, record.sequence)]
@@ -431,7 +425,8 @@ class TestLoading:
 
 
 class TestCommand:
-    def test_prints_the_main_table_and_what_it_wrote(self, out, capsys):
+    def test_prints_the_main_table_and_what_it_wrote(self, evaluation, capsys):
+        out = evaluation
         assert cli.main(["report", str(out), "--no-figures"]) == 0
         printed = capsys.readouterr().out
         assert parsed(printed)["UfM*-Ensemble"]["paper: NLL"] == "0.96 ± 0.19"

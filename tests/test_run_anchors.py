@@ -17,7 +17,7 @@ from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.commands.run_job import job_from
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.report.outputs import Finished
-from ufmstar_torch.eval.report.panels import fit_scales, map_columns
+from ufmstar_torch.eval.report.panels import map_columns
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.results.folder import FolderError
@@ -267,7 +267,7 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
         for key in ("posterior_depth", "posterior_variance"):
             np.testing.assert_array_equal(one[key], other[key])
     panel = Finished(whole, tour, records(whole), with_error=True).panel(7)
-    labels = [column.label for column in map_columns(fit_scales([panel]), with_error=True, with_posterior=True)]
+    labels = [column.label for column in map_columns([panel])]
     assert labels == ["depth", "posterior", "σ", "|error|", "σ, posterior", "|error|, posterior"]
     assert np.nanmean(panel.posterior_error) < 0.7 * np.nanmean(panel.error)
 
@@ -278,12 +278,11 @@ def test_pictures_have_a_column_for_what_anchors_add(tour, finished, tmp_path):
     stored = read_frame(out / "frames" / f"{tour.names[7]}.npz")
     np.testing.assert_array_equal(panel.anchored, np.sqrt(stored["anchored"]))
     assert panel.note == f"K = {done[7]['components']}, {done[7]['anchors']['used']} anchors"
-    scales = fit_scales([panel])
     plain = dataclasses.replace(panel, anchored=None)
-    labels = [column.label for column in map_columns(scales, with_error=True, with_anchored=True)]
-    assert labels == ["depth", "σ", "√B", "|error|"]
+    columns, fewer = map_columns([panel]), map_columns([plain])
+    assert [column.label for column in columns] == ["depth", "σ", "√B", "|error|"]
     width = panel.depth.shape[1] * 240 / panel.depth.shape[0]
-    gained = preview_frame(panel, scales).shape[1] - preview_frame(plain, scales).shape[1]
+    gained = preview_frame(panel, columns).shape[1] - preview_frame(plain, fewer).shape[1]
     assert abs(gained - width) < 8
 
 

@@ -16,7 +16,7 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.spill import MEMORY
 from ufmstar_torch.spill_index import CELL, Page, PageIndex, View
-from ufmstar_torch.spill_store import Folder
+from ufmstar_torch.spill_store import VERSION, Folder
 
 FRAMES, LIMIT = 36, 60
 
@@ -52,6 +52,13 @@ def rows(ufm: UfMStar) -> torch.Tensor:
     n = int(state.mixture.components)
     table = torch.cat([v[0, :n].double().reshape(n, -1) for v in state.mixture.tensors().values()], 1)
     return torch.tensor(sorted(table.tolist()))
+
+
+def changes_of(folder) -> list[dict]:
+    """The lines of the journal behind its first, which has the version."""
+    head, *lines = (folder / "pages.jsonl").read_text().splitlines()
+    assert json.loads(head) == {"version": VERSION}
+    return [json.loads(line) for line in lines]
 
 
 @pytest.mark.parametrize("kind", ["folder", "memory"])
@@ -117,7 +124,7 @@ def test_a_reset_begins_anew(tmp_path):
     ufm, _, _ = walk(config, 0, 24)
     ufm.reset()
     ufm, _, _ = walk(config, 0, 3, ufm)
-    changes = [json.loads(line) for line in (tmp_path / "pages.jsonl").read_text().splitlines()]
+    changes = changes_of(tmp_path)
     assert all(change["frames"] <= 3 for change in changes), "the old journal is gone"
     fresh, _, _ = walk(UfMStarConfig(), 0, 3)
     assert torch.equal(rows(ufm), rows(fresh))
@@ -125,7 +132,7 @@ def test_a_reset_begins_anew(tmp_path):
 
 def test_files_are_named_by_their_content_and_the_journal_keeps_what_changed(tmp_path):
     ufm, _, _ = walk(UfMStarConfig(max_components=LIMIT, spill=str(tmp_path)), 0, 30)
-    changes = [json.loads(line) for line in (tmp_path / "pages.jsonl").read_text().splitlines()]
+    changes = changes_of(tmp_path)
     frames = [change["frames"] for change in changes]
     assert frames == sorted(set(frames))
     assert frames[-1] <= 30
@@ -152,6 +159,37 @@ def test_what_a_killed_process_left_of_a_line_does_not_count(tmp_path):
     fresh = UfMStar(config, dtype=torch.float64)
     fresh.load_state_dict(again.state_dict())
     assert torch.equal(rows(fresh), rows(plain)), "the journal can be read to its end"
+
+
+def test_a_journal_of_this_version_without_its_first_line_is_read(tmp_path):
+    config = UfMStarConfig(max_components=LIMIT, spill=str(tmp_path))
+    ufm, _, _ = walk(config, 0, 24)
+    journal = tmp_path / "pages.jsonl"
+    journal.write_text("".join(line + "\n" for line in journal.read_text().splitlines()[1:]))
+    again = UfMStar(config, dtype=torch.float64)
+    again.load_state_dict(ufm.state_dict())
+    assert torch.equal(rows(again), rows(ufm))
+
+
+@pytest.mark.parametrize(("name", "text"), [("pages-000000000007.json", "[]"), ("pages.jsonl", '{"version": 1}\n')])
+def test_a_folder_of_another_version_is_an_error(name, text, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match="version 1, this release reads version 2"):
+        UfMStar(UfMStarConfig(max_components=LIMIT, spill=str(tmp_path)))(*corridor()[0])
+    assert [p.name for p in tmp_path.iterdir()] == [name], "nothing was written"
+
+
+def test_what_is_hidden_stays_out_and_changes_no_component(tmp_path):
+    """With occlusion_depth: as with everything in memory to the last bit, with fewer pages read than without."""
+    r = UfMStarConfig(occlusion_depth=1.5)
+    plain, expected, _ = walk(r)
+    ufm, maps, counts = walk(r.replace(max_components=LIMIT, spill=str(tmp_path)))
+    assert torch.equal(rows(ufm), rows(plain)), "to the last bit"
+    for ours, theirs in zip(maps, expected, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-7, equal_nan=True)
+    paper, _, more = walk(UfMStarConfig(max_components=LIMIT, spill=MEMORY))
+    print(ufm.spilled, paper.spilled, sum(counts), sum(more))
+    assert ufm.spilled.read < paper.spilled.read
 
 
 @pytest.mark.parametrize("values", [{"spill": "x"}, {"spill": "", "max_components": 5}])

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from random_gaussians import mixture
 
 import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Anchors
 from ufmstar_torch.frame import FrameMaps, check_values
-from ufmstar_torch.kernels import check_cpu, threads_cpu
+from ufmstar_torch.kernels import check_cpu, reach_cpu, rigid_cpu, step_cpu, threads_cpu
+from ufmstar_torch.kernels.regress_cull_cpu import in_view
 
 pytestmark = pytest.mark.numerics
 
@@ -26,6 +29,7 @@ CONFIGS = {
         segment=SMALL, features=2, max_components=12, initial_capacity=3, unmeasured="nan", aleatoric_in_moments=True
     ),
     "anchored": UfMStarConfig(segment=SMALL, anchored=True, unmeasured="prior", prior_mean=0.2),
+    "hidden": UfMStarConfig(segment=SMALL, occlusion_depth=1.0),
 }
 
 
@@ -117,6 +121,43 @@ def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(name, m
                 assert_same(ufm(depth[s : s + 1], pose[s : s + 1], K, **one), outs[0], slice(s, s + 1))
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_components_out_of_reach_change_no_bit(dtype, monkeypatch):
+    """The same frames with every component looked at; on the way back, many lie behind the camera."""
+    chosen, every = (UfMStar(CONFIGS["default"], dtype=dtype) for _ in range(2))
+    given = [arguments for arguments, _ in frames(14, CONFIGS["default"], dtype)]
+    for depth, pose, intrinsics in (given[0], *given[3:], *reversed(given[3:])):
+        one = chosen(depth, pose, intrinsics)
+        with monkeypatch.context() as patch:
+            patch.setattr(step_cpu, "EPSILON", {dtype: 0.0})
+            other = every(depth, pose, intrinsics)
+        assert_same(one, other)
+    for name, value in chosen.state.tensors().items():
+        assert torch.equal(value.nan_to_num(-1), getattr(every.state, name).nan_to_num(-1)), name
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
+    m = mixture(1, 400, 7, empty=0)
+    scale = 10 ** torch.linspace(-6, 1, 400, dtype=torch.float64)[:, None, None]
+    far = (m.mean[0] - torch.tensor([0.0, 0.0, 3.0])) * 10
+    T = torch.tensor(scenes.look((0.3, -0.2, 0.1), 0.7, 0.4)).numpy()
+    slots = [v.numpy().astype(dtype) for v in (far, m.covariance[0] * scale, m.weight[0])]
+    motion, camera = rigid_cpu.relative(np.eye(4), T), K.numpy()
+    mean, covariance = np.zeros((400, 3)), np.zeros((400, 3, 3))
+    rigid_cpu.move(motion, *slots, 0, np.empty(0, np.bool_), mean, covariance)
+    everyone, weight = np.arange(400), slots[2].astype(np.float64)
+    near, occupied = reach_cpu.reached(motion, *slots, camera, SIZE, 1.0, 1e-6, 0)
+    u, v = (camera[i, i] * mean[:, i] / mean[:, 2] + camera[i, 2] for i in range(2))
+    inside = (u >= -0.5) & (u < SIZE[1] - 0.5) & (v >= -0.5) & (v < SIZE[0] - 0.5) & (mean[:, 2] > 0.05)
+    args = (mean, covariance, weight, weight, np.zeros((400, 0)), camera, *SIZE, 1.0, 0.0, 1e-6, np.float64(0))
+    summed = in_view(everyone, 400, *args)[0]
+    assert occupied == 400
+    assert set(everyone[inside]) | set(summed) <= set(near)
+    assert 20 < len(set(everyone[inside]) | set(summed)) <= len(near) < 300
+    assert np.array_equal(in_view(near, 400, *args)[0], summed)
 
 
 def test_the_state_before_is_not_modified():

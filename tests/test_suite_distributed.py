@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
+import pickle
 import subprocess
 import sys
 import threading
@@ -35,7 +35,6 @@ from ufmstar_torch.eval.results.launch import (
     run_slurm,
     tasks_of,
 )
-from ufmstar_torch.eval.results.work import EvalJob
 from ufmstar_torch.eval.results.worker import WorkerTask
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
@@ -99,12 +98,12 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
 
 
 SCRIPT = """
-import json, os, signal, sys, time
-task = json.loads(sys.stdin.read())
-folder = task["job"]["out"]
-signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{task['index']}", "w").close(), sys.exit(130)))
-open(f"{folder}/started{task['index']}", "w").write(str(os.getpid()))
-os.rename(f"{folder}/started{task['index']}", f"{folder}/pid{task['index']}")
+import os, pickle, signal, sys, time
+task = pickle.load(sys.stdin.buffer)
+folder = task.job.out
+signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{task.index}", "w").close(), sys.exit(130)))
+open(f"{folder}/started{task.index}", "w").write(str(os.getpid()))
+os.rename(f"{folder}/started{task.index}", f"{folder}/pid{task.index}")
 while True:
     time.sleep(0.02)
 """
@@ -113,7 +112,7 @@ while True:
 def scripted(tmp_path, text, stop, count=3):
     """Processes that run a script: whether all came to their end, and the lines that were reported."""
     lines: list[str] = []
-    tasks = [WorkerTask({"out": str(tmp_path)}, n + 1, count, n, "abc", 1) for n in range(count)]
+    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), n + 1, count, n, "abc", 1) for n in range(count)]
     return run_processes(tasks, stop=stop, report=lines.append, command=(sys.executable, "-c", text)), lines
 
 
@@ -141,9 +140,9 @@ def test_a_pool_whose_starter_fails_leaves_no_process(tmp_path):
 
 @pytest.mark.slow
 def test_a_pool_tells_of_a_process_that_was_killed_and_lets_the_others_finish(tmp_path):
-    text = "import json, os, sys\nif json.loads(sys.stdin.read())['index'] == 2: os.kill(os.getpid(), 9)"
+    text = "import os, pickle, sys\nif pickle.load(sys.stdin.buffer).index == 2: os.kill(os.getpid(), 9)"
     assert scripted(tmp_path, text, lambda: False) == (False, ["process 2/3 ended early (signal 9)"])
-    assert scripted(tmp_path, "import sys; sys.stdin.read()", lambda: False) == (True, [])
+    assert scripted(tmp_path, "import sys; sys.stdin.buffer.read()", lambda: False) == (True, [])
 
 
 def test_threads_are_divided_and_devices_go_round(rooms, tmp_path, monkeypatch):
@@ -158,12 +157,13 @@ def test_threads_are_divided_and_devices_go_round(rooms, tmp_path, monkeypatch):
     assert worker.device_of("cuda:1", 0) == "cuda:1"
 
 
-def test_a_job_is_the_same_after_a_way_through_json(rooms, tmp_path):
+def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
     words = ["--frames", "1::2", "--cache", str(tmp_path / "cache"), "--depth-scale", "0.5", "--samples", "3"]
     job = job_from(options_for(rooms, tmp_path / "out", *words, suite="ablation-anchors"))
-    again = EvalJob.from_dict(json.loads(json.dumps(job.to_dict())))
+    again = pickle.loads(pickle.dumps(job))
     assert again == job
     assert [item.opening for item in again.items] == [item.opening for item in job.items]
+    assert [row.setting.to_dict() for row in again.suite.rows] == [row.setting.to_dict() for row in job.suite.rows]
 
 
 def test_a_device_that_is_not_there():
@@ -290,7 +290,7 @@ def test_what_slurm_is_told():
 
 
 def test_a_job_is_queued_again_with_the_same_task():
-    job = ClusterTask(WorkerTask({"out": "x"}, 1, 2, 0, "abc"))
+    job = ClusterTask(WorkerTask(SimpleNamespace(out="x"), 1, 2, 0, "abc"))
     again = job.checkpoint()
     assert again.function == job
 
@@ -335,7 +335,7 @@ def test_jobs_that_fail_are_reported_and_stopping_cancels_all(
 ):
     cluster, lines = Submitted(*ends), []
     monkeypatch.setitem(sys.modules, "submitit", cluster)
-    tasks = [WorkerTask({"out": str(tmp_path)}, n + 1, 2, 0, "abc") for n in range(2)]
+    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), n + 1, 2, 0, "abc") for n in range(2)]
     assert run_slurm(Slurm.parse(["jobs=2"]), tasks, stop=lambda: stops, report=lines.append) == finished
     assert lines == [f"jobs 1, 2; their output is in {tmp_path}/slurm", *failed]
     assert cluster.cancelled == cancelled
@@ -354,20 +354,21 @@ def test_without_submitit_the_error_names_what_to_install(rooms, tmp_path, monke
 @pytest.mark.slow
 def test_a_worker_reads_its_task_and_its_code_is_how_it_ended(rooms, tmp_path):
     def run(out, debug=False, **changes):
-        task = WorkerTask(job_on(rooms, out, **changes).to_dict(), 1, 2, 0, "abc", 1, debug)
+        task = pickle.dumps(WorkerTask(job_on(rooms, out, **changes), 1, 2, 0, "abc", 1, debug))
         command = (sys.executable, "-P", "-m", "ufmstar_torch.eval.results.worker")
-        return subprocess.run(command, input=task.to_json(), capture_output=True, text=True, check=False)
+        ended = subprocess.run(command, input=task, capture_output=True, check=False)
+        return ended.returncode, ended.stderr.decode()
 
-    done = run(tmp_path / "out")
-    assert done.returncode == worker.DONE, done.stderr
-    assert "[1/2] rooms/ash: 4 rows, 4 frames" in done.stderr
+    code, text = run(tmp_path / "out")
+    assert code == worker.DONE, text
+    assert "[1/2] rooms/ash: 4 rows, 4 frames" in text
     assert len(kept(tmp_path / "out")) == 12
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("x")
-    refused = run(tmp_path / "home")
-    assert refused.returncode == worker.FAILED
-    assert refused.stderr.startswith("[1/2] failed: --out")
-    assert "Traceback" in run(tmp_path / "home", debug=True).stderr
+    code, text = run(tmp_path / "home")
+    assert code == worker.FAILED
+    assert text.startswith("[1/2] failed: --out")
+    assert "Traceback" in run(tmp_path / "home", debug=True)[1]
 
 
 @pytest.mark.usefixtures("no_torchrun")

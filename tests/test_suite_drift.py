@@ -14,8 +14,8 @@ from tiny_suite import row
 
 from ufmstar_torch.eval.bench.measure import measure
 from ufmstar_torch.eval.engine.anchors import anchor_sources
-from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.estimators import Estimate
+from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.engine.rows import RowRunner
@@ -193,7 +193,8 @@ def test_a_row_sees_drift_and_noise_on_top_of_it():
     for i in range(0, 20, 4):
         frame = Frame(i, str(i), None, None, WALK[i], np.eye(3))
         given = runner.begin(frame, one, None)
-        taken = runner.finish(frame, given, poses.update(one, given.of_estimator().T_world_cam), 0.0)
+        given.answer = poses.update(*given.of_estimator())
+        taken = runner.finish(frame, given)
     expected = [perturbed(T, setting, i) for T, i in zip(drifted(BOTH, range(0, 20, 4)), range(0, 20, 4), strict=True)]
     np.testing.assert_allclose(np.stack(poses.given), np.stack(expected), atol=1e-12)
     np.testing.assert_array_equal(taken.T_world_cam, poses.given[-1])

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError, open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.tour.name import open_tour
+from ufmstar_torch.eval.tour.open import open_tour
 from ufmstar_torch.models import load_trained
 from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
 from ufmstar_torch.models.inference import Inference
@@ -427,7 +427,6 @@ def test_asked_to_stop_it_stops_between_frames(networks, sequence):
         ([row("Aleatoric"), row("Aleatoric", seed=4)], {}, "different ones"),
         ([row("Ensemble"), row("Evidential")], {}, "ensemble, evidential is missing"),
         ([row("Aleatoric")], {"confident": 0.0}, "confident"),
-        ([row("UfM*-Aleatoric", overrides={"etaa": 0.5})], {}, "etaa"),
     ],
 )
 def test_what_cannot_be_judged_is_refused(networks, sequence, rows, options, told):

@@ -9,7 +9,7 @@ from layouts import truncate, write_generic
 from tiny_suite import base_network, evaluate, row, write_networks
 
 from ufmstar_torch import UfMStar
-from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
+from ufmstar_torch.eval.results.examples import ExampleWriter
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 
@@ -30,7 +30,7 @@ def sequence(tmp_path_factory):
 @pytest.fixture(scope="module")
 def folder(networks, sequence, tmp_path_factory):
     folder = tmp_path_factory.mktemp("out")
-    evaluate(sequence, ROWS, networks, sinks=[ExampleWriter(Examples(folder, frames=2))])
+    evaluate(sequence, ROWS, networks, sinks=[ExampleWriter(folder, frames=2)])
     return folder
 
 
@@ -104,7 +104,7 @@ def test_a_broken_frame_hands_its_place_to_the_next(networks, tmp_path):
     sequence = open_sequence(path)
     truncate(path / "images" / f"{sequence.names[1]}.png")
     truncate(path / "images" / f"{sequence.names[5]}.png")
-    evaluate(sequence, [row("UfM*-Aleatoric")], networks, sinks=[ExampleWriter(Examples(tmp_path / "out", frames=2))])
+    evaluate(sequence, [row("UfM*-Aleatoric")], networks, sinks=[ExampleWriter(tmp_path / "out", frames=2)])
     assert {file.name.partition(".")[0] for file in (tmp_path / "out" / "examples").glob("*[0-9].npz")} == {
         sequence.names[2],
         sequence.names[4],
@@ -114,15 +114,15 @@ def test_a_broken_frame_hands_its_place_to_the_next(networks, tmp_path):
 
 
 def test_only_what_is_asked_for(networks, sequence, tmp_path):
-    evaluate(sequence, ROWS[:1], networks, sinks=[ExampleWriter(Examples(tmp_path, frames=0, room=False))])
+    evaluate(sequence, ROWS[:1], networks, sinks=[ExampleWriter(tmp_path, frames=0, room=False)])
     assert not any(tmp_path.iterdir())
     with pytest.raises(ValueError, match="frames"):
-        Examples(tmp_path, frames=-1)
+        ExampleWriter(tmp_path, frames=-1)
 
 
 def test_maps_of_another_camera_bring_their_own(networks, sequence, tmp_path):
     both = {"aleatoric": networks["aleatoric"], "depth_only": base_network("depth_only=ground-truth:24x32")}
-    evaluate(sequence, [row("Aleatoric"), row("DepthOnly")], both, sinks=[ExampleWriter(Examples(tmp_path, frames=1))])
+    evaluate(sequence, [row("Aleatoric"), row("DepthOnly")], both, sinks=[ExampleWriter(tmp_path, frames=1)])
     name = sequence.names[2]
     other = read(tmp_path / "examples" / f"{name}@DepthOnly.npz")
     assert read(tmp_path / "examples" / f"{name}.npz")["truth"].shape == (32, 64)

@@ -18,12 +18,11 @@ from walks import SPGF, oracle_settings
 import oracle
 import scenes
 from ufmstar_torch import UfMStarConfig
-from ufmstar_torch.eval.engine.estimators import Gaussians, make_estimator, ufm_star_config
+from ufmstar_torch.eval.engine.estimators import Gaussians, ufm_star_config
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.perturb import perturbed, rotation, selects
 from ufmstar_torch.eval.methods.setting import Setting
-from ufmstar_torch.eval.methods.suite import check_row
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.models import Preprocess
 
@@ -74,14 +73,14 @@ def test_overrides_by_dotted_name():
 )
 def test_an_override_that_is_none_is_refused(name, value, told):
     with pytest.raises(ValueError, match=told) as raised:
-        ufm_star_config(row("UfM*-MCD", overrides={name: value}))
+        row("UfM*-MCD", overrides={name: value})
     assert "UfM*-MCD" in str(raised.value)
 
 
 @pytest.mark.parametrize("name", ["Ensemble", "UfM-Ensemble-100K"])
 def test_settings_of_ufm_star_go_with_it_only(name):
-    with pytest.raises(ValueError, match="with UfM\\* only"):
-        make_estimator(row(name, overrides={"eta": 0.3}), CPU)
+    with pytest.raises(ValueError, match=r"only UfM\* has"):
+        row(name, overrides={"eta": 0.3})
 
 
 def test_fixed_param_takes_the_thresholds_as_they_stand_for_224():
@@ -330,10 +329,10 @@ def test_a_in_h_is_a_row_of_its_own():
     assert one.label == "UfM*-Aleatoric (aleatoric_in_h True)"
     with pytest.raises(ValueError, match="goes without anchors, features"):
         Setting(aleatoric_in_h=True, anchors="tracked")
-    with pytest.raises(ValueError, match="row Aleatoric: aleatoric_in_h is of UfM"):
-        check_row(row("Aleatoric", aleatoric_in_h=True))
+    with pytest.raises(ValueError, match=r"row Aleatoric: only UfM\* has aleatoric_in_h"):
+        row("Aleatoric", aleatoric_in_h=True)
     with pytest.raises(ValueError, match="needs a network that predicts an aleatoric variance"):
-        check_row(row("UfM*-DepthOnly", aleatoric_in_h=True))
+        row("UfM*-DepthOnly", aleatoric_in_h=True)
 
 
 # ---- how images come to the networks ----

@@ -14,11 +14,10 @@ import pytest
 import torch
 from layouts_more import write_nyu
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, write_rooms
-from tiny_suite import evaluate
+from tiny_suite import evaluate, rows_of
 
 from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequences
-from ufmstar_torch.eval.methods.suite import rows_of
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.results.cache import CacheError
 from ufmstar_torch.eval.results.eval_folder import EvalFolder

@@ -23,12 +23,11 @@ from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_a
 from ufmstar_torch.eval.results.writers import (
     FULL,
     FrameWriter,
+    encode_length_png,
     fitting_unit,
-    read_depth_png,
     read_frame,
-    read_scale,
-    write_length_png,
 )
+from ufmstar_torch.eval.sequences.images import read_depth, read_map
 
 
 def frame(seed: int = 0, far: float = 8.0) -> dict[str, torch.Tensor]:
@@ -41,6 +40,12 @@ def frame(seed: int = 0, far: float = 8.0) -> dict[str, torch.Tensor]:
 
 def tree(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def write_length_png(path: Path, values: np.ndarray, valid: np.ndarray, unit: float, quantity: str = "depth") -> int:
+    content, saturated = encode_length_png(values, valid, unit, quantity=quantity)
+    path.write_bytes(content)
+    return saturated
 
 
 def full_disk(*_: object, **__: object) -> NoReturn:
@@ -56,43 +61,36 @@ class TestPng:
         with TemporaryDirectory() as folder:
             path = Path(folder) / "d.png"
             array = np.array([values])
-            assert write_length_png(path, array, np.ones_like(array, bool), 0.001, quantity="depth") == 0
-            got, valid = read_depth_png(path)
-            assert valid.all()
+            assert write_length_png(path, array, np.ones_like(array, bool), 0.001) == 0
+            got = read_depth(path)
+            assert (got > 0).all()
             # Half a unit, and float32's rounding of the result (4e-6 m at 65 m).
             assert np.abs(got - array).max() <= 0.0005 + 4e-6
 
     def test_counts_and_scale_are_exact(self, tmp_path: Path) -> None:
         counts = np.array([[1, 2, 32767, 32768, 65535]])
-        write_length_png(tmp_path / "d.png", counts / 256, counts > 0, 1 / 256, quantity="depth")
+        write_length_png(tmp_path / "d.png", counts / 256, counts > 0, 1 / 256)
         with Image.open(tmp_path / "d.png") as image:
             stored = np.asarray(image)
             assert image.info["depth_scale"] == "0.00390625"
             assert image.info["unit"] == "metres per count"
             assert image.info["quantity"] == "depth"
         np.testing.assert_array_equal(stored, counts)
-        np.testing.assert_array_equal(read_depth_png(tmp_path / "d.png")[0], (counts / 256).astype(np.float32))
+        np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), (counts / 256).astype(np.float32))
 
     def test_opencv_reads_the_same_counts(self, tmp_path: Path) -> None:
         import cv2
 
         values = np.linspace(0.5, 60, 300).reshape(15, 20)
-        write_length_png(tmp_path / "d.png", values, values > 0, 0.001, quantity="depth")
+        write_length_png(tmp_path / "d.png", values, values > 0, 0.001)
         counts = cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
         assert counts.dtype == np.uint16
         np.testing.assert_array_equal(counts, np.rint(values * 1000))
 
-    def test_16_bits_do_not_turn_negative(self, tmp_path: Path) -> None:
-        """16-bit depth read as int16: everything from 6.55 m on at TUM's scale became negative."""
-        Image.fromarray(np.full((2, 3), 50000, np.uint16)).save(tmp_path / "tum.png")
-        got, valid = read_depth_png(tmp_path / "tum.png", metres_per_count=1 / 5000)
-        assert valid.all()
-        np.testing.assert_array_equal(got, np.float32(10.0))
-
     def test_saturation_is_counted_and_does_not_wrap(self, tmp_path: Path) -> None:
         values = np.array([[65.535, 65.536, 70.0, 1e9, 65.5354]])
-        assert write_length_png(tmp_path / "d.png", values, values > 0, 0.001, quantity="depth") == 3
-        np.testing.assert_array_equal(read_depth_png(tmp_path / "d.png")[0], np.float32(65.535))
+        assert write_length_png(tmp_path / "d.png", values, values > 0, 0.001) == 3
+        np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), np.float32(65.535))
         with Image.open(tmp_path / "d.png") as image:
             assert image.info["saturated"] == "3"
 
@@ -100,17 +98,9 @@ class TestPng:
         values = np.array([[0.0, 1e-7, 2.0, np.nan, np.inf, -1.0, 3.0]])
         usable = np.array([[True, True, True, True, True, True, False]])
         write_length_png(tmp_path / "s.png", values, usable, 1e-4, quantity="sigma")
-        got, valid = read_depth_png(tmp_path / "s.png")
-        assert valid.tolist() == [[True, True, True, False, False, False, False]]
+        got = read_depth(tmp_path / "s.png")
+        assert (got > 0).tolist() == [[True, True, True, False, False, False, False]]
         np.testing.assert_array_equal(got[0, :3], np.float32([1e-4, 1e-4, 2.0]))
-
-    def test_a_scale_is_not_guessed(self, tmp_path: Path) -> None:
-        Image.fromarray(np.ones((2, 3), np.uint16)).save(tmp_path / "other.png")
-        with pytest.raises(ValueError, match="no depth_scale"):
-            read_depth_png(tmp_path / "other.png")
-        Image.fromarray(np.ones((2, 3), np.uint8)).save(tmp_path / "grey.png")
-        with pytest.raises(ValueError, match="16-bit"):
-            read_depth_png(tmp_path / "grey.png", metres_per_count=1.0)
 
     def test_fitting_unit(self) -> None:
         assert fitting_unit(np.array([3.0, 8.0])) == 0.001
@@ -132,20 +122,13 @@ class TestFrames:
         for name, value in maps.items():
             np.testing.assert_array_equal(back[name], value.numpy())
             assert back[name].dtype == value.numpy().dtype
-        depth, valid = read_depth_png(tmp_path / "depth" / "1305031102.175304.png")
-        sigma, sigma_valid = read_depth_png(tmp_path / "sigma" / "1305031102.175304.png")
+        depth, sigma = (read_depth(tmp_path / kind / "1305031102.175304.png") for kind in ("depth", "sigma"))
+        valid = depth > 0
         np.testing.assert_array_equal(valid, maps["valid"])
-        np.testing.assert_array_equal(sigma_valid, maps["valid"])
+        np.testing.assert_array_equal(sigma > 0, maps["valid"])
         assert np.abs(depth - maps["depth"].numpy())[valid].max() <= 0.0005 + 1e-6
         assert np.abs(sigma - maps["variance"].sqrt().numpy())[valid].max() <= 0.00005 + 1e-7
         assert (depth[~valid] == 0).all()
-
-    def test_float64_arrays_and_no_mask(self, tmp_path: Path) -> None:
-        depth = np.array([[1.0, np.nan], [0.0, 2.0]])
-        FrameWriter(tmp_path).write("a", depth=depth, variance=depth, disagreement=depth)
-        back = read_frame(tmp_path / "frames" / "a.npz")
-        assert back["depth"].dtype == np.float32
-        assert back["valid"].tolist() == [[True, False], [False, True]]
 
     def test_one_scale_for_the_whole_run_and_its_continuation(self, tmp_path: Path) -> None:
         writer = FrameWriter(tmp_path)
@@ -153,16 +136,17 @@ class TestFrames:
         lost = writer.write("b", **frame(far=2.0))
         assert lost.depth_saturated == 0
         FrameWriter(tmp_path).write("c", **frame(far=2.0))
-        assert [read_scale(tmp_path / "depth" / f"{n}.png") for n in "abc"] == [1 / 256] * 3
-        assert [read_scale(tmp_path / "sigma" / f"{n}.png") for n in "abc"] == [1 / 2560] * 3
+        for kind, unit in (("depth", 1 / 256), ("sigma", 1 / 2560)):
+            assert [read_map(tmp_path / kind / f"{n}.png", "depth")[1] for n in "abc"] == [unit] * 3
 
     def test_saturation_is_reported(self, tmp_path: Path) -> None:
-        maps = frame(far=8.0)
-        maps["valid"] = torch.ones_like(maps["valid"])
-        lost = FrameWriter(tmp_path, depth_unit=1e-4, sigma_unit=1e-5).write("a", **maps)
-        assert lost.depth_saturated == int((maps["depth"].double() > (FULL + 0.5) * 1e-4).sum()) > 0
+        writer, maps = FrameWriter(tmp_path), frame(far=100.0)
+        writer.write("near", **frame(far=8.0))
+        maps |= {"valid": torch.ones_like(maps["valid"]), "variance": 200 * maps["variance"]}
+        lost = writer.write("far", **maps)
+        assert lost.depth_saturated == int((maps["depth"].double() > (FULL + 0.5) * 1e-3).sum()) > 0
         sigma = maps["variance"].double().sqrt()
-        assert lost.sigma_saturated == int((sigma > (FULL + 0.5) * 1e-5).sum()) > 0
+        assert lost.sigma_saturated == int((sigma > (FULL + 0.5) * 1e-4).sum()) > 0
 
     def test_finished_needs_every_file(self, tmp_path: Path) -> None:
         writer = FrameWriter(tmp_path)
@@ -187,8 +171,6 @@ class TestFrames:
             writer.write("a", **{**maps, "depth": maps["depth"][None]})
         with pytest.raises(ValueError, match="valid must be a bool"):
             writer.write("a", **{**maps, "valid": maps["valid"].float()})
-        with pytest.raises(ValueError, match="depth_unit"):
-            FrameWriter(tmp_path, depth_unit=0.0)
         assert tree(tmp_path) == {}
 
 

@@ -12,7 +12,7 @@ from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import Prediction
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Entry
 from ufmstar_torch.models import NetworkSpec, build_network, save_trained
 
@@ -66,6 +66,11 @@ def base_network(text, **options):
 def row(name, **setting):
     """The row of a name, under a setting."""
     return Row(Method.parse(name), Setting(**setting))
+
+
+def rows_of(names, setting=DEFAULT):
+    """The rows of some names, under one setting."""
+    return tuple(Row(Method.parse(name), setting) for name in names)
 
 
 def evaluate(sequence, rows, networks, store=None, **options):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.report.panels import FramePanel, contact_sheet, fit_scales, map_columns
+from ufmstar_torch.eval.report.panels import FramePanel, contact_sheet, map_columns
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.data import DepthDataModule
@@ -66,7 +66,7 @@ def draw_examples(
         title: of the sheet.
     """
     panels = [_panel(network, preprocess, name, sample) for name, sample in samples]
-    columns = map_columns(fit_scales(panels), with_error=True)
+    columns = map_columns(panels)
     if not any(panel.sigma.any() for panel in panels):
         columns = [column for column in columns if column.field != "sigma"]
     contact_sheet(panels, path, title=title, columns=columns)

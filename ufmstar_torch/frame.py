@@ -110,11 +110,12 @@ def check_values(
 
     Args:
         maps: of B streams.
-        pose: [B, 4, 4] float64, on any device.
-        intrinsics: [B, 3, 3] float64 [px], on any device.
+        pose: [B, 4, 4], or [1, 4, 4] or [4, 4] for all streams, of any floating dtype, on any device.
+        intrinsics: likewise [B, 3, 3] and so on [px].
         rotation_tolerance, max_depth: as :func:`check_frame`.
     """
     plain, device = maps.depth, maps.depth.device
+    pose, intrinsics = (of_streams(camera, len(plain)) for camera in (pose, intrinsics))
     deviation = rotation_deviation(pose[..., :3, :3])
     faults = pose_fault(pose, deviation, rotation_tolerance), intrinsics_fault(intrinsics, plain.shape[-2:])
     known = _first(*faults, torch.device("cpu")) if pose.device.type == intrinsics.device.type == "cpu" else None
@@ -170,11 +171,12 @@ def check_frame(
     if not (len(shape) == 3 or (len(shape) == 4 and shape[1] == 1)) or 0 in shape:
         raise ValueError(f"depth must be [B, H, W] or [B, 1, H, W] with no empty dimension, got {shape}")
     dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
-    plain = depth.detach().reshape(shape[0], *shape[-2:]).to(dtype)
-    shapes = [shape, tuple(plain.shape)]
+    size = (shape[0], *shape[-2:])
+    plain = _as(_constant(depth), size, dtype)
+    shapes = [shape, size]
 
     def own(name: str, value: Tensor | None) -> Tensor | None:
-        return None if value is None else require_float(name, value, shapes, depth).reshape(plain.shape).to(plain.dtype)
+        return None if value is None else _as(require_float(name, value, shapes, depth), size, dtype)
 
     a, e = own("aleatoric", aleatoric), own("epistemic", epistemic)
     extra = _features(features, feature_count, plain)
@@ -184,7 +186,7 @@ def check_frame(
     mask = None
     if valid is not None:
         either = [*shapes, (shape[0], 1, *shape[-2:])]
-        mask = require_mask("valid", valid, either, depth).reshape(plain.shape)
+        mask = _as(require_mask("valid", valid, either, depth), size, torch.bool)
     maps = FrameMaps(plain, a, e, extra, mask)
     return kernel(maps, T, K, rotation_tolerance=rotation_tolerance, max_depth=max_depth)
 
@@ -209,11 +211,11 @@ def _features(features: Tensor | None, count: int, plain: Tensor) -> Tensor | No
         if count:
             raise ValueError(f"features must be given with shape {expected}: config.features is {count}")
         return None
-    return require_float("features", features, [expected], plain).detach().to(plain.dtype)
+    return _as(_constant(require_float("features", features, [expected], plain)), expected, plain.dtype)
 
 
 def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
-    """[B, n, n] float64 on the device where it was given (a pose on the CPU is checked without waiting)."""
+    """A camera on the device where it was given (a pose on the CPU is checked without waiting)."""
     require_float(name, value)
     if value.shape[-2:] != (n, n) or value.dim() not in (2, 3):
         raise ValueError(f"{name} must be [B, {n}, {n}] or [{n}, {n}], got {tuple(value.shape)}")
@@ -221,7 +223,24 @@ def _matrix(name: str, value: Tensor, n: int, plain: Tensor) -> Tensor:
         raise ValueError(f"{name} must have depth's {plain.shape[0]} streams, got {value.shape[0]}")
     if value.device.type == "meta" and plain.device.type != "meta":
         raise ValueError(f"{name} must hold values, got a tensor on device meta")
-    return value.detach().to(torch.float64).expand(plain.shape[0], n, n)
+    return _constant(value)
+
+
+def of_streams(cameras: Tensor, streams: int) -> Tensor:
+    """[B, n, n] float64 of [B, n, n], [1, n, n] or [n, n]."""
+    return cameras.double().expand(streams, *cameras.shape[-2:])
+
+
+# A call of torch takes microseconds, several times as many after a network: none is made that changes nothing.
+def _constant(value: Tensor) -> Tensor:
+    """The tensor without its graph."""
+    return value.detach() if value.requires_grad else value
+
+
+def _as(value: Tensor, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """The tensor in a shape and dtype."""
+    value = value if value.dtype == dtype else value.to(dtype)
+    return value if value.shape == shape else value.reshape(shape)
 
 
 def _moved(value: Tensor, device: torch.device) -> Tensor:

@@ -20,6 +20,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.output import FrameStatistics, MeanUncertainty
 from ufmstar_torch.prediction import DepthPrediction, infer, stated_range
 from ufmstar_torch.recalibrate import Recalibration
+from ufmstar_torch.stateful import outliving
 from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 # image [B, 3, H, W], intrinsics [B, 3, 3] -> network image and the intrinsics of that image
@@ -405,7 +406,7 @@ class UncertainDepth(NetworksInTurn):
     def _count(self, images: int) -> None:
         """Images seen, as a number for the alternation and as a buffer for state_dict."""
         self._next = images
-        with torch.inference_mode(False):  # the buffer must outlive the caller's inference mode
+        with outliving():  # the buffer must outlive the caller's inference mode
             self.image_index = torch.full_like(self.image_index, images)
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:

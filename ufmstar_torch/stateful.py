@@ -201,7 +201,13 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[object]:
-    """Autocast off, where the device has it: it would turn products into half precision."""
-    if device.type == "meta" or not torch.amp.is_autocast_available(device.type):
+    """Autocast off, where it is on: it would turn products into half precision."""
+    kind = device.type
+    if kind == "meta" or not torch.amp.is_autocast_available(kind) or not torch.is_autocast_enabled(kind):
         return nullcontext()
-    return torch.autocast(device.type, enabled=False)
+    return torch.autocast(kind, enabled=False)
+
+
+def outliving() -> AbstractContextManager[object]:
+    """The caller's inference mode off, where it is on: a state must outlive it."""
+    return torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext()

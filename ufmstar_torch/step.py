@@ -28,6 +28,7 @@ from ufmstar_torch.disagree import with_overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
+from ufmstar_torch.occlude import hidden
 from ufmstar_torch.output import FrameStatistics, StepOutput, given
 from ufmstar_torch.regress import Regression, moving_average
 from ufmstar_torch.segment_input import SegmentInput
@@ -218,7 +219,11 @@ def step(
     mixture = state.mixture
     R_cam, t_cam = relative_pose(first, frame.T_world_cam)
     previous_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
-    pairs = kernels.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
+    candidates = previous_cam
+    if config.occlusion_depth is not None:
+        weight = previous_cam.weight.masked_fill(hidden(previous_cam, frame, config), 0)
+        candidates = previous_cam.replace(weight=weight)
+    pairs = kernels.correspond(candidates, current_cam, frame.intrinsics, frame.size, config)
     stage("correspond")
 
     if config.disagreement == "overlap":
@@ -285,7 +290,9 @@ def after_regress(
         The regression of M and the caller's features; the residual and the share that was measured, as in
         :class:`~ufmstar_torch.output.StepOutput`.
     """
-    depth = frame.depth if pixels is None else torch.gather(frame.depth.flatten(1), 1, pixels)
+    depth = frame.depth
+    if pixels is not None and config.unmeasured == "relative":  # nothing else reads it
+        depth = torch.gather(depth.flatten(1), 1, pixels)
     result, measured = unmeasured.after_regression(result, depth, config)
     result, residual = after_regression(result, stream)
     return result, residual, measured

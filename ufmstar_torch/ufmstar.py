@@ -15,7 +15,7 @@ from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, chec
 from ufmstar_torch.arguments import require_float
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.fixed_order import apply, total
+from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import (
     LateStep,
@@ -23,6 +23,7 @@ from ufmstar_torch.kernels.select import (
     select_check,
     select_merge,
     select_posterior,
+    select_sample,
     select_step,
 )
 from ufmstar_torch.merge import merged
@@ -32,10 +33,10 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
-from ufmstar_torch.regress import Regression, regress, sample_pixels
+from ufmstar_torch.regress import Regression, regress
 from ufmstar_torch.spill import Spill, Spilled
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.stateful import StatefulModule, full_precision
+from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 from ufmstar_torch.step import Step, StepObserver
 from ufmstar_torch.warm_up import warm_up
 
@@ -143,20 +144,23 @@ class UfMStar(StatefulModule):
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
         out, variance, anchored, posterior = self._observe(frame, anchors)
-        shape = depth.shape
+
+        def shaped(value: Tensor) -> Tensor:
+            return value if value.shape == depth.shape else value.reshape(depth.shape)
+
         return UfMStarOutput(
             depth=depth,
-            variance=variance.reshape(shape),
-            disagreement=out.disagreement.reshape(shape),
+            variance=shaped(variance),
+            disagreement=shaped(out.disagreement),
             aleatoric=aleatoric,
             epistemic=epistemic,
-            anchored=None if anchored is None else anchored.reshape(shape),
-            bias=None if out.residual is None else out.residual[..., 0].reshape(shape),
-            posterior_depth=None if posterior is None else posterior.depth.reshape(shape),
-            posterior_variance=None if posterior is None else posterior.variance.reshape(shape),
+            anchored=None if anchored is None else shaped(anchored),
+            bias=None if out.residual is None else shaped(out.residual[..., 0]),
+            posterior_depth=None if posterior is None else shaped(posterior.depth),
+            posterior_variance=None if posterior is None else shaped(posterior.variance),
             features=out.features,
-            measured=out.measured.reshape(shape),
-            valid=frame.valid.reshape(shape),
+            measured=shaped(out.measured),
+            valid=shaped(frame.valid),
             read_labels=out.read_labels,
             current_cam=out.current_cam,
             statistics=out.statistics,
@@ -200,19 +204,11 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
+        kernels = select_sample(self.config.backend, frame.depth.device.type)
+        index, used = kernels.pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
         out, variance, _, _ = self._observe(frame, anchors, index, average=average)
-        sampled = used.sum(1)
-        measured = ((out.measured >= unmeasured.HALF) & used).sum(1) / sampled
-        used = used & ~variance.isnan()  # not measured, with config.unmeasured = "nan"
-        count = used.sum(1)
-        value = torch.where(used, variance, torch.zeros_like(variance))
-        mean = total(value, 1) / count  # 0/0 = NaN where no pixel is valid
-        squares = total(torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)), 1)
-        # Without replacement: all pixels, no error.
-        left = 1 - sampled / out.statistics.valid_pixels.clamp_min(1)
-        error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
-        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, measured, out.statistics)
+        sample = kernels.mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
+        return MeanUncertainty(sample.mean, sample.error, sample.count, sample.measured, out.statistics)
 
     def warm_up(
         self,
@@ -334,7 +330,7 @@ class UfMStar(StatefulModule):
         """
         if keep_evidence and not self.config.anchored:
             raise ValueError("keep_evidence needs UfMStarConfig(anchored=True): nothing is learnt without")
-        with torch.inference_mode(False), torch.no_grad():  # buffers must outlive the caller's inference mode
+        with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             self._reset(streams, keep_evidence)
 
     def _reset(self, streams: Sequence[int] | Tensor | None, keep_evidence: bool) -> None:
@@ -388,7 +384,7 @@ class UfMStar(StatefulModule):
         """
         checked_anchors = self._anchors(anchors, frame)
         # Normal tensors also under the caller's inference_mode: the state must outlive it.
-        with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
+        with outliving(), torch.no_grad(), full_precision(frame.depth.device):
             state = self._state_for(frame)
             if self.config.on_bad_frame == "raise":
                 known = frame.fault if frame.known_fault is None else frame.known_fault
@@ -490,7 +486,7 @@ class UfMStar(StatefulModule):
     def _settle(self) -> None:
         """Let the state have what a step keeps for the next frame, before the state goes elsewhere."""
         if self._kept_step is not None and isinstance(self._kept_step[1], LateStep):
-            with torch.inference_mode(False), torch.no_grad():
+            with outliving(), torch.no_grad():
                 self._store(self._kept_step[1].settled(self._stored(), self.config).tensors())
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -515,16 +511,15 @@ class UfMStar(StatefulModule):
         return self.__dict__ | {"_kept_step": None}
 
     def _state_for(self, frame: FrameInput) -> UfMStarState:
-        streams, device = frame.depth.shape[0], frame.depth.device
-        if self.mean.shape[0] == 0:
-            return UfMStarState.initial(streams, self.config, self.mean.dtype, device)
-        if self.mean.shape[0] != streams:
-            raise ValueError(
-                f"depth has {streams} streams but the state holds {self.mean.shape[0]}: call reset() first"
-            )
-        if self.mean.device != device:
-            raise ValueError(f"depth lies on {device} but the state on {self.mean.device}: move one with .to()")
-        return self._stored()
+        state = self._stored()
+        streams, device, mean = len(frame.depth), frame.depth.device, state.mean
+        if len(mean) == 0:
+            return UfMStarState.initial(streams, self.config, mean.dtype, device)
+        if len(mean) != streams:
+            raise ValueError(f"depth has {streams} streams but the state holds {len(mean)}: call reset() first")
+        if mean.device != device:
+            raise ValueError(f"depth lies on {device} but the state on {mean.device}: move one with .to()")
+        return state
 
     def extra_repr(self) -> str:
         """Streams and components."""

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from ufmstar_torch.anchors.hook import Anchors
-from ufmstar_torch.kernels.select import compile_triangulation
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.kernels.select import compile_triangulation, select_beside
+from ufmstar_torch.mixture import GaussianMixture
 
 if TYPE_CHECKING:
     from ufmstar_torch.ufmstar import UfMStar
@@ -19,16 +21,35 @@ _DISTANCE = 2.0  # [m]
 _TOTAL = 3 * 7  # stages of a step, for two frames and an image average
 
 
-class _Stages:
-    """Counts the stages of the frames (``ufmstar_torch.step.StepObserver``), at whose first a stage compiles."""
+_REGRESSION = "append"  # the stage before it
 
-    def __init__(self, progress: Callable[[int, int], object]) -> None:
-        self._progress, self._done = progress, 0
+
+class _Stages:
+    """Counts the stages of the frames (``ufmstar_torch.step.StepObserver``), at whose first a stage compiles.
+
+    Args:
+        progress: see :func:`warm_up`.
+        total: steps to report at most, whatever a step counts as a stage.
+        before_regression: called before every regression.
+    """
+
+    def __init__(
+        self, progress: Callable[[int, int], object], total: int, before_regression: Callable[[], object]
+    ) -> None:
+        self._progress, self._total, self._before_regression = progress, total, before_regression
+        self._done = -1
+        self.step()
+
+    def step(self) -> None:
+        """One more is done."""
+        self._done += 1
+        self._progress(min(self._done, self._total), self._total)
 
     def stage(self, name: str) -> None:
-        """One more is done; at most ``_TOTAL`` are reported, whatever a step counts as a stage."""
-        self._done += 1
-        self._progress(min(self._done, _TOTAL), _TOTAL)
+        """A stage has ended."""
+        self.step()
+        if name == _REGRESSION:
+            self._before_regression()
 
     def kernel(self, name: str) -> AbstractContextManager[object]:
         """Nothing is counted within a stage."""
@@ -36,9 +57,21 @@ class _Stages:
 
 
 def warm_up(
-    module: UfMStar, size: tuple[int, int], streams: int, progress: Callable[[int, int], object] | None = None
+    module: UfMStar,
+    size: tuple[int, int],
+    streams: int,
+    progress: Callable[[int, int], object] | None = None,
+    also: Sequence[Callable[[], object]] = (),
 ) -> None:
     """Take a module through two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
+
+    On a machine's very first call the regression and ``also`` are compiled in a process beside this one, where there
+    are two cores.
+
+    Args:
+        module: without frames so far; it is changed.
+        size, streams, progress: see there.
+        also: functions of modules, which call further kernels that the caller will need.
 
     Raises:
         ValueError: a size or number of streams that is not positive.
@@ -47,21 +80,45 @@ def warm_up(
     if min(height, width, streams) < 1:
         raise ValueError(f"size and streams must be positive, got {size} and {streams}")
     config, device = module.config, module.mean.device
-    if progress is not None:
-        progress(0, _TOTAL)
-        module.observer = _Stages(progress)
     distance = min(_DISTANCE, config.segment.depth_limit)
     depth = torch.full((streams, height, width), distance, device=device)
     pose = torch.eye(4)
-    K = torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
+    K = _camera(height, width)
     features = depth.new_zeros(streams, config.features, height, width) if config.features else None
     corner = depth[:, 0, :1]
     anchors = None
     if config.anchored:
         anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
-        compile_triangulation()
-    with warnings.catch_warnings():
+    jobs: list[tuple[str, str, dict[str, Any]]] = [(__name__, "regression", {"kind": config.regression})]
+    jobs += [(function.__module__, function.__qualname__, {}) for function in also]
+    with warnings.catch_warnings(), select_beside(config.backend, device.type, jobs) as wait:
         warnings.simplefilter("ignore", UserWarning)  # a small image has no segment
+        stages = _Stages(progress or _unseen, _TOTAL + len(also), wait)
+        module.observer = stages
         for _ in range(2):  # the fusion meets a mixture from the second on
             module(depth, pose, K, features=features, anchors=anchors)
         module.mean_uncertainty(depth, pose, K, features=features, pixels=1)
+        if config.anchored:
+            compile_triangulation()
+        for function in also:
+            function()
+            stages.step()
+
+
+def regression(kind: str) -> None:
+    """Compile the regression of single-precision maps, and at some pixels, on the CPU; ``kind`` as
+    ``config.regression``."""
+    from ufmstar_torch.kernels.regress_cpu import regress_maps
+
+    mixture = GaussianMixture.empty(1, 1, dtype=torch.float64, device="cpu")
+    depth = torch.full((1, 8, 8), _DISTANCE)
+    for pixels in (None, torch.zeros(1, 1, dtype=torch.int64)):
+        regress_maps(mixture, depth, _camera(8, 8)[None], UfMStarConfig(regression=kind), pixels)
+
+
+def _camera(height: int, width: int) -> torch.Tensor:
+    return torch.tensor([[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]])
+
+
+def _unseen(done: int, total: int) -> None:
+    """Nobody follows the progress."""

@@ -69,7 +69,7 @@ def measure_anchors(
     history: int,
     in_view: int,
     step_size: int,
-    tour: TrackedTour | None = None,
+    tour: TrackedTour = TrackedTour(),
 ) -> dict[str, Any]:
     """Time the tracker and the anchored step with ``points`` corners, on one thread of torch, numba and OpenCV.
 
@@ -80,18 +80,15 @@ def measure_anchors(
         frames: timed.
         history, in_view: as :func:`~ufmstar_torch.eval.bench.step.build_up` takes them.
         step_size: of the step's depth maps [px].
-        tour: images of the tracker; None = the standard ones.
+        tour: images of the tracker.
 
     Returns:
         "tracker" (see :func:`measure_tracker`), "step" (see :func:`measure_anchored_step`) and the settings.
 
     Raises:
-        ValueError: ``points`` is not positive, or too few frames.
+        ValueError: too few frames.
         ModuleNotFoundError: OpenCV is not installed.
     """
-    if points < 1:
-        raise ValueError(f"points must be at least 1, got {points}")
-    tour = TrackedTour() if tour is None else tour
     rounds = _STEP_WARM_UP + frames
     with pinned_threads(1, opencv=True):
         tracker = measure_tracker(tour.frames(_TRACKER_WARM_UP + frames), points)
@@ -103,11 +100,8 @@ def measure_anchors(
 
 
 def measure_tracker(frames: Sequence[Frame], points: int) -> dict[str, Any]:
-    """Two trackers follow the same images in turn: one is timed as a whole, the other part by part.
-
-    Args:
-        frames: with images; the first 12 are not counted.
-        points: corners to follow on average.
+    """Two trackers follow the same images in turn: one is timed as a whole, the other part by part; the first 12 frames
+    are not counted.
 
     Returns:
         "update" and "parts": times [ms]; "refills": the share of frames in which new corners were taken;
@@ -217,7 +211,11 @@ def _spread(times: CallTimes, name: str) -> dict[str, float | int]:
     """Median, 90th percentile, mean and minimum of wall-clock and processor times [ms], and their count."""
     figures: dict[str, float | int] = {"count": len(times.wall[name])}
     for prefix, values in (("", times.wall[name]), ("cpu_", times.cpu[name])):
-        median, p90 = (float(q) for q in np.percentile(np.asarray(values, np.float64), (50, 90)))
-        figures |= {f"{prefix}median_ms": median, f"{prefix}p90_ms": p90}
-        figures |= {f"{prefix}mean_ms": float(np.mean(values)), f"{prefix}min_ms": float(min(values))}
+        of: dict[str, Any] = {
+            "median": np.median(values),
+            "p90": np.percentile(values, 90),
+            "mean": np.mean(values),
+            "min": min(values),
+        }
+        figures |= {f"{prefix}{key}_ms": float(value) for key, value in of.items()}
     return figures

@@ -20,7 +20,6 @@ from ufmstar_torch.eval.engine.clock import spread
 
 FRAMES = "UFMSTAR_BENCH_FRAMES"
 _RUNS = 3
-_SAME = ("cpu", "cores", "machine")
 
 
 def measure_peer(command: str, frames: Iterable[PosedDepth]) -> dict[str, Any]:
@@ -48,11 +47,20 @@ def measure_peer(command: str, frames: Iterable[PosedDepth]) -> dict[str, Any]:
             np.savez(Path(folder, f"{number:04}.npz"), allow_pickle=False, **{k: v.numpy() for k, v in arrays.items()})
         for _ in range(_RUNS):
             before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-            output = _run(command, os.environ | {FRAMES: folder})
+            try:
+                done = subprocess.run(
+                    shlex.split(command),
+                    env=os.environ | {FRAMES: folder},
+                    stdout=subprocess.PIPE,
+                    text=True,
+                    check=True,
+                )
+            except (OSError, ValueError, subprocess.CalledProcessError) as error:
+                raise ValueError(f"--peer {command!r} failed: {error}") from error
             walls.append(1000 * (time.perf_counter() - started))
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             processor.append(1000 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime))
-            printed += [float(line["ms"]) for line in _json_lines(output) if "ms" in line]
+            printed += [float(line["ms"]) for line in _json_lines(done.stdout) if "ms" in line]
     process = {**spread(walls), "cpu_median_ms": float(np.median(processor))}
     return {"command": command, "process": process, "frame": spread(printed) if printed else None}
 
@@ -78,8 +86,10 @@ def compare(report: Mapping[str, Any], path: Path) -> dict[str, Any]:
     here, there = _place(report), _place(earlier)
     if apart := [f"{name} {there[name]!r}, here {here[name]!r}" for name in here if here[name] != there[name]]:
         raise ValueError(f"--against {path} was measured on other hardware: {'; '.join(apart)}")
-    before = {_label(result): _figures(result) for result in earlier["results"]}
-    now = {_label(result): _figures(result) for result in report["results"]}
+    now, before = (
+        {f"{result['size']} {result['backend']}": _figures(result) for result in one["results"]}
+        for one in (report, earlier)
+    )
     ratios = {
         label: {name: value / before[label][name] for name, value in figures.items() if before[label].get(name)}
         for label, figures in now.items()
@@ -90,7 +100,8 @@ def compare(report: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 def _place(report: Mapping[str, Any]) -> dict[str, Any]:
     """On what a report was measured."""
-    return {**{name: report["hardware"][name] for name in _SAME}, "threads": report["settings"]["threads"]}
+    of_machine = {name: report["hardware"][name] for name in ("cpu", "cores", "machine")}
+    return {**of_machine, "threads": report["settings"]["threads"]}
 
 
 def _figures(result: Mapping[str, Any]) -> dict[str, float]:
@@ -98,19 +109,6 @@ def _figures(result: Mapping[str, Any]) -> dict[str, float]:
     stages = {name: times["median_ms"] for name, times in result["stages"].items()}
     ratios = {name: ratio["median"] for name, ratio in result["ratios"].items()}
     return {"step": result["step"]["median_ms"], **stages, **ratios}
-
-
-def _label(result: Mapping[str, Any]) -> str:
-    return f"{result['size']} {result['backend']}"
-
-
-def _run(command: str, environment: Mapping[str, str]) -> str:
-    """The standard output of a program that succeeds."""
-    try:
-        done = subprocess.run(shlex.split(command), env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    except (OSError, ValueError, subprocess.CalledProcessError) as error:
-        raise ValueError(f"--peer {command!r} failed: {error}") from error
-    return done.stdout
 
 
 def _json_lines(text: str) -> Iterable[dict[str, Any]]:

@@ -12,14 +12,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import cycle
 from queue import Empty
 from typing import Any
 
 import numpy as np
 
 GPU, CPU, DRAM, OTHER = "gpu", "cpu", "dram", "other"
-PARTS = (GPU, CPU, DRAM, OTHER)
 NOT_MEASURABLE = "not measurable here"
 # A window lasts at least so many refreshes of its counter: a refresh missed at either end is 5 % of it.
 _REFRESHES = 20
@@ -43,22 +41,13 @@ class Rail:
 
     Attributes:
         name: as "gpu 0", "cpu package 0".
-        part: of the machine, one of ``PARTS``; "other" counts in no column of the table.
+        part: of the machine, "gpu", "cpu" or "dram"; "other" counts in no column of the table.
         wraps_at: [J] where the counter starts from 0 again; None = never.
-
-    Raises:
-        ValueError: another part, or a limit that is not positive.
     """
 
     name: str
     part: str
     wraps_at: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.part not in PARTS:
-            raise ValueError(f"part must be one of {', '.join(PARTS)}, got {self.part!r}")
-        if self.wraps_at is not None and not self.wraps_at > 0:
-            raise ValueError(f"wraps_at must be positive joules or None, got {self.wraps_at}")
 
 
 @dataclass(frozen=True)
@@ -78,24 +67,11 @@ class Source:
 
 @dataclass(frozen=True)
 class Window:
-    """What was consumed while something ran.
-
-    Attributes:
-        seconds: how long it took [s].
-        joules: by rail [J]; only what was measured.
-        unusable: by rail, why its reading is none.
-    """
+    """What was consumed while something ran: [s], [J] by rail, and why other rails have no reading."""
 
     seconds: float
     joules: Mapping[str, float]
     unusable: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Reading:
-    at: float
-    joules: Mapping[str, float]
-    failed: Mapping[str, str]
 
 
 class PowerMeter:
@@ -148,9 +124,18 @@ class PowerMeter:
 
     def measure(self, work: Callable[[], object]) -> Window:
         """What ``work()`` consumes; it must have finished on every device when it returns."""
-        start = self._read()
+        began, before, failed_before = self._read()
         work()
-        return self._between(start, self._read())
+        ended, after, failed_after = self._read()
+        joules: dict[str, float] = {}
+        unusable = {**failed_after, **failed_before}
+        for rail in self.rails:
+            if rail.name not in unusable:
+                try:
+                    joules[rail.name] = consumed(rail, before[rail.name], after[rail.name], ended - began)
+                except SensorError as error:
+                    unusable[rail.name] = str(error)
+        return Window(ended - began, joules, unusable)
 
     def idle(self, seconds: float, sleep: Callable[[float], object] = time.sleep) -> dict[str, float]:
         """Power by rail [W] while this process does nothing for at least ``seconds`` [s]; {} without a sensor."""
@@ -159,7 +144,8 @@ class PowerMeter:
         window = self.measure(lambda: sleep(max(seconds, self.shortest)))
         return {name: joules / window.seconds for name, joules in window.joules.items()}
 
-    def _read(self) -> _Reading:
+    def _read(self) -> tuple[float, dict[str, float], dict[str, str]]:
+        """The time, the joules by rail, and by rail why it could not be read."""
         joules: dict[str, float] = {}
         failed: dict[str, str] = {}
         at = self._clock()
@@ -168,20 +154,7 @@ class PowerMeter:
                 joules |= source.read()
             except SensorError as error:
                 failed |= {rail.name: str(error) for rail in source.rails}
-        return _Reading(at, joules, failed)
-
-    def _between(self, start: _Reading, end: _Reading) -> Window:
-        seconds = end.at - start.at
-        joules: dict[str, float] = {}
-        unusable: dict[str, str] = {**end.failed, **start.failed}
-        for rail in self.rails:
-            if rail.name in unusable:
-                continue
-            try:
-                joules[rail.name] = consumed(rail, start.joules[rail.name], end.joules[rail.name], seconds)
-            except SensorError as error:
-                unusable[rail.name] = str(error)
-        return Window(seconds, joules, unusable)
+        return at, joules, failed
 
 
 def consumed(rail: Rail, start: float, end: float, seconds: float) -> float:
@@ -243,17 +216,12 @@ class PartEnergy:
         figures: dict[str, Any] = {}
         for name, values in (("gross", self.joules), ("net", self.net)):
             low, middle, high = (1e3 * float(v) for v in np.percentile(values, (25, 50, 75)))
+            total = sum(self.seconds)  # of a difference, it may be negative: there is no power then
             figures[name] = {
                 "millijoules": middle, "q1": low, "q3": high,
-                "seconds": float(np.median(self.seconds)), "watts": _power(values, self.seconds),
+                "seconds": float(np.median(self.seconds)), "watts": sum(values) / total if total > 0 else None,
             }  # fmt: skip
         return {**figures, "windows": len(self.joules)}
-
-
-def _power(joules: Sequence[float], seconds: Sequence[float]) -> float | None:
-    """[W] Energy over time; None where the time that a difference leaves is not positive."""
-    total = sum(seconds)
-    return sum(joules) / total if total > 0 else None
 
 
 def run_windows(
@@ -273,36 +241,26 @@ def run_windows(
         seconds: that a window lasts, at least [s].
         windows: per part.
     """
-    results: dict[tuple[str, str], list[tuple[float, float, float]]] = {key: [] for key in work}
-    reasons = {key: reason for key, (unit, _) in work.items() if (reason := _without_rails(meter, unit)) is not None}
+    results: dict[tuple[str, str], list[tuple[float, ...]]] = {key: [] for key in work}
+    reasons = {key: meter.missing.get(unit, NOT_MEASURABLE) for key, (unit, _) in work.items() if not meter.names(unit)}
     measured = [key for key in work if key not in reasons]
     for turn in range(windows):
-        for key in measured if turn % 2 == 0 else measured[::-1]:
-            unit, repeat = work[key]
-            value = _one(meter, unit, repeat, idle, max(seconds, meter.shortest))
+        for key in measured[:: 1 if turn % 2 == 0 else -1]:
+            value = _one(meter, *work[key], idle, max(seconds, meter.shortest))
             if isinstance(value, str):
                 reasons[key] = value
             else:
                 results[key].append(value)
-    energies: dict[tuple[str, str], PartEnergy] = {}
-    for key, values in results.items():
-        if key in reasons:
-            energies[key] = PartEnergy(reason=reasons[key])
-        else:
-            joules, net, times = zip(*values, strict=True)
-            energies[key] = PartEnergy(joules, net, times)
+    energies = {key: PartEnergy(reason=reason) for key, reason in reasons.items()}
+    for key in work.keys() - reasons.keys():
+        joules, net, times = zip(*results[key], strict=True)
+        energies[key] = PartEnergy(joules, net, times)
     return energies
-
-
-def _without_rails(meter: PowerMeter, unit: str) -> str | None:
-    if meter.names(unit):
-        return None
-    return meter.missing.get(unit, NOT_MEASURABLE)
 
 
 def _one(
     meter: PowerMeter, unit: str, repeat: Work, idle: Mapping[str, float], seconds: float
-) -> tuple[float, float, float] | str:
+) -> tuple[float, ...] | str:
     """Joules, net joules and seconds per frame of one window, or why there are none."""
     frames: list[int] = []
     window = meter.measure(lambda: frames.append(repeat(seconds)))
@@ -317,14 +275,12 @@ def _one(
 
 
 def repeated(
-    calls: Sequence[Callable[[], object]],
-    wait: Callable[[], None],
-    clock: Callable[[], float] = time.perf_counter,
+    calls: Sequence[Callable[[], object]], wait: Callable[[], None], clock: Callable[[], float] = time.perf_counter
 ) -> Work:
     """Call after call, each waited for as in a robot's loop, over and over until the time is up.
 
     Args:
-        calls: one per frame.
+        calls: at least one, one per frame.
         wait: until the device has finished.
         clock: [s].
 
@@ -336,12 +292,10 @@ def repeated(
 
     def work(seconds: float) -> int:
         start, count = clock(), 0
-        for call in cycle(calls):
-            call()
+        while not count or clock() - start < seconds:
+            calls[count % len(calls)]()
             wait()
             count += 1
-            if clock() - start >= seconds:
-                break
         return count
 
     return work

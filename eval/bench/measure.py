@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.bench.energy import CPU, GPU, PartEnergy, PowerMeter, Work, repeated, run_windows
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
@@ -37,7 +38,7 @@ from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.machine import available_cores, hardware, load_average, versions
 from ufmstar_torch.eval.results.work import EvalJob
 from ufmstar_torch.eval.results.worker import device_of
-from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 
 EFFICIENCY = "efficiency.json"
 FORMAT = 1
@@ -48,7 +49,7 @@ Energies = Mapping[tuple[str, str], PartEnergy]
 
 
 @dataclass(frozen=True)
-class Plan:
+class Plan(Checked):
     """How much is measured.
 
     Attributes:
@@ -64,25 +65,13 @@ class Plan:
         ValueError: a number out of range.
     """
 
-    frames: int = 40
-    warm_up: int = 5
-    threads: int | None = None
-    seconds: float = 3.0
-    windows: int = 3
-    idle: float = 10.0
-    sequences: int | None = None
-
-    def __post_init__(self) -> None:
-        for name, least in (("frames", 1), ("warm_up", 0), ("windows", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
-        if self.threads is not None and (not isinstance(self.threads, int) or self.threads < 1):
-            raise ValueError(f"threads must be None or at least 1, got {self.threads!r}")
-        if self.sequences is not None and (not isinstance(self.sequences, int) or self.sequences < 1):
-            raise ValueError(f"sequences must be None or at least 1, got {self.sequences!r}")
-        if not (self.seconds > 0 and self.idle > 0):
-            raise ValueError(f"seconds and idle must be positive, got {self.seconds} and {self.idle}")
+    frames: int = number(40, "", "1", 1)
+    warm_up: int = number(5, "", "1", 0)
+    threads: int | None = number(None, "", "1", 1)
+    seconds: float = number(3.0, "", "s", 0.0, open_low=True)
+    windows: int = number(3, "", "1", 1)
+    idle: float = number(10.0, "", "s", 0.0, open_low=True)
+    sequences: int | None = number(None, "", "1", 1)
 
 
 def measure(
@@ -119,10 +108,15 @@ def measure(
     chosen = [row for row in rows if row.label not in left_out]
     if not chosen:
         raise ValueError(f"rows must hold one that can be measured: {left_out or 'none was given'}")
-    frames, unreadable = _frames(sequence, plan)
+    broken: list[FrameError] = []
+    wanted = plan.warm_up + plan.frames
+    frames = list(islice(sequence.readable(broken.append), wanted))
+    if len(frames) < wanted:
+        raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
     meter = meter or PowerMeter.open(None if on_gpu is None else on_gpu.index or 0)
-    with pinned_threads(plan.threads or available_cores()):
+    threads = plan.threads or available_cores()
+    with pinned_threads(threads):
         idle = meter.idle(plan.idle)
         race = run_race(
             chosen, networks, frames, warm_up=plan.warm_up, device=device, multiview_device=multiview_device
@@ -136,8 +130,8 @@ def measure(
         "format": FORMAT,
         "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": gpu},
         "devices": {"networks": str(device), "multiview": str(multiview_device), "units": units},
-        "plan": {**asdict(plan), "threads": plan.threads or available_cores()},
-        "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": unreadable},
+        "plan": {**asdict(plan), "threads": threads},
+        "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": len(broken)},
         "power": {"rails": [asdict(rail) for rail in meter.rails], "missing": meter.missing, "idle_watts": idle},
         "networks": {base: _network_line(networks[base], race, energy) for base in used},
         "rows": [_row_line(row, networks[row.method.base], race, energy) for row in chosen],
@@ -188,12 +182,8 @@ def over_sequences(measured: Mapping[tuple[str, str], Mapping[str, Any]]) -> dic
     """
     runs = list(measured.values())
     single = [
-        {
-            "dataset": dataset,
-            "sequence": sequence,
-            "energy_mj": {row["row"]: _uncertainty_mj(row["energy"]) for row in run["rows"]},
-        }
-        for (dataset, sequence), run in measured.items()
+        {"dataset": d, "sequence": s, "energy_mj": {row["row"]: _uncertainty_mj(row["energy"]) for row in run["rows"]}}
+        for (d, s), run in measured.items()
     ]
     mean: dict[str, Any] = _mean(runs)
     if len(runs) > 1:
@@ -229,24 +219,8 @@ def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:
     if setting.skip or setting.pose_noise:
         return "left out frames and noise on poses are no matter of efficiency"
     if setting.anchors:
-        return (
-            "anchors are not measured here: the benchmark times the tracker, `ufmstar eval` what UfM* takes with them"
-        )
+        return "anchors are not measured here: `ufmstar bench` times the tracker, `ufmstar eval` UfM* with them"
     return None
-
-
-def _frames(sequence: FrameSequence, plan: Plan) -> tuple[list[Frame], int]:
-    """The first frames that can be read, and how many could not.
-
-    Raises:
-        ValueError: there are too few.
-    """
-    broken: list[FrameError] = []
-    wanted = plan.warm_up + plan.frames
-    frames = list(islice(sequence.readable(broken.append), wanted))
-    if len(frames) < wanted:
-        raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
-    return frames, len(broken)
 
 
 def _unit(device: torch.device) -> str:
@@ -271,10 +245,8 @@ def _work(
         if row.method.fusion != ALONE:
             step = MultiviewStep(row, multiview_device)
             steps = [partial(_advance, step, turn == 0, *given) for turn, given in enumerate(race.step_inputs(row))]
-            work[row.label, MULTIVIEW] = (
-                _unit(multiview_device),
-                repeated(steps, partial(synchronize, multiview_device)),
-            )
+            waited = repeated(steps, partial(synchronize, multiview_device))
+            work[row.label, MULTIVIEW] = (_unit(multiview_device), waited)
     return work
 
 
@@ -290,14 +262,13 @@ def _advance(step: MultiviewStep, first: bool, *given: Any) -> None:
 
 def _network_line(network: TimedNetwork, race: Race, energy: Energies) -> dict[str, Any]:
     """A base's networks: what they are, and what depth alone and each form of inference take."""
-    memory = network.memory()
     parts = [part for part in (DEPTH, ONCE, EVERY) if race.ms(network.base, part)]
     return {
         "label": network.label,
         "members": len(network.members),
         "passes": network.passes,
         "whole": network.why_whole,
-        "memory": None if memory is None else asdict(memory),
+        "memory": network.memory(),
         "latency": {part: spread(race.ms(network.base, part)) for part in parts},
         "energy": {part: energy[network.base, part].to_dict() for part in parts},
     }
@@ -366,10 +337,10 @@ def _memory(row: Row, network: TimedNetwork, race: Race) -> dict[str, Any]:
     state = race.steps[row.label].memory() if row.method.fusion != ALONE else None
     if memory is None:
         return {"multiview": state, "not_measurable": "the weights are not torch's tensors"}
-    uncertainty = memory.uncertainty + (0 if state is None else state["bytes_end"])
+    uncertainty = memory["uncertainty"] + (0 if state is None else state["bytes_end"])
     return {
-        "depth_bytes": memory.depth,
-        "network_uncertainty_bytes": memory.uncertainty,
+        "depth_bytes": memory["depth"],
+        "network_uncertainty_bytes": memory["uncertainty"],
         "multiview": state,
-        "overhead_percent": overhead_percent(uncertainty, memory.depth),
+        "overhead_percent": overhead_percent(uncertainty, memory["depth"]),
     }

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import resource
 import tracemalloc
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from torch import Tensor, nn
@@ -46,39 +45,8 @@ def state_memory(ufm: UfMStar) -> dict[str, int]:
     }
 
 
-@dataclass(frozen=True)
-class NetworkMemory:
-    """Weights and buffers of a network [bytes].
-
-    Attributes:
-        depth: of one network that predicts depth alone.
-        uncertainty: of all else: heads, further members, factors of a BatchEnsemble.
-    """
-
-    depth: int
-    uncertainty: int
-
-    @classmethod
-    def of(cls, members: Sequence[nn.Module], depth: nn.Module) -> NetworkMemory:
-        """Of what is kept to run ``members``, beyond what ``depth`` alone needs.
-
-        Raises:
-            ValueError: the members hold less than the network for depth.
-        """
-        alone, everything = weight_bytes(depth), weight_bytes(*members)
-        if everything < alone:
-            raise ValueError(f"members hold {everything} bytes, less than the {alone} of one network for depth")
-        return cls(alone, everything - alone)
-
-
 def overhead_percent(uncertainty: float, depth: float) -> float:
-    """Share of uncertainty in the whole [%]: 100 u / (u + d), of bytes or of joules.
-
-    Raises:
-        ValueError: a negative amount, or nothing at all.
-    """
-    if uncertainty < 0 or depth < 0 or uncertainty + depth <= 0:
-        raise ValueError(f"uncertainty and depth must be amounts, at least one positive, got {uncertainty} and {depth}")
+    """Share of uncertainty in the whole [%]: 100 u / (u + d), of bytes or of joules."""
     return 100 * uncertainty / (uncertainty + depth)
 
 

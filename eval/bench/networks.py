@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.bench.memory import NetworkMemory, weight_bytes
+from ufmstar_torch.eval.bench.memory import weight_bytes
 from ufmstar_torch.eval.engine.networks import prepared_as
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
@@ -47,13 +47,15 @@ class TimedNetwork:
         why_whole: None, or why ``depth`` is the whole network instead.
 
     Raises:
-        ValueError: another base, no member, or members that want different inputs.
+        ValueError: another base, no member, several members in one, or members that want different inputs.
     """
 
     def __init__(self, base: str, members: Sequence[DepthNetwork], label: str, samples: int = SAMPLES) -> None:
         if base not in BASES:
             raise ValueError(f"base must be one of {', '.join(BASES)}, got {base!r}")
-        opened = [_opened(member) for member in members]
+        if any(isinstance(member, Ensemble) for member in members):
+            raise ValueError("members must be the ensemble's members one by one, not an Ensemble")
+        opened = [member.network() if isinstance(member, LazyMember) else member for member in members]
         if not opened:
             raise ValueError(f"{base}: members must hold at least one network")
         if any(member.preprocess != opened[0].preprocess for member in opened):
@@ -82,15 +84,16 @@ class TimedNetwork:
             if part == DEPTH:
                 prediction: DepthPrediction = infer(self.depth, x, intrinsics)
                 return prediction
-            if part == EVERY:
-                return self._turns.every(x, intrinsics)
-            return self._turns.member(x, intrinsics, turn)
+            every = part == EVERY
+            return self._turns.every(x, intrinsics) if every else self._turns.member(x, intrinsics, turn)
 
-    def memory(self) -> NetworkMemory | None:
-        """Of depth alone and of the rest, or None where weights are not known (a wrapped function's)."""
-        if not weight_bytes(*self.members):
+    def memory(self) -> dict[str, int] | None:
+        """Weights and buffers [bytes] of "depth" alone, and of all else as "uncertainty": heads, further members,
+        factors of a BatchEnsemble; None where weights are not known (a wrapped function's)."""
+        everything, alone = weight_bytes(*self.members), weight_bytes(self.depth)
+        if not everything:
             return None
-        return NetworkMemory.of([self.depth] if self.base == "depth_only" else self.members, self.depth)
+        return {"depth": alone, "uncertainty": 0 if self.base == "depth_only" else everything - alone}
 
 
 def timed_networks(sources: Mapping[str, DepthSource], rows: Sequence[Row] = ()) -> dict[str, TimedNetwork]:
@@ -129,14 +132,3 @@ def depth_alone(network: DepthNetwork) -> DepthNetwork:
         if isinstance(module, DecoderDropout):
             module.sampling = False
     return DepthOnlyNetwork(backbone).eval()
-
-
-def _opened(network: DepthNetwork) -> DepthNetwork:
-    """A member as it is once it has been loaded.
-
-    Raises:
-        ValueError: several members in one, which could not be run in turn.
-    """
-    if isinstance(network, Ensemble):
-        raise ValueError("members must be the ensemble's members one by one, not an Ensemble")
-    return network.network() if isinstance(network, LazyMember) else network

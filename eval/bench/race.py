@@ -53,23 +53,14 @@ class NetworkInput:
 
 
 class MultiviewStep:
-    """UfM or UfM* of a row, as the evaluation builds it, with a state of its own.
+    """UfM or UfM* of a row on a device, as the evaluation builds it, with a state of its own.
 
-    Args:
-        row: behind UfM or UfM*.
-        device: where it runs.
-
-    Attributes:
-        kept: what the estimator holds after every noted frame (``Estimator.memory``).
-
-    Raises:
-        ValueError: a row without a multiview part.
+    ``kept`` is what the estimator holds after every noted frame (``Estimator.memory``).
     """
 
     def __init__(self, row: Row, device: torch.device) -> None:
         estimator = make_estimator(row, device)
-        if not isinstance(estimator, Pointwise | Gaussians):
-            raise ValueError(f"{row.label} has no multiview part")
+        assert isinstance(estimator, Pointwise | Gaussians), f"{row.label} has no multiview part"
         self.row, self.device, self.module = row, device, estimator.ufm
         self.kept: list[dict[str, float]] = []
         self._estimator = estimator
@@ -95,11 +86,8 @@ class MultiviewStep:
         figures = {"smoothing_bytes": self.kept[-1]["smoothing_bytes"]}
         for name in ("bytes", "count"):
             values = [kept[name] for kept in self.kept]
-            figures |= {
-                f"{name}_end": values[-1],
-                f"{name}_mean": sum(values) / len(values),
-                f"{name}_max": max(values),
-            }
+            mean = sum(values) / len(values)
+            figures |= {f"{name}_end": values[-1], f"{name}_mean": mean, f"{name}_max": max(values)}
         return figures
 
 
@@ -161,12 +149,9 @@ def run_race(
     """Run every part of every row on every frame.
 
     Args:
-        rows: different ones.
-        networks: by base.
+        rows, networks, device, multiview_device: as ``eval.bench.measure.measure`` takes them.
         frames: with images; the first ``warm_up`` are run, but not counted.
         warm_up: see ``frames``.
-        device: of the networks.
-        multiview_device: of UfM and UfM*.
 
     Raises:
         FrameError: a frame has no image.

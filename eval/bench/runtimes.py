@@ -7,7 +7,6 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,20 +24,6 @@ _ROUNDS, _WARM_UP = 12, 2
 _AGREEMENT = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class TimedForward:
-    """The pass that steps are compared with.
-
-    Attributes:
-        call: the forward pass on a fixed random image; its arguments are not used.
-        about: "runtime" and "version" of the pass, "threads", "runtimes": the least time of each in turns [ms], and
-            "apart": the largest difference of their outputs as a share of the largest.
-    """
-
-    call: Callable[..., Tensor]
-    about: dict[str, Any]
-
-
 class _Maps(nn.Module):
     """A network that returns a tensor: of a depth network, the depth."""
 
@@ -51,13 +36,17 @@ class _Maps(nn.Module):
         return maps.depth if isinstance(maps, DepthPrediction) else maps
 
 
-def fastest(network: nn.Module, side: int, *, runtime: str = "auto") -> TimedForward:
-    """The pass of a network on a [1, 3, side, side] image.
+def fastest(network: nn.Module, side: int, *, runtime: str = "auto") -> tuple[Callable[..., Tensor], dict[str, Any]]:
+    """The pass of a network on a fixed random [1, 3, side, side] image; its arguments are not used.
 
     Args:
         network: in eval mode, batch norms folded where it can be.
         side: [px].
         runtime: "auto" compares those that are installed; "torch" or "onnx" takes that one.
+
+    Returns:
+        The pass, and "runtime" and "version" of it, "threads", "runtimes": the least time of each in turns [ms], and
+        "apart": the largest difference of their outputs as a share of the largest.
 
     Raises:
         ModuleNotFoundError: "onnx" without the packages onnx and onnxruntime.
@@ -84,7 +73,7 @@ def fastest(network: nn.Module, side: int, *, runtime: str = "auto") -> TimedFor
         "runtimes": least,
         "apart": _apart(calls),
     }
-    return TimedForward(calls[chosen], about)
+    return calls[chosen], about
 
 
 def _in_torch(network: nn.Module, image: Tensor) -> Callable[..., Tensor]:

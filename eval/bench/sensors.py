@@ -8,7 +8,7 @@ for its wrapping, every second; a difference modulo the counter's range needs no
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -33,21 +33,20 @@ def find_sources(gpu: int | None) -> tuple[list[Source], dict[str, str]]:
     missing: dict[str, str] = {}
     sources: list[Source] = []
     chip, why_no_chip = _try(_chip)
-    if chip is not None:
-        sources.append(chip if gpu is not None else _without(chip, GPU))
+    if chip is not None:  # a GPU on which nothing runs counts in no column
+        rails = tuple(replace(r, part=OTHER) if r.part == GPU and gpu is None else r for r in chip.rails)
+        sources.append(replace(chip, rails=rails))
     known = {rail.part for source in sources for rail in source.rails}
-    if CPU not in known:
-        source, reason = _try(_packages)
-        if source is not None:
-            sources.append(source)
-        missing |= dict.fromkeys((CPU, DRAM), _both(reason, why_no_chip))
+    others: dict[str, tuple[Callable[[], Source], tuple[str, ...]]] = {CPU: (_packages, (CPU, DRAM))}
     if gpu is None:
         missing[GPU] = _UNUSED
-    elif GPU not in known:
-        source, reason = _try(lambda: _graphics(gpu))
-        if source is not None:
-            sources.append(source)
-        missing[GPU] = _both(reason, why_no_chip)
+    else:
+        others[GPU] = (lambda: _graphics(gpu), (GPU,))
+    for part, (open_, parts) in others.items():
+        if part not in known:
+            source, reason = _try(open_)
+            sources += [] if source is None else [source]
+            missing |= dict.fromkeys(parts, _both(reason, why_no_chip))
     if any(rail.part == CPU for source in sources for rail in source.rails):
         missing[DRAM] = "the processor has no counter for its memory"
     return [source for source in sources if source.rails], missing
@@ -88,11 +87,7 @@ def _guarded(call: Callable[[], Any]) -> Any:
 
 
 def _graphics(index: int) -> Source:
-    """The GPU's counter of its whole energy.
-
-    Raises:
-        SensorError: there is none.
-    """
+    """The GPU's counter of its whole energy; without one raises SensorError."""
     from zeus.device import get_gpus
 
     gpus = _guarded(get_gpus)
@@ -159,36 +154,19 @@ def _from_files(cpus: Any) -> Source:
 
 
 def _chip() -> Source:
-    """The rails of a Jetson or of Apple's chips.
-
-    Raises:
-        SensorError: this is none of them.
-    """
+    """The rails of a Jetson or of Apple's chips; of another machine raises SensorError."""
     from zeus.device import get_soc
 
     soc = _guarded(get_soc)
+    # The whole processor's, GPU's and memory's rails; clusters of cores and caches are parts of them.
+    whole = {"soc cpu": CPU, "soc cpu total": CPU, "soc gpu": GPU, "soc dram": DRAM}
 
     def read() -> Mapping[str, float]:
         now = asdict(_guarded(soc.get_total_energy_consumption))
         single = {key: value for key, value in now.items() if isinstance(value, int | float)}
-        return {f"soc {_plain(key)}": 1e-3 * value for key, value in single.items()}
+        return {  # "cpu_energy_mj" is "soc cpu", "gpu_sram_mj" "soc gpu sram"
+            f"soc {key.removesuffix('_mj').removesuffix('_energy').replace('_', ' ')}": 1e-3 * value
+            for key, value in single.items()
+        }
 
-    rails = tuple(Rail(name, _part(name)) for name in read())
-    return Source(rails, read, _SOC_PERIOD)
-
-
-def _plain(key: str) -> str:
-    """ "cpu_energy_mj" as "cpu", "gpu_sram_mj" as "gpu sram"."""
-    return key.removesuffix("_mj").removesuffix("_energy").replace("_", " ")
-
-
-def _part(name: str) -> str:
-    """The whole processor's, GPU's and memory's rails; clusters of cores and caches are parts of them."""
-    whole = {"soc cpu": CPU, "soc cpu total": CPU, "soc gpu": GPU, "soc dram": DRAM}
-    return whole.get(name, OTHER)
-
-
-def _without(source: Source, part: str) -> Source:
-    """A source whose rails of a part count in no column."""
-    rails = tuple(Rail(r.name, OTHER if r.part == part else r.part, r.wraps_at) for r in source.rails)
-    return Source(rails, source.read, source.period)
+    return Source(tuple(Rail(name, whole.get(name, OTHER)) for name in read()), read, _SOC_PERIOD)

@@ -202,8 +202,7 @@ def reference_networks(
         networks["resnet50"] = (torch.nn.Sequential(*list(resnet50(weights=None).children())[:-2]).eval(), size)
     calls = {}
     for name, (network, side) in networks.items():
-        forward = fastest(network, side, runtime=runtime)
-        calls[name] = forward.call
+        calls[name], facts = fastest(network, side, runtime=runtime)
         whole = fastdepth if name == "fastdepth" else network  # with the batch norms that are folded
-        about[name] = {"size": side, "parameters": sum(p.nelement() for p in whole.parameters()), **forward.about}
+        about[name] = {"size": side, "parameters": sum(p.nelement() for p in whole.parameters()), **facts}
     return calls, about

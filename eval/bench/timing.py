@@ -8,7 +8,7 @@ threads (threads that wait by spinning included), without what other processes t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import cycle
@@ -49,17 +49,18 @@ def pinned_threads(count: int, *, opencv: bool = False) -> Iterator[None]:
         numba: Any = import_module("numba")
         if count > numba.config.NUMBA_NUM_THREADS:
             raise ValueError(f"threads must be at most numba's {numba.config.NUMBA_NUM_THREADS}, got {count}")
-        libraries.insert(0, (numba.get_num_threads, numba.set_num_threads))
+        libraries.append((numba.get_num_threads, numba.set_num_threads))
     if opencv:
         cv2: Any = import_module("cv2")
-        libraries.insert(0, (cv2.getNumThreads, cv2.setNumThreads))
-    before = [read() for read, _ in reversed(libraries)][::-1]
-    with ExitStack() as restored:
-        for (_, write), number in reversed(list(zip(libraries, before, strict=True))):
-            restored.callback(write, number)
-        for _, write in libraries:
+        libraries.append((cv2.getNumThreads, cv2.setNumThreads))
+    before = [read() for read, _ in libraries]
+    try:
+        for _, write in reversed(libraries):
             write(count)
         yield
+    finally:
+        for (_, write), number in reversed(list(zip(libraries, before, strict=True))):
+            write(number)
 
 
 def most_threads() -> int:
@@ -108,22 +109,19 @@ class TimedCalls:
             synchronize(device)
             return result
 
-        names = list(calls) if self._number % 2 == 0 else list(calls)[::-1]
         untimed = set(self._before)
         results = {}
-        for name, previous in zip(names, cycle(self._before or [None]), strict=False):
-            if previous is not None:
-                self._run(previous, previous in untimed, finished, self._before[previous])
+        for name, previous in zip(
+            list(calls)[:: -1 if self._number % 2 else 1], cycle(self._before or [""]), strict=False
+        ):
+            if previous in untimed:
+                self.times.time(previous, finished, self._before[previous])
                 untimed.discard(previous)
+            elif previous:
+                finished(self._before[previous])
             synchronize(device)
             results[name] = self.times.time(name, finished, calls[name])
         return results
-
-    def _run(self, name: str, timed: bool, finished: Callable[..., Any], call: Callable[..., Any]) -> None:
-        if timed:
-            self.times.time(name, finished, call)
-        else:
-            finished(call)
 
 
 class StagedStep:
@@ -163,11 +161,8 @@ class StagedStep:
         return self._kernels.stage(name)
 
     def summary(self, *, warm_up: int) -> dict[str, Any]:
-        """Spread of every stage, of every kernel (all its calls in a step), and of the steps' sums.
-
-        Args:
-            warm_up: steps at the beginning that do not count.
-        """
+        """Spread of every stage, of every kernel (all its calls in a step), and of the steps' sums; the first
+        ``warm_up`` steps do not count."""
         return {
             "stages": {name: spread(times[warm_up:]) for name, times in self.stages.items()},
             "kernels": {name: spread(times[warm_up:]) for name, times in self.kernels.items()},

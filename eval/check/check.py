@@ -15,8 +15,6 @@ from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_
 from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 
-AS_GIVEN = CONVENTIONS[OURS].description
-_READINGS = {convention.description: convention.convert for convention in CONVENTIONS.values()}
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
 # Share of a frame's points that must land on valid depth, of those that would if all fell into the image, or a pair
@@ -41,10 +39,10 @@ class SequenceCheck:
         pairs: pairs of frames compared, ``gap`` frames apart.
         gap: see ``pairs``.
         error: median relative error of warped depth, as the sequence is given; inf without overlap.
-        reading: the reading of the poses that fits best, and ``scale``, by which depth must be multiplied
-            then; ``best_error`` is the error with both.
-        scale: see ``reading``.
-        best_error: see ``reading``.
+        poses: the reading of the poses that fits best, by the name that ``open_sequence`` takes, and ``scale``, by
+            which depth must be multiplied then; ``best_error`` is the error with both.
+        scale: see ``poses``.
+        best_error: see ``poses``.
         registration: how depth lies on the image, or None where it was not checked.
         unreadable: files that could not be decoded.
         problems: what is wrong, in words; empty if nothing.
@@ -54,7 +52,7 @@ class SequenceCheck:
     pairs: int
     gap: int
     error: float
-    reading: str
+    poses: str
     scale: float
     best_error: float
     registration: DepthImageFit | None
@@ -63,9 +61,9 @@ class SequenceCheck:
     undecided: tuple[str, ...]
 
     @property
-    def convention(self) -> str:
-        """The reading by the name that ``open_sequence`` takes as ``poses``."""
-        return next(name for name, convention in CONVENTIONS.items() if convention.description == self.reading)
+    def reading(self) -> str:
+        """The reading of the poses in words."""
+        return CONVENTIONS[self.poses].description
 
     @property
     def ok(self) -> bool:
@@ -99,48 +97,25 @@ def check_sequence(sequence: FrameSequence, pairs: int = 8) -> SequenceCheck:
     if pairs < 1:
         raise ValueError(f"pairs must be at least 1, got {pairs}")
     unreadable: list[str] = []
-    if not sequence.posed:
-        return _without_poses(_registration(sequence, unreadable), unreadable)
-    errors: dict[str, np.ndarray] = {}
-    loaded: list[_Pair] = []
-    gap = 0
-    for gap in _GAPS:
-        loaded = _load_pairs(sequence, gap, pairs, unreadable)
-        errors = {name: _errors(loaded, name, _SCALES) for name in _READINGS} if loaded else {}
-        if any(np.isfinite(curve).any() for curve in errors.values()):
-            break
-    if not loaded:
-        raise ValueError(f"sequence {sequence.name!r} has no two readable frames with depth to compare")
+    if sequence.posed:
+        figures, problems, undecided = _geometry(sequence, pairs, unreadable)
+    else:
+        figures = (0, 0, float("nan"), OURS, 1.0, float("nan"))
+        problems, undecided = [], ["there are no poses: methods that compare views cannot be run"]
     registration = _registration(sequence, unreadable)
-    return _judge(loaded, gap, errors, registration, tuple(dict.fromkeys(unreadable)))
-
-
-def _without_poses(registration: DepthImageFit | None, unreadable: list[str]) -> SequenceCheck:
-    problems: list[str] = []
-    undecided = ["there are no poses: methods that compare views cannot be run"]
     if registration is not None:
-        _registration_verdict(registration, problems, undecided)
-    return SequenceCheck(
-        pairs=0,
-        gap=0,
-        error=float("nan"),
-        reading=AS_GIVEN,
-        scale=1.0,
-        best_error=float("nan"),
-        registration=registration,
-        unreadable=tuple(dict.fromkeys(unreadable)),
-        problems=tuple(problems),
-        undecided=tuple(undecided),
-    )
+        wrong, open_ = _registration_verdict(registration)
+        problems, undecided = problems + wrong, undecided + open_
+    return SequenceCheck(*figures, registration, tuple(dict.fromkeys(unreadable)), tuple(problems), tuple(undecided))
 
 
-def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> float:
+def warp_error(pair: _Pair, poses: str, scale: float) -> float:
     """Median |log(z warped / depth there)| of a pair; inf where too few points land on valid depth.
 
     Depth times ``scale`` with poses is the same as depth with positions divided by ``scale``, which leaves
     the comparison in the unit of the files.
     """
-    convert = _READINGS[reading]
+    convert = CONVENTIONS[poses].convert
     T_b_a = np.linalg.inv(convert(pair.T_world_b)) @ convert(pair.T_world_a)
     x, y, z = T_b_a[:3, :3] @ pair.points + T_b_a[:3, 3:] / scale
     front = z > 1e-6
@@ -157,15 +132,34 @@ def warp_error(pair: _Pair, reading: str = AS_GIVEN, scale: float = 1.0) -> floa
     return float(np.median(np.abs(np.log(z[inside][valid] / depth_there[valid]))))
 
 
-def _load_pairs(sequence: FrameSequence, gap: int, count: int, unreadable: list[str]) -> list[_Pair]:
-    if len(sequence) <= gap:
-        return []
-    pairs = []
-    for i in np.unique(np.linspace(0, len(sequence) - 1 - gap, count).astype(int)):
-        first, second = _read(sequence, int(i), unreadable), _read(sequence, int(i) + gap, unreadable)
-        if first is not None and second is not None:
-            pairs.append(_pair(*first, *second))
-    return pairs
+def _geometry(
+    sequence: FrameSequence, count: int, unreadable: list[str]
+) -> tuple[tuple[int, int, float, str, float, float], list[str], list[str]]:
+    """The first six fields of the outcome, problems and undecided questions of poses and depth scale."""
+    errors: dict[str, np.ndarray] = {}
+    pairs: list[_Pair] = []
+    gap = 0
+    for gap in (gap for gap in _GAPS if gap < len(sequence)):
+        first = np.unique(np.linspace(0, len(sequence) - 1 - gap, count).astype(int)).tolist()
+        read = [(_read(sequence, i, unreadable), _read(sequence, i + gap, unreadable)) for i in first]
+        pairs = [_pair(*a, *b) for a, b in read if a is not None and b is not None]
+        errors = {name: _errors(pairs, name, _SCALES) for name in CONVENTIONS} if pairs else {}
+        if any(np.isfinite(curve).any() for curve in errors.values()):
+            break
+    if not pairs:
+        raise ValueError(f"sequence {sequence.name!r} has no two readable frames with depth to compare")
+    poses = min(errors, key=lambda name: float(errors[name].min()))
+    around = _SCALES[int(np.argmin(errors[poses]))]
+    fine = around * 10.0 ** np.linspace(-0.125, 0.125, 21)
+    fine_errors = _errors(pairs, poses, fine)
+    scale, best = float(fine[int(np.argmin(fine_errors))]), float(fine_errors.min())
+    given = float(_errors(pairs, OURS, np.ones(1))[0])
+    if _as_good(given, best):
+        poses = OURS
+    if _as_good(float(_errors(pairs, poses, np.ones(1))[0]), best):
+        scale = 1.0
+    figures = (len(pairs), gap, given, poses, scale, best)
+    return figures, *_geometry_verdict(errors, given, best, poses, scale)
 
 
 def _read(sequence: FrameSequence, index: int, unreadable: list[str]) -> tuple[Frame, np.ndarray] | None:
@@ -182,15 +176,14 @@ def _pair(first: Frame, first_depth: np.ndarray, second: Frame, second_depth: np
     v, u = np.nonzero(first_depth > 0)
     keep = np.unique(np.linspace(0, len(v) - 1, _POINTS).astype(int))
     z = first_depth[v[keep], u[keep]].astype(np.float64)
-    K_a = first.intrinsics if first.depth_intrinsics is None else first.depth_intrinsics
-    K_b = second.intrinsics if second.depth_intrinsics is None else second.depth_intrinsics
+    K_a, K_b = (f.intrinsics if f.depth_intrinsics is None else f.depth_intrinsics for f in (first, second))
     points = np.linalg.inv(K_a) @ np.stack([u[keep] * z, v[keep] * z, z])
     return _Pair(points, first.T_world_cam, second.T_world_cam, K_b, second_depth)
 
 
-def _errors(pairs: list[_Pair], reading: str, scales: np.ndarray) -> np.ndarray:
+def _errors(pairs: list[_Pair], poses: str, scales: np.ndarray) -> np.ndarray:
     """[len(scales)] the median over pairs of the warp error."""
-    return np.median([[warp_error(pair, reading, scale) for scale in scales] for pair in pairs], axis=0)
+    return np.median([[warp_error(pair, poses, scale) for scale in scales] for pair in pairs], axis=0)
 
 
 def _registration(sequence: FrameSequence, unreadable: list[str]) -> DepthImageFit | None:
@@ -203,46 +196,12 @@ def _registration(sequence: FrameSequence, unreadable: list[str]) -> DepthImageF
     return depth_image_fit(both) if both else None
 
 
-def _judge(
-    pairs: list[_Pair],
-    gap: int,
-    errors: dict[str, np.ndarray],
-    registration: DepthImageFit | None,
-    unreadable: tuple[str, ...],
-) -> SequenceCheck:
-    reading = min(errors, key=lambda name: float(errors[name].min()))
-    around = _SCALES[int(np.argmin(errors[reading]))]
-    fine = around * 10.0 ** np.linspace(-0.125, 0.125, 21)
-    fine_errors = _errors(pairs, reading, fine)
-    scale, best = float(fine[int(np.argmin(fine_errors))]), float(fine_errors.min())
-    given = float(_errors(pairs, AS_GIVEN, np.ones(1))[0])
-    if _as_good(given, best):
-        reading = AS_GIVEN
-    if _as_good(float(_errors(pairs, reading, np.ones(1))[0]), best):
-        scale = 1.0
-    problems, undecided = _geometry_verdict(errors, given, best, reading, scale)
-    if registration is not None:
-        _registration_verdict(registration, problems, undecided)
-    return SequenceCheck(
-        pairs=len(pairs),
-        gap=gap,
-        error=given,
-        reading=reading,
-        scale=scale,
-        best_error=best,
-        registration=registration,
-        unreadable=unreadable,
-        problems=tuple(problems),
-        undecided=tuple(undecided),
-    )
-
-
 def _as_good(error: float, best: float) -> bool:
     return error <= max(_SAME_FACTOR * best, best + _SAME_ERROR)
 
 
 def _geometry_verdict(
-    errors: dict[str, np.ndarray], given: float, best: float, reading: str, scale: float
+    errors: dict[str, np.ndarray], given: float, best: float, poses: str, scale: float
 ) -> tuple[list[str], list[str]]:
     """Problems and undecided questions of poses and depth scale."""
     problems: list[str] = []
@@ -252,29 +211,28 @@ def _geometry_verdict(
     as_given = f"by {given:.1%} as given" if np.isfinite(given) else "as given frames do not overlap"
     measured = f"warped depth is off by {best:.1%} then, {as_given}"
     if best > _MAX_ERROR:
-        problems.append(f"depth and poses disagree under every reading tried ({measured})")
-        return problems, undecided
-    if reading != AS_GIVEN:
-        problems.append(f"the poses look {reading} ({measured})")
+        return [f"depth and poses disagree under every reading tried ({measured})"], undecided
+    if poses != OURS:
+        problems.append(f"the poses look {CONVENTIONS[poses].description} ({measured})")
     if not 1 / _SCALE_TOLERANCE < scale < _SCALE_TOLERANCE:
         problems.append(f"depth looks too {'small' if scale > 1 else 'large'}: times {scale:.3g} fits ({measured})")
-    others = [name for name in errors if name != reading and _as_good(float(errors[name].min()), best)]
+    alike = [name for name in errors if name != poses and _as_good(float(errors[name].min()), best)]
+    others = [CONVENTIONS[name].description for name in alike]
     if others:
         undecided.append(f"the motion does not tell the poses from {', or '.join(others)}")
-    fitting = _SCALES[[_as_good(float(error), best) for error in errors[reading]]]
+    fitting = _SCALES[[_as_good(float(error), best) for error in errors[poses]]]
     if fitting.size and fitting.max() / fitting.min() > 4:
         undecided.append("the motion is too small, beside the depth, to tell the depth's scale")
     return problems, undecided
 
 
-def _registration_verdict(registration: DepthImageFit, problems: list[str], undecided: list[str]) -> None:
-    """Appends the verdict on the fit of depth and image."""
+def _registration_verdict(registration: DepthImageFit) -> tuple[list[str], list[str]]:
+    """Problems and undecided questions of the fit of depth and image."""
     if registration.edges < _MIN_EDGES or registration.contrast < _MIN_CONTRAST:
-        undecided.append("too few edges, or too many, to tell whether depth is registered to the images")
-    elif registration.quality < _NOT_ALIGNED:
-        problems.append(
-            f"depth looks not registered to the images: zoomed by {registration.zoom:.2f} and shifted by "
-            f"({registration.shift_x:.0f}, {registration.shift_y:.0f}) px its edges fit better"
-        )
-    elif registration.quality < _ALIGNED:
-        undecided.append("depth edges meet image edges too weakly to tell whether depth is registered")
+        return [], ["too few edges, or too many, to tell whether depth is registered to the images"]
+    if registration.quality < _NOT_ALIGNED:
+        shift = f"({registration.shift_x:.0f}, {registration.shift_y:.0f}) px"
+        zoomed = f"zoomed by {registration.zoom:.2f} and shifted by {shift} its edges fit better"
+        return [f"depth looks not registered to the images: {zoomed}"], []
+    weak = "depth edges meet image edges too weakly to tell whether depth is registered"
+    return [], [weak] if registration.quality < _ALIGNED else []

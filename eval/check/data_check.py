@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
+from ufmstar_torch.eval.results.files import to_json
 from ufmstar_torch.eval.sequences.conventions import OURS
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.tour.open import open_sequence
@@ -77,7 +78,7 @@ class DataReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; what is not finite is None."""
-        return {"ok": self.ok, **_plain(asdict(self))}
+        return {"ok": self.ok, **to_json(self)}
 
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
@@ -104,6 +105,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
     except (FrameError, FileNotFoundError, ImportError, ValueError) as error:
         return DataReport(name or Path(path).name, str(path), problems=(f"cannot be opened: {error}",))
     depth_range, filled = _depth_statistics(sequence)
+    positions = np.array([entry.T_world_cam[:3, 3] for entry in sequence.entries])
     problems, remedies, undecided, checked = _verdict(sequence, path, pairs, options)
     return DataReport(
         name=name or sequence.name,
@@ -114,7 +116,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         skipped=dict(Counter(frame.reason for frame in sequence.skipped)),
         without_depth=len(sequence.without_depth),
         posed=sequence.posed,
-        walked=_walked(sequence),
+        walked=float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         image_size=sequence.image_size,
         depth_size=sequence.depth_size,
         intrinsics=_pinhole(sequence.intrinsics),
@@ -147,14 +149,16 @@ def _verdict(
         remedies.append("they are skipped and counted when the sequence is used; copy them again if it is many")
     problems += outcome.problems
     remedies += _remedies(outcome, sequence, path, options)
-    return problems, remedies, list(outcome.undecided), {**_measured(outcome), "read": read, "unreadable": broken}
+    figures = ("pairs", "gap", "error", "poses", "scale", "best_error", "registration")
+    measured = {name: value for name, value in asdict(outcome).items() if name in figures}
+    return problems, remedies, list(outcome.undecided), {**measured, "read": read, "unreadable": broken}
 
 
 def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
     remedies = []
-    if check.convention != OURS:
+    if check.poses != OURS:
         given = options.get("poses", OURS)
-        remedies.append(f"--poses {check.convention}" if given == OURS else f"leave --poses {given} out")
+        remedies.append(f"--poses {check.poses}" if given == OURS else f"leave --poses {given} out")
     if any("depth looks too" in problem for problem in check.problems):
         remedies.append(_scale_remedy(check.scale, sequence, path, options))
     if any("disagree" in problem or "no two frames overlap" in problem for problem in check.problems):
@@ -205,19 +209,6 @@ def _metres_per_unit(sequence: FrameSequence, path: str | Path, options: Mapping
     return None
 
 
-def _measured(check: SequenceCheck) -> dict[str, Any]:
-    lies = check.registration
-    return {
-        "pairs": check.pairs,
-        "gap": check.gap,
-        "error": check.error,
-        "poses": check.convention,
-        "scale": check.scale,
-        "best_error": check.best_error,
-        "registration": None if lies is None else asdict(lies),
-    }
-
-
 def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
     """How many frames were read, and the errors of those that cannot be; a rendered frame always can."""
     if sequence.layout == "tour":
@@ -251,19 +242,5 @@ def _depth_statistics(sequence: FrameSequence) -> tuple[tuple[float, ...] | None
     return tuple(float(q) for q in np.quantile(depths, _QUANTILES)), depths.size / pixels
 
 
-def _walked(sequence: FrameSequence) -> float:
-    positions = np.array([entry.T_world_cam[:3, 3] for entry in sequence.entries])
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-
-
 def _pinhole(K: np.ndarray) -> tuple[float, ...]:
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-
-
-def _plain(value: Any) -> Any:
-    """The value as JSON can hold it."""
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

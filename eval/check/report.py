@@ -29,20 +29,19 @@ def page(report: DataReport) -> str:
     return "\n".join([*lines, *_problems(report), _end(report)])
 
 
-def line(report: DataReport) -> str:
-    """One sequence in one line."""
+def lines(reports: Sequence[DataReport]) -> str:
+    """Several sequences, a line each, and how many are fine."""
+    fine = sum(report.ok for report in reports)
+    return "\n".join([*map(_line, reports), f"{fine} of {len(reports)} sequences are fine"])
+
+
+def _line(report: DataReport) -> str:
     if report.ok:
         error = report.checked.get("error")
         fit = f", depth fits to {error:.1%}" if error is not None and report.posed else ""
         return f"fine     {report.name}: {report.layout}, {report.frames} of {report.on_disk} frames{fit}"
     remedy = f" -> {'; '.join(report.remedies)}" if report.remedies else ""
     return f"PROBLEM  {report.name}: {' '.join('; '.join(report.problems).split())}{remedy}"
-
-
-def lines(reports: Sequence[DataReport]) -> str:
-    """Several sequences, a line each, and how many are fine."""
-    fine = sum(report.ok for report in reports)
-    return "\n".join([*map(line, reports), f"{fine} of {len(reports)} sequences are fine"])
 
 
 def _problems(report: DataReport) -> list[str]:

@@ -37,6 +37,7 @@ from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.ufm import UfMConfig
@@ -45,14 +46,12 @@ from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
 from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.results.summary import versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence
-from ufmstar_torch.models.trained import TrainedInfo, load_trained, read_info
+from ufmstar_torch.models.trained import load_trained, read_info
 from ufmstar_torch.pipeline import NetworksInTurn
-from ufmstar_torch.ufmstar import UfMStar
 
 # Of "mixed" tours: what the networks were trained on, and what they never saw.
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
@@ -64,29 +63,18 @@ SUMMARY = "summary.json"
 DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))
 
 
-class DemoError(ValueError):
-    """An option is out of range, or cannot be met on this machine."""
-
-
 def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
-    """Walk through the tour and leave pictures, mixture and summary in a folder.
-
-    Args:
-        options: what to show.
-        progress: called at the start of each stage and after every step of it.
-
-    Returns:
-        What summary.json holds; ``report.text`` makes a table of it.
+    """Walk through the tour and leave pictures, mixture and summary in a folder; what summary.json holds. ``progress``
+    is called at the start of each stage and after every step of it.
 
     Raises:
         FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
-        DemoError: the device does not exist.
         FileNotFoundError, CheckpointError: the networks cannot be loaded.
         ValueError: the networks state no variance.
         OSError: the results cannot be written.
     """
     started = perf_counter()
-    device = _device(options.device)
+    device = torch.zeros((), device=options.device).device
     with _weights(options.weights) as file:
         info, members = read_info(file), load_trained(file)
         digest = sha256(file)
@@ -101,7 +89,13 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "out": str(options.out),
         "settings": options.settings(),
         "tour": {"seed": options.seed, "style": STYLE, "frames": len(sequence), "size": info.spec.size},
-        "network": _network(info, digest, len(members)),
+        "network": {
+            "file": info.path.name,
+            "sha256": digest,
+            "members": len(members),
+            "spec": info.spec.to_dict(),
+            "training": info.info,
+        },
         "methods": _methods(rows, metrics, walk),
         "surfaces": metrics.by_region(),
         "components": int(rows[2].estimator.memory()["count"]),
@@ -137,14 +131,9 @@ def surface_kinds(tour: Tour, frame: Frame) -> NDArray[np.int64]:
 
 
 def sheet_rows(unfamiliar: list[bool], rows: int = SHEET_ROWS) -> list[int]:
-    """Frames to show: half of them in each kind of room, spread evenly, familiar ones first.
-
-    Not the very first frame: nothing has been compared by then.
-
-    Args:
-        unfamiliar: of every frame, whether most of it shows an unfamiliar room.
-        rows: how many, at most.
-    """
+    """At most ``rows`` frames to show, given of every frame whether most of it shows an unfamiliar room: half of them
+    in each kind of room, spread evenly, familiar ones first. Not the very first frame: nothing has been compared by
+    then."""
     groups = [[i for i, is_new in enumerate(unfamiliar) if is_new == expected and i > 0] for expected in (False, True)]
     present = [group for group in groups if group]
     chosen: list[int] = []
@@ -172,22 +161,13 @@ class _RequireVariances(FrameSink):
     """Raises ValueError where a row has no variance: the network states none."""
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         if any(row.estimate.variance is None for row in result.rows.values()):
             raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
 
 
 class _Walk(FrameSink):
-    """Collects times and the rows of the contact sheet, and reports the progress.
-
-    Args:
-        unfamiliar: of every frame, whether most of it shows an unfamiliar room.
-        progress: called at the start and after every frame.
-
-    Attributes:
-        panels: the rows of the sheet, in its order.
-        ms: by row, the times of every frame by stage [ms].
-    """
+    """Collects the rows of the contact sheet and the times of every frame by row and stage [ms], and reports the
+    progress; ``unfamiliar``: of every frame, whether most of it shows an unfamiliar room."""
 
     def __init__(self, unfamiliar: list[bool], progress: Callable[[Progress], None]) -> None:
         self._unfamiliar, self._progress = unfamiliar, progress
@@ -197,16 +177,14 @@ class _Walk(FrameSink):
 
     @property
     def panels(self) -> list[FramePanel]:
-        """See above."""
+        """The rows of the sheet, in its order."""
         return [self._panels[index] for index in self._rows]
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._gaussians = next(row.estimator for row in stream.rows if row.key == UFM_STAR)
         self._progress(Progress("frames", 0, len(self._unfamiliar), None, 0))
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         for key, row in result.rows.items():
             self.ms.setdefault(key, []).append(row.ms)
         if result.index in self._rows:
@@ -221,17 +199,10 @@ class _Walk(FrameSink):
 
 
 def _walk(
-    sequence: FrameSequence,
-    source: DepthSource,
-    device: torch.device,
-    tour: Tour,
-    progress: Callable[[Progress], None],
+    sequence: FrameSequence, source: DepthSource, device: torch.device, tour: Tour, progress: Callable[[Progress], None]
 ) -> tuple[list[RowRunner], RegionMetrics, _Walk]:
-    """All frames through all rows, with their figures by kind of room.
-
-    Raises:
-        ValueError: a network states no variance of its own.
-    """
+    """All frames through all rows, with their figures by kind of room. Raises ValueError: a network states no variance
+    of its own."""
     # Libraries set themselves up at the first call, which does not count.
     FrameStream(sequence, range(1), demo_rows(source, device), device=device).drive([_RequireVariances()])
     rows, kinds = demo_rows(source, device), [surface_kinds(tour, frame) for frame in sequence]
@@ -258,7 +229,7 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
 
     progress(Progress("rooms", 0, len(sequence), None, 0))
     with ThreadPoolExecutor(1) as beside:
-        compiled = beside.submit(UfMStar(_POSTERIOR, device=device).warm_up, (64, 64), progress=compiling)
+        compiled = beside.submit(warm_up_command, _POSTERIOR, device, compiling, dense=True)
         for index in range(len(sequence)):
             frames.append(sequence[index])
             progress(Progress("rooms", index + 1, len(sequence), None, 0))
@@ -298,23 +269,10 @@ def _state_bytes(row: RowRunner) -> int:
     return int(row.estimator.memory().get("bytes", 0)) + sum(value.nbytes for value in evidence.values())
 
 
-def _network(info: TrainedInfo, digest: str, members: int) -> dict[str, Any]:
-    return {
-        "file": info.path.name,
-        "sha256": digest,
-        "members": members,
-        "spec": info.spec.to_dict(),
-        "training": info.info,
-    }
-
-
 @contextmanager
 def _weights(path: Path | None) -> Iterator[Path]:
-    """The file with the networks: the user's, or the package's own wherever that is installed.
-
-    Raises:
-        FileNotFoundError: it is not there.
-    """
+    """The file with the networks: the user's, or the package's own wherever that is installed. Raises
+    FileNotFoundError: it is not there."""
     if path is not None:
         if not path.is_file():
             raise FileNotFoundError(f"--weights: no such file: {path}")
@@ -325,15 +283,3 @@ def _weights(path: Path | None) -> Iterator[Path]:
         raise FileNotFoundError(f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another")
     with as_file(own) as file:
         yield file
-
-
-def _device(name: str) -> torch.device:
-    """The device, if it is there.
-
-    Raises:
-        DemoError: it is not.
-    """
-    try:
-        return torch.zeros((), device=require_device(name)).device
-    except ValueError as error:
-        raise DemoError(str(error)) from error

@@ -59,11 +59,16 @@ def main(options: DemoOptions) -> int:
     from ufmstar_torch.eval.commands.terminal import Bars
     from ufmstar_torch.eval.report.text import demo_explanation, demo_table
     from ufmstar_torch.eval.results.folder import FolderError
+    from ufmstar_torch.eval.results.machine import require_device
 
+    try:
+        require_device(options.device)
+    except ValueError as error:
+        raise UsageError(error) from error
     try:
         with Bars() as bars:
             summary = demo.run_demo(options, bars.show)
-    except (demo.DemoError, FileNotFoundError, FolderError) as error:
+    except (FileNotFoundError, FolderError) as error:
         raise UsageError(error) from error
     print(demo_table(summary), demo_explanation(summary), sep="\n\n")
     return 0

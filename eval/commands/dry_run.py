@@ -15,13 +15,7 @@ _FILE_BYTES = 2048  # of a cached file beside its maps, rounded up to what file 
 
 
 def dry_run(job: EvalJob, networks: Mapping[str, DepthSource], shard: Shard) -> str:
-    """Open every sequence, predict one frame, and describe the work.
-
-    Args:
-        job: what would be evaluated.
-        networks: loaded for the job.
-        shard: of the sequences.
-    """
+    """Open every sequence of a shard of the job, predict one frame with its networks, and describe the work."""
     lines = [f"{job.suite.name}: {job.suite.title}", f"{len(job.suite.rows)} rows:"]
     lines += [f"  {row.label}  [{networks[row.method.base].label}]" for row in job.suite.rows]
     if job.missing_bases:

@@ -260,8 +260,12 @@ def launch_from(options: EvalOptions) -> LaunchOptions:
 
 
 def _evaluate(options: EvalOptions) -> int:
-    from ufmstar_torch import UfMStar
+    import torch
+
+    from ufmstar_torch import UfMStarConfig
+    from ufmstar_torch.anchors.landmarks import DENSE
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
     from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.results.launch import evaluate_suite
 
@@ -269,8 +273,12 @@ def _evaluate(options: EvalOptions) -> int:
         job, launch = job_from(options), launch_from(options)
         for base in job.unused:
             bars.say(f"--network {base}=...: not used, suite {job.suite.name} has no row of it")
-        if any(row.method.fusion == UFM_STAR for row in job.suite.rows):
-            UfMStar().warm_up((32, 32), progress=partial(bars.frames, "kernels, compiled on the first run"))
+        rows = [row for row in job.suite.rows if row.method.fusion == UFM_STAR]
+        if rows:
+            anchors = {row.setting.anchors for row in rows}
+            config = UfMStarConfig(anchored=anchors != {""}, posterior=any(row.setting.posterior for row in rows))
+            shown = partial(bars.frames, "kernels, compiled on the first run")
+            warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
         outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
     if outcome.reports:
         return _report(outcome, options.threads, draws=not options.output.no_report)
@@ -279,25 +287,58 @@ def _evaluate(options: EvalOptions) -> int:
 
 def _report(outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
     """Print the table, make the measurements and pictures that belong to it, name what failed; the exit code."""
-    from ufmstar_torch.eval.commands.outcome import draw, measure, table
+    from ufmstar_torch.eval.report.data import ResultsError, load_results
+    from ufmstar_torch.eval.report.text import summary, written
+    from ufmstar_torch.eval.report.write import write_report
 
-    print(table(outcome), flush=True)
+    job = outcome.job
+    try:
+        print(summary(load_results(job.out, with_sums=False)))
+    except ResultsError as error:
+        print(error)
+    if job.missing_bases:
+        print(f"left out, without a --network: the rows of {', '.join(job.missing_bases)}")
+    print(f"{job.out}: eval.json, records/DATASET/SEQUENCE/ with a record for every row", flush=True)
     if outcome.finished:
-        if outcome.job.suite.efficiency:
-            print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
-        for line in (measure(outcome, threads), draw(outcome) if draws else None):
-            if line is not None:
-                print(line)
+        _measure(job, threads)
+    if outcome.finished and draws:
+        try:
+            print(written(job.out, write_report(job.out)))
+        except (ImportError, ResultsError) as error:
+            print(f"no report: {' '.join(str(error).split())}")
     for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
     if outcome.stopped:
-        kept = outcome.job.out / "records"
-        print(f"ufmstar eval: stopped; finished rows are kept in {kept}; --resume goes on", file=sys.stderr)
+        print(
+            f"ufmstar eval: stopped; finished rows are kept in {job.out / 'records'}; --resume goes on", file=sys.stderr
+        )
         return 130
     if outcome.failed or not outcome.finished:
         print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)
         return 1
     return 0
+
+
+def _measure(job: EvalJob, threads: int | None) -> None:
+    """Measure what a suite about efficiency needs, unless it exists; print why where it cannot be measured.
+
+    Not while sequences are still to be evaluated: other parts (``--shard``) are at them, and would be timed along.
+    """
+    if not job.suite.efficiency:
+        return
+    from ufmstar_torch.eval.bench.measure import EFFICIENCY, Plan, measure_job
+    from ufmstar_torch.eval.report.data import ResultsError, load_results
+
+    print("ufmstar eval: measuring time, energy and memory ...", file=sys.stderr)
+    if (job.out / EFFICIENCY).exists():
+        return
+    try:
+        if load_results(job.out, with_sums=False).missing:
+            print(f"no {EFFICIENCY} yet: it is measured when all sequences are evaluated")
+        else:
+            measure_job(job, Plan(threads=threads))
+    except (ResultsError, ValueError) as error:
+        print(f"no {EFFICIENCY}: {' '.join(str(error).split())}")
 
 
 def _dry_run(options: EvalOptions) -> int:

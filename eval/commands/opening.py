@@ -74,12 +74,8 @@ class SequenceOptions(OpeningOptions):
     drive: str | None = None
 
     def given(self) -> dict[str, Any]:
-        """The arguments of ``open_sequence`` that differ from its defaults.
-
-        Raises:
-            OSError, ValueError: intrinsics are neither a file nor four numbers, or a matrix file is missing or no
-                4x4 matrix.
-        """
+        """The arguments of ``open_sequence`` that differ from its defaults. Raises OSError, ValueError: intrinsics are
+        neither a file nor four numbers, or a matrix file is missing or no 4x4 matrix."""
         from ufmstar_torch.eval.sequences.poses import read_pose
 
         changed = super().given()

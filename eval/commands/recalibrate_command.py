@@ -66,11 +66,7 @@ def main(options: RecalibrateOptions) -> int:
 
 
 def _row(results: Results, name: str) -> Row:
-    """The row of this name.
-
-    Raises:
-        ValueError: the evaluation has no such row, or a method other than UfM*.
-    """
+    """The row of this name. Raises ValueError: the evaluation has no such row, or a method other than UfM*."""
     from ufmstar_torch.eval.methods.method import UFM_STAR
 
     rows = {row.label: row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration}

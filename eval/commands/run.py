@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.anchors.dense import DenseEvidence
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
 from ufmstar_torch.config import UfMStarConfig
@@ -27,14 +28,15 @@ from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Stopped
+from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
-from ufmstar_torch.eval.report.outputs import Finished, common_scales, draw_sheet, draw_video, write_mixture
+from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
 from ufmstar_torch.eval.results.files import to_json, write_json_atomic
-from ufmstar_torch.eval.results.journal import Journal, MapWriter, row_state
+from ufmstar_torch.eval.results.journal import Journal, row_state
 from ufmstar_torch.eval.results.run_folder import RunFolder
 from ufmstar_torch.eval.results.summary import FAILED, FINISHED, INTERRUPTED, Ending, summarise
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
-from ufmstar_torch.recalibrate import Recalibration, read_recalibration, split_name
+from ufmstar_torch.recalibrate import read_recalibration, split_name
 from ufmstar_torch.ufmstar import UfMStar
 
 # [s] between two updates of the summary of a run that is going on.
@@ -44,40 +46,28 @@ _GOING_ON = Ending(INTERRUPTED, "no orderly end: the program was killed, or is s
 
 @dataclass(frozen=True, eq=False)
 class RunJob:
-    """What to run.
+    """What to run."""
 
-    Attributes:
-        sequence: the posed frames.
-        indices: which of them, in order.
-        source: of the depth.
-        config: of UfM*.
-        device: of UfM*.
-        settings: everything the user chose, as plain values, for the summary.
-        recalibration: FILE@DIGEST of a map of the variance; "" = none.
-        every: all members predict on every image, instead of one in turn.
-        video: whether to make preview.mp4.
-        sheet: whether to make contact_sheet.png.
-        landmarks: makes the source of the anchors, in its initial state; for ``config.anchored``.
-    """
-
-    sequence: FrameSequence
-    indices: range
-    source: DepthSource
-    config: UfMStarConfig
-    device: torch.device
-    settings: Mapping[str, Any]
-    recalibration: str = ""
-    every: bool = False
-    video: bool = True
-    sheet: bool = True
+    sequence: FrameSequence  # the posed frames
+    indices: range  # which of them, in order
+    source: DepthSource  # of the depth
+    config: UfMStarConfig  # of UfM*
+    device: torch.device  # of UfM*
+    settings: Mapping[str, Any]  # everything the user chose, as plain values, for the summary
+    recalibration: str = ""  # FILE@DIGEST of a map of the variance; "" = none
+    every: bool = False  # all members predict on every image, instead of one in turn
+    video: bool = True  # whether to make preview.mp4
+    sheet: bool = True  # whether to make contact_sheet.png
+    # makes the source of the anchors, in its initial state; for ``config.anchored``.
     landmarks: Callable[[], LandmarkSource] = LandmarkTracker
 
     def row(self, module: Mapping[str, Tensor], position: int) -> RowRunner:
         """UfM* on the source after ``position`` frames, in the state that a checkpoint holds; {} at the start."""
+        mapped = read_recalibration(self.recalibration) if self.recalibration else None
         row = RowRunner(
             UFM,
             self.source,
-            Gaussians(self.config, self.device, recalibration=self._map()),
+            Gaussians(self.config, self.device, recalibration=mapped),
             every=self.every,
             anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks())) if self.config.anchored else None,
             skips_faults=True,
@@ -86,9 +76,6 @@ class RunJob:
         if module:
             row.load_state(row_state(module, bare=not self.source.needs_image, images=torch.tensor(position)))
         return row
-
-    def _map(self) -> Recalibration | None:
-        return read_recalibration(self.recalibration) if self.recalibration else None
 
     @property
     def source_identity(self) -> dict[str, Any]:
@@ -129,21 +116,13 @@ class RunJob:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is.
+    """How far a run is."""
 
-    Attributes:
-        stage: "kernels" (compiled on a machine's first run), "frames" or "pictures".
-        done: of this stage, skipped frames included.
-        total: of this stage.
-        components: K after this frame, None if it was skipped or nothing has been done yet.
-        skipped: frames so far.
-    """
-
-    stage: str
-    done: int
-    total: int
-    components: int | None
-    skipped: int
+    stage: str  # "kernels" (compiled on a machine's first run), "frames" or "pictures"
+    done: int  # of this stage, skipped frames included
+    total: int  # of this stage
+    components: int | None  # K after this frame, None if it was skipped or nothing has been done yet
+    skipped: int  # frames so far
 
 
 def run(
@@ -202,13 +181,14 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     def compiling(done: int, total: int) -> None:
         progress(Progress("kernels", done, total, None, 0))
 
-    UfMStar(job.config, device=job.device).warm_up((32, 32), progress=compiling)
+    dense = job.config.anchored and isinstance(job.landmarks(), DenseEvidence)
+    warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
     position = folder.checkpoint.position
     row = job.row(folder.checkpoint.module, position)
-    metrics, maps = RunMetrics(UFM, folder.checkpoint.metrics), MapWriter(UFM, folder.writer)
-    journal = Journal(UFM, folder, metrics.figures.state, maps, bare=not job.source.needs_image)
+    metrics = RunMetrics(UFM, folder.checkpoint.metrics)
+    journal = Journal(UFM, folder, metrics.figures.state, bare=not job.source.needs_image)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=position)
-    with Behind([metrics, maps, journal, _Summaries(job, folder)]) as behind:
+    with Behind([metrics, journal, _Summaries(job, folder)]) as behind:
         stream.drive([behind, _Reports(job, folder, progress)], stop=stop)
 
 
@@ -220,11 +200,9 @@ class _Reports(FrameSink):
         self._skipped = sum(record["state"] == "skipped" for record in folder.records)
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._progress(Progress("frames", stream.position, len(self._job.indices), None, self._skipped))
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         self._skipped += len(result.skipped)
         statistics = result.rows[UFM].estimate.statistics if UFM in result.rows else None
         components = None if statistics is None else int(statistics.components[0])
@@ -238,11 +216,9 @@ class _Summaries(FrameSink):
         self._job, self._folder = job, folder
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._reported = perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """See ``Sink``."""
         if perf_counter() - self._reported > _SUMMARY_EVERY:
             _write_summary(self._job, self._folder, _GOING_ON)
             self._reported = perf_counter()
@@ -269,18 +245,19 @@ def _outputs(
     done = [record for record in folder.records if record["state"] == "done"]
     if not done:
         return {}
-    write_mixture(folder.path, _ufm(job, folder))
+    for name, write in mixture_writers(_ufm(job, folder)).items():
+        write(folder.path / name)
     write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).figures.curves())
     made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = Finished(folder.path, job.sequence, done, with_error)
     try:
         if job.sheet or job.video:
-            scales = common_scales(finished)
+            columns = common_columns(finished)
         if job.sheet:
-            draw_sheet(finished, scales, f"{job.sequence.name}: {_counts(folder, job)}")
+            draw_sheet(finished, columns, f"{job.sequence.name}: {_counts(folder, job)}")
             made["contact_sheet.png"] = None
-        for drawn in draw_video(finished, scales) if job.video else ():
+        for drawn in draw_video(finished, columns) if job.video else ():
             progress(Progress("pictures", drawn, len(done), None, 0))
             if stop():
                 raise Stopped

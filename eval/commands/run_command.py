@@ -195,12 +195,7 @@ def main(options: RunOptions) -> int:
     try:
         with Bars() as bars, stop_signals(bars.say) as stop:
             summary = run_job(
-                job,
-                options.out,
-                resume=options.resume,
-                overwrite=options.overwrite,
-                progress=bars.show,
-                stop=stop,
+                job, options.out, resume=options.resume, overwrite=options.overwrite, progress=bars.show, stop=stop
             )
     except FolderError as error:
         raise UsageError(error) from error
@@ -208,11 +203,8 @@ def main(options: RunOptions) -> int:
 
 
 def _check_depth(options: Mapping[str, Any]) -> None:
-    """Whether the options name one source of depth, and nothing that belongs to another one.
-
-    Raises:
-        ValueError: they do not.
-    """
+    """Whether the options name one source of depth, and nothing that belongs to another one. Raises ValueError: they do
+    not."""
     model, depth = options["model"], options["depth"]
     if (model is None) == (depth is None):
         expected = "--model NAME --weights FILE for a network, or --depth DIR for maps that are already predicted"

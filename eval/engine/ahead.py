@@ -12,15 +12,8 @@ _AHEAD = 2  # frames; decoding releases Python's lock
 
 
 class FramesAhead:
-    """The frames of a sequence one after the other, read by one thread that is at most two frames ahead.
-
-    Use it as a context; the thread ends with the block.
-
-    Args:
-        sequence: whose frames.
-        indices: which of them, in order.
-        prepare: called with every frame that was read, in the thread.
-    """
+    """The frames of a sequence at some indices, in order, read by one thread that is at most two frames ahead and calls
+    ``prepare`` with each. Use it as a context; the thread ends with the block."""
 
     def __init__(
         self, sequence: FrameSequence, indices: Iterable[int], prepare: Callable[[Frame], None] = lambda _: None

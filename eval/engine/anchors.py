@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 import torch
@@ -33,21 +32,14 @@ _TAKEN, _NOISE = 1, 2
 
 @dataclass(frozen=True, eq=False)
 class FrameAnchors:
-    """The anchors of one frame.
+    """The anchors of one frame."""
 
-    Attributes:
-        anchors: [1, N] in the pixels of the depth map, on its device; None where there is no image to track in.
-        tracked: corners that were followed from the frame before; 0 of ground truth.
-        triangulated: those of them with a depth; of ground truth, all.
-        ms: of the tracker [ms]; None of ground truth.
-        none: why nothing was triangulated, where that is so.
-    """
-
+    # [1, N] in the pixels of the depth map, on its device; None where there is no image to track in.
     anchors: Anchors | None
-    tracked: int = 0
-    triangulated: int = 0
-    ms: float | None = None
-    none: str = ""
+    tracked: int = 0  # corners that were followed from the frame before; 0 of ground truth
+    triangulated: int = 0  # those of them with a depth; of ground truth, all
+    ms: float | None = None  # of the tracker [ms]; None of ground truth
+    none: str = ""  # why nothing was triangulated, where that is so
 
 
 class Tracks:
@@ -62,17 +54,9 @@ class Tracks:
         self._before: Mapping[str, Tensor] = {}
         self._last: tuple[Frame, Landmarks, float] | None = None
 
-    @property
-    def identity(self) -> dict[str, Any]:
-        """Plain values on which the landmarks depend."""
-        return self._tracker.identity
-
     def of(self, frame: Frame, T_world_cam: NDArray[np.float64]) -> tuple[Landmarks, float] | None:
-        """Landmarks of a frame, which follows those that were asked for before, and the time that they took [ms].
-
-        Args:
-            frame: without an image that the source needs, there are none, and the source stays as it is.
-            T_world_cam: [4, 4], noise included [m].
+        """Landmarks of a frame, which follows those that were asked for before, at the pose [4, 4] with its noise [m],
+        and the time that they took [ms]. None without an image that the source needs; the source stays as it is.
 
         Raises:
             ModuleNotFoundError: OpenCV is not installed.
@@ -97,11 +81,7 @@ class Tracks:
         return self._tracker.state()
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken.
-
-        Raises:
-            ValueError: it is of a tracker of another size.
-        """
+        """Continue where ``state`` was taken. Raises ValueError: it is of a tracker of another size."""
         self._tracker.load_state(state)
         self._last = None
 
@@ -123,20 +103,10 @@ class AnchorSource:
         self._setting, self.tracks = setting, tracks
 
     def of(
-        self,
-        frame: Frame,
-        T_world_cam: NDArray[np.float64],
-        prediction: Prediction,
-        truth: NDArray[np.float32] | None,
+        self, frame: Frame, T_world_cam: NDArray[np.float64], prediction: Prediction, truth: NDArray[np.float32] | None
     ) -> FrameAnchors:
-        """The anchors of the next frame.
-
-        Args:
-            frame: the next one.
-            T_world_cam: [4, 4] as the row sees it [m].
-            prediction: with the camera of the maps.
-            truth: [h, w] at their pixels [m], 0 = none; None = nowhere.
-        """
+        """The anchors of the next frame, at the pose [4, 4] that the row sees [m], in the camera of the prediction;
+        ``truth`` [h, w] is the ground truth at its pixels [m], 0 = none, or None."""
         device = prediction.depth.device
         if self.tracks is None:
             known = np.zeros(prediction.size, np.float32) if truth is None else truth
@@ -196,11 +166,8 @@ class AnchorSource:
 
 
 def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
-    """What yields the landmarks of a sequence: the one place where an option or a setting becomes a source.
-
-    Args:
-        value: True, "corners" or "tracked": tracked corners; else as ``landmark_source`` takes it.
-        folder: of the sequence; a file of landmarks lies in it, or else in the working folder.
+    """What yields the landmarks of a sequence; True, "corners" and "tracked" mean tracked corners, other values are as
+    ``landmark_source`` takes them. A file of landmarks lies in the sequence's folder or the working folder.
 
     Raises:
         FileNotFoundError: no such file.
@@ -212,22 +179,16 @@ def landmarks_of(value: str | bool, folder: Path | None) -> LandmarkSource:
 
 
 def landmark_digests(rows: Iterable[Row], folder: Path | None) -> dict[str, str]:
-    """Digests of the landmarks of those rows that have them from a file, by the rows' slugs.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`landmarks_of`.
-    """
+    """Digests of the landmarks of those rows that have them from a file, by the rows' slugs. Raises FileNotFoundError,
+    ValueError, as :func:`landmarks_of`."""
     files = {row.slug: row.setting.anchors for row in rows if row.setting.anchors not in ("", TRACKED, DENSE, TRUTH)}
     known = {file: landmarks_of(file, folder).identity for file in set(files.values())}
     return {slug: known[file]["landmarks"] for slug, file in files.items() if "landmarks" in known[file]}
 
 
 def anchor_sources(rows: Iterable[Row], folder: Path | None = None) -> dict[Row, AnchorSource]:
-    """The source of every row with anchors; rows of the same images and poses share a tracker.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`landmarks_of`.
-    """
+    """The source of every row with anchors; rows of the same images and poses share a tracker. Raises
+    FileNotFoundError, ValueError, as :func:`landmarks_of`."""
     tracks: dict[tuple[object, ...], Tracks] = {}
     sources = {}
     for row in rows:

@@ -14,7 +14,7 @@ from time import perf_counter
 import torch
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink, hand_over
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, hand_over
 
 # Frames that wait for their sinks; each holds its maps and the state after it, about 3 MB at 224 x 224.
 _WAITING = 4
@@ -31,7 +31,7 @@ class Behind(FrameSink):
             time since the frame before [ms]: of the whole loop, waiting for these sinks included.
     """
 
-    def __init__(self, sinks: Sequence[Sink]) -> None:
+    def __init__(self, sinks: Sequence[FrameSink]) -> None:
         self._sinks = tuple(sinks)
         self._timer = StageTimer(torch.device("cpu"))
         self._thread = ThreadPoolExecutor(1)
@@ -49,18 +49,14 @@ class Behind(FrameSink):
             self._thread.shutdown(cancel_futures=True)
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
         self._stream = stream
         for sink in self._sinks:
             sink.begin(stream)
         self._last = perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """Queue a frame; waits where the sinks are too far behind.
-
-        Raises:
-            BaseException: what a sink raised for an earlier frame.
-        """
+        """Queue a frame; waits where the sinks are too far behind. Raises BaseException: what a sink raised for an
+        earlier frame."""
         self._wait(_WAITING)
         state = {name: value.clone() for name, value in self._stream.state().items()}
         now = perf_counter()
@@ -69,7 +65,6 @@ class Behind(FrameSink):
         self._waiting.append(self._thread.submit(self._work, replace(result, state=state)))
 
     def end(self) -> None:
-        """See ``Sink``."""
         self._wait(0)
         for sink in self._sinks:
             sink.end()

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.gaussian_streams import StreamInput, UfMStarStreams
 from ufmstar_torch.eval.engine.predictions import Prediction
-from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
+from ufmstar_torch.eval.methods.method import ALONE, UFM
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import configured
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
@@ -27,36 +27,26 @@ from ufmstar_torch.ufmstar import UfMStar, UfMStarOutput
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A row's answer for one frame: maps [h, w] on the CPU.
+    """A row's answer for one frame: maps [h, w] on the CPU."""
 
-    Attributes:
-        depth: as predicted, or corrected by the anchors' bias, where the row is about that [m].
-        variance: total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
-        valid: bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
-        aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
-        disagreement: M of UfM* [m^2], or None.
-        anchored: B of UfM* with anchors [m^2], or None.
-        bias: r of UfM* with anchors, or None.
-        posterior_depth: of UfM* with anchors and a posterior [m], or None.
-        posterior_variance: likewise [m^2].
-        statistics: of UfM*, [1] per count, or None.
-    """
-
-    depth: Tensor
+    depth: Tensor  # as predicted, or corrected by the anchors' bias, where the row is about that [m]
+    # total variance [m^2], NaN where not valid; None for a network that predicts depth alone.
     variance: Tensor | None
+    # bool, True where there is a prediction: depth is positive and finite, and so is every variance used.
     valid: Tensor
+    # aleatoric, epistemic: A and E as far as the row uses them [m^2], or None.
     aleatoric: Tensor | None = None
     epistemic: Tensor | None = None
-    disagreement: Tensor | None = None
-    anchored: Tensor | None = None
-    bias: Tensor | None = None
-    posterior_depth: Tensor | None = None
-    posterior_variance: Tensor | None = None
-    statistics: FrameStatistics | None = None
+    disagreement: Tensor | None = None  # M of UfM* [m^2], or None
+    anchored: Tensor | None = None  # B of UfM* with anchors [m^2], or None
+    bias: Tensor | None = None  # r of UfM* with anchors, or None
+    posterior_depth: Tensor | None = None  # of UfM* with anchors and a posterior [m], or None
+    posterior_variance: Tensor | None = None  # likewise [m^2]
+    statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
 
 
-class Estimator(Protocol):
-    """Turns the predictions of a sequence, one after the other, into variances."""
+class Estimator:
+    """Turns the predictions of a sequence, one after the other, into variances; this one remembers nothing."""
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """Take in the next frame.
@@ -66,33 +56,25 @@ class Estimator(Protocol):
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
             anchors: [1, N] of the frame in the map's pixels; None = none.
         """
-        ...
+        raise NotImplementedError
 
     def memory(self) -> dict[str, float]:
         """What is kept for the next frame: "bytes" and "count" of points or components, "smoothing_bytes" of the map
         kept for smoothing [B]; {} if nothing is. With anchors also "anchors", those used of the frame."""
-        ...
+        return {}
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends."""
-        ...
+        return {}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken.
-
-        Raises:
-            ValueError: it is the state of another kind of estimator.
-        """
-        ...
+        """Continue where ``state`` was taken; raises ValueError for that of another kind of estimator."""
+        if state:
+            raise ValueError(f"the saved state has {sorted(state)} too many")
 
 
-@dataclass(frozen=True, eq=False)
-class EstimatorInput:
-    """The arguments of :meth:`Estimator.update`."""
-
-    prediction: Prediction
-    T_world_cam: Tensor
-    anchors: Anchors | None = None
+# The arguments of :meth:`Estimator.update`.
+EstimatorInput = tuple[Prediction, Tensor, Anchors | None]
 
 
 def make_estimator(row: Row, device: torch.device, max_depth: float | None = None, *, streams: int = 1) -> Estimator:
@@ -105,33 +87,26 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         streams: of UfM* (:meth:`Gaussians.stream`); with ``config.spill``, whose folder is one sequence's, one.
 
     Raises:
-        ValueError: the setting changes what UfM* does not have, or what the method does not use; or a recalibration
-            that was fitted under other settings.
+        ValueError: a recalibration that was fitted under other settings.
         FileNotFoundError: the setting's recalibration does not exist.
     """
-    method = row.method
-    if row.setting.of_ufm_star and method.fusion in (ALONE, UFM):
-        raise ValueError(f"{row.label}: settings of UfM* go with UfM* only")
-    if row.setting.anchors and method.fusion != UFM_STAR:
-        raise ValueError(f"{row.label}: anchors go with UfM* only")
-    if row.setting.recalibration and method.fusion != UFM_STAR:
-        raise ValueError(f"{row.label}: a recalibration goes with UfM* only")
+    method, setting = row.method, row.setting
     if method.fusion == ALONE:
         return Alone(uses_variances=method.uses_aleatoric)
     if method.fusion == UFM:
         points = UfMConfig(max_points=method.max_points, on_bad_frame="skip")
         return Pointwise(points, device, uses_variances=method.uses_aleatoric)
-    recalibration = read_recalibration(row.setting.recalibration) if row.setting.recalibration else None
+    recalibration = read_recalibration(setting.recalibration) if setting.recalibration else None
     config = ufm_star_config(row).within(max_depth)
     return Gaussians(
         config,
         device,
         streams=streams if config.spill is None else 1,
         uses_variances=method.uses_aleatoric,
-        corrected=row.setting.corrected,
-        posterior=row.setting.posterior,
+        corrected=setting.corrected,
+        posterior=setting.posterior,
         recalibration=recalibration,
-        aleatoric_in_h=row.setting.aleatoric_in_h,
+        aleatoric_in_h=setting.aleatoric_in_h,
     )
 
 
@@ -143,29 +118,18 @@ def ufm_star_config(row: Row) -> UfMStarConfig:
     and rows in pixels are not scaled, and the threshold a z^2 / f has the image's own focal length, where scaling keeps
     a / f. Segments are then smaller and more. Thresholds in metres, overlaps and radii are alike in both. At 224 x 224
     only the second part makes a difference, as far as the focal length is not 200 px.
-
-    Raises:
-        ValueError: an override has an unknown name or an impossible value; the message names it.
     """
-    try:
-        config = configured(row.setting).replace(on_bad_frame="skip")
-    except ValueError as error:
-        raise ValueError(f"{row.label}: {error}") from error
+    config = configured(row.setting).replace(on_bad_frame="skip")
     return config.replace(segment=replace(config.segment, scale_with_image=False)) if row.method.fixed_param else config
 
 
 @dataclass(frozen=True)
-class Alone:
-    """The network's own variance, A + E of what it has.
+class Alone(Estimator):
+    """The network's own variance, A + E of what it has."""
 
-    Attributes:
-        uses_variances: False leaves A and E aside, so that there is no variance.
-    """
-
-    uses_variances: bool = True
+    uses_variances: bool = True  # False leaves A and E aside, so that there is no variance
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`; pose and anchors do not matter."""
         a, e = _variances(prediction, self.uses_variances)
         parts = [part for part in (a, e) if part is not None]
         valid = (prediction.depth > 0) & prediction.depth.isfinite()
@@ -174,35 +138,15 @@ class Alone:
         variance = torch.where(valid, sum(parts[1:], start=parts[0]), torch.nan) if parts else None
         return _estimate(depth=prediction.depth, variance=variance, valid=valid, aleatoric=a, epistemic=e)
 
-    def memory(self) -> dict[str, float]:
-        """Nothing."""
-        return {}
 
-    def state(self) -> dict[str, Tensor]:
-        """Nothing."""
-        return {}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """See :meth:`Estimator.load_state`."""
-        if state:
-            raise ValueError(f"the saved state has {sorted(state)} too many")
-
-
-class Pointwise:
-    """UfM.
-
-    Args:
-        config: its settings.
-        device: of the points.
-        uses_variances: False leaves A and E aside.
-    """
+class Pointwise(Estimator):
+    """UfM. Without ``uses_variances``, A and E are left aside."""
 
     def __init__(self, config: UfMConfig, device: torch.device, *, uses_variances: bool = True) -> None:
         self.ufm = UfM(config, device=device)
         self._uses_variances = uses_variances
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`; anchors do not matter."""
         a, e = _variances(prediction, self._uses_variances)
         out = self.ufm(prediction.depth[None], T_world_cam, prediction.intrinsics, _one(a), _one(e))
         return _estimate(depth=prediction.depth, variance=out.variance[0], valid=out.valid[0], aleatoric=a, epistemic=e)
@@ -214,15 +158,13 @@ class Pointwise:
         return {"bytes": count * (cloud.bytes_per_point if cloud else 0), "count": count, "smoothing_bytes": 0}
 
     def state(self) -> dict[str, Tensor]:
-        """See :meth:`Estimator.state`."""
         return dict(self.ufm.state_dict())
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """See :meth:`Estimator.load_state`."""
         _load(self.ufm, state)
 
 
-class Gaussians:
+class Gaussians(Estimator):
     """UfM*.
 
     Args:
@@ -273,33 +215,25 @@ class Gaussians:
         return self._streams.choose(self._stream, prediction.size), prediction.size, *prediction.maps()
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """See :meth:`Estimator.update`.
-
-        Raises:
-            ValueError: ``aleatoric_in_h`` without an aleatoric variance.
-        """
-        return self.update_together([self], [EstimatorInput(prediction, T_world_cam, anchors)])[0]
+        """See :meth:`Estimator.update`. Raises ValueError: ``aleatoric_in_h`` without an aleatoric variance."""
+        return self.update_together([self], [(prediction, T_world_cam, anchors)])[0]
 
     @staticmethod
     def update_together(streams: Sequence[Gaussians], inputs: Sequence[EstimatorInput]) -> list[Estimate]:
-        """The next frames of some streams of one UfM*, which have the same :meth:`batch`.
-
-        Raises:
-            ValueError: as :meth:`update`.
-        """
-        frames = {one._stream: one._input(given) for one, given in zip(streams, inputs, strict=True)}
+        """The next frames of some streams of one UfM*, which have the same :meth:`batch`. Raises ValueError, as
+        :meth:`update`."""
+        frames = {one._stream: one._input(*given) for one, given in zip(streams, inputs, strict=True)}
         out = streams[0]._streams(frames)
         return [one._estimate(frames[one._stream], out[one._stream]) for one in streams]
 
-    def _input(self, given: EstimatorInput) -> StreamInput:
-        prediction = given.prediction
+    def _input(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None) -> StreamInput:
         a, e = _variances(prediction, self._uses_variances)
         features = None
         if self._in_h:
             if a is None:
                 raise ValueError("aleatoric_in_h needs a network that predicts an aleatoric variance")
             features = torch.stack([a, torch.ones_like(a)])
-        return StreamInput(prediction.depth, given.T_world_cam, prediction.intrinsics, a, e, features, given.anchors)
+        return StreamInput(prediction.depth, T_world_cam, prediction.intrinsics, a, e, features, anchors)
 
     def _estimate(self, given: StreamInput, out: UfMStarOutput) -> Estimate:
         """What the row makes of UfM*'s output for one stream."""
@@ -346,7 +280,6 @@ class Gaussians:
         return kept
 
     def state(self) -> dict[str, Tensor]:
-        """See :meth:`Estimator.state`."""
         return self._streams.state(self._stream)
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:

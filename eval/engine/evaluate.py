@@ -8,9 +8,10 @@ where it predicts something. How many it leaves out is among its figures (``left
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -20,12 +21,11 @@ from torch import Tensor
 from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
-from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.estimators import Estimator, Gaussians, make_estimator
-from ufmstar_torch.eval.engine.judge import RowMetrics
+from ufmstar_torch.eval.engine.judge import RowMetrics, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
 from ufmstar_torch.eval.engine.rows import RowRunner
-from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, Sink, drive_together
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, drive_together
 from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import TRACKED
@@ -53,38 +53,28 @@ BROKEN = (SequenceError, FrameError, RuntimeError, ValueError)
 
 @dataclass(frozen=True)
 class RowResult:
-    """One row on one sequence.
+    """One row on one sequence."""
 
-    Attributes:
-        row: which.
-        frames, figures, curves, state, ms: as ``Record`` has them.
-        sums: states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and
-            "nll_by_error:REFERENCE" (``NLLByError``), to be added up over sequences.
-    """
-
-    row: Row
+    row: Row  # which
+    # frames, figures, curves, state, ms: as ``Record`` has them.
     frames: dict[str, Any]
     figures: dict[str, float]
     curves: dict[str, Any]
     state: dict[str, float]
     ms: dict[str, float]
+    # states of the metrics on the CPU by name: "metrics" (``SequenceMetrics``) and "nll_by_error:REFERENCE"
+    # (``NLLByError``), to be added up over sequences.
     sums: dict[str, dict[str, Tensor]]
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceTask:
-    """What is judged of a sequence.
+    """What is judged of a sequence."""
 
-    Attributes:
-        sequence: posed frames with ground truth.
-        rows: different ones.
-        sinks: take the frames after the metrics; a row's key is its slug.
-        progress: called with the frames that are done and all of them, at the start and after every one.
-    """
-
-    sequence: FrameSequence
-    rows: Sequence[Row]
-    sinks: Sequence[Sink] = ()
+    sequence: FrameSequence  # posed frames with ground truth
+    rows: Sequence[Row]  # different ones
+    sinks: Sequence[FrameSink] = ()  # take the frames after the metrics; a row's key is its slug
+    # called with the frames that are done and all of them, at the start and after every one.
     progress: Callable[[int, int], None] = lambda done, total: None
 
 
@@ -92,26 +82,18 @@ class SequenceTask:
 class Judge:
     """How sequences are judged.
 
-    Attributes:
-        networks: by base.
-        device: where UfM and UfM* run.
-        store: of predictions; None = all are computed.
-        limit: which frames, before a setting's skip.
-        confident: of the pixels of a frame, the share of which a reference method counts as confident.
-        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
-        streams: sequences that are judged at the same time: networks and UfM* get their frames as one batch. UfM* gives
-            the same bits as for one sequence after the other; a network may not (``NetworkSource.several``).
-
     Raises:
         ValueError: a share of confident pixels out of range, or less than one stream.
     """
 
-    networks: Mapping[str, DepthSource]
-    device: torch.device
-    store: PredictionStore | None = None
-    limit: slice = field(default_factory=lambda: slice(None))
-    confident: float = 0.5
-    bins: str = "ours"
+    networks: Mapping[str, DepthSource]  # by base
+    device: torch.device  # where UfM and UfM* run
+    store: PredictionStore | None = None  # of predictions; None = all are computed
+    limit: slice = field(default_factory=lambda: slice(None))  # which frames, before a setting's skip
+    confident: float = 0.5  # of the pixels of a frame, the share of which a reference method counts as confident
+    bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
+    # sequences that are judged at the same time: networks and UfM* get their frames as one batch. UfM* gives the same
+    # bits as for one sequence after the other; a network may not (``NetworkSource.several``).
     streams: int = 1
 
     def __post_init__(self) -> None:
@@ -144,7 +126,7 @@ def evaluate_sequences(
     estimators = _Estimators(judge.device, judge.streams)
     running: dict[FrameStream, _Evaluation] = {}
 
-    def begun() -> Iterator[tuple[FrameStream, Sequence[Sink]]]:
+    def begun() -> Iterator[tuple[FrameStream, Sequence[FrameSink]]]:
         for task in tasks:
             slot = min(set(range(judge.streams)) - {one.slot for one in running.values()})
             try:
@@ -202,14 +184,15 @@ class _Evaluation:
         anchors = anchor_sources(rows, sequence.folder)
         named = {row.slug: {other.slug: other.method.name for other in references(row, rows)} for row in rows}
         self._metrics, self._accounts = RowMetrics(named, judge.confident, judge.bins), _Accounts()
-        self.sinks: Sequence[Sink] = [self._metrics, self._accounts, *task.sinks, ProgressSink(task.progress)]
+        self.sinks: Sequence[FrameSink] = [self._metrics, self._accounts, *task.sinks, ProgressSink(task.progress)]
         runners = []
         for row in rows:
             source = sources[row.method.base, row.setting.preprocess]
             estimator = estimators.of(row, source.max_depth, slot)
             how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting}
             runners.append(RowRunner(row.slug, source, estimator, **how, anchors=anchors.get(row), device=judge.device))
-        check = _FrameCheck(list(sources.values()), any(row.setting.anchors in (TRACKED, DENSE) for row in rows))
+        tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)
+        check = partial(_check_frame, sources=sources.values(), tracked=tracked)
         self.stream = FrameStream(sequence, indices, runners, store=judge.store, device=judge.device, check=check)
 
     def outcome(self) -> list[RowResult] | Exception:
@@ -221,26 +204,19 @@ class _Evaluation:
             return error
 
 
-@dataclass(frozen=True)
-class _FrameCheck:
-    """Raises FrameError unless all networks and UfM* can use a frame.
-
-    Attributes:
-        sources: of depth.
-        tracked: whether anchors are looked for in the image.
-    """
-
-    sources: Sequence[DepthSource]
-    tracked: bool
-
-    def __call__(self, frame: Frame) -> None:
-        if frame.image is None and (self.tracked or any(source.needs_image for source in self.sources)):
-            raise FrameError(frame.name, "no image")
-        if frame.depth is None and not all(source.needs_image for source in self.sources):
-            raise FrameError(frame.name, "no depth map")
-        fault = frame_fault(frame)
-        if fault is not None:
-            raise FrameError(frame.name, fault)
+def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
+    """Raises FrameError unless all sources and UfM* can use a frame, in whose image anchors may be ``tracked``."""
+    if frame.image is None and (tracked or any(source.needs_image for source in sources)):
+        raise FrameError(frame.name, "no image")
+    if frame.depth is None and not all(source.needs_image for source in sources):
+        raise FrameError(frame.name, "no depth map")
+    pictured = frame.image if frame.image is not None else frame.depth
+    height, width = (1, 1) if pictured is None else pictured.shape[:2]
+    one = torch.ones(1, 1, 1).expand(1, height, width)
+    pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
+    checked = check_frame(one, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
+    if int(checked.fault[0]):
+        raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
 
 
 class ProgressSink(FrameSink):
@@ -250,12 +226,10 @@ class ProgressSink(FrameSink):
         self._progress, self._total = progress, 0
 
     def begin(self, stream: FrameStream) -> None:
-        """See :class:`Sink`."""
         self._total = len(stream.indices)
         self._progress(stream.position, self._total)
 
     def take(self, result: FrameResult) -> None:
-        """See :class:`Sink`."""
         self._progress(result.number + 1, self._total)
 
 
@@ -263,57 +237,47 @@ class ProgressSink(FrameSink):
 class _Account:
     """Counts, times and memory of a row over a sequence."""
 
-    done: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
-    ms: dict[str, list[float]] = field(default_factory=lambda: {"network": [], "anchors": [], "uncertainty": []})
-    last: dict[str, float] = field(default_factory=dict)
-    total: dict[str, float] = field(default_factory=dict)
-    most: dict[str, float] = field(default_factory=dict)
-
-    def add(self, ms: Mapping[str, float], memory: Mapping[str, float]) -> None:
-        """A frame that the row has taken in."""
-        self.done += 1
-        for stage, time in ms.items():
-            self.ms[stage].append(time)
-        self.last = dict(memory)
-        for name, value in memory.items():
-            self.total[name] = self.total.get(name, 0) + value
-            self.most[name] = max(value, self.most.get(name, 0))
+    ms: list[Mapping[str, float]] = field(default_factory=list)
+    memory: list[Mapping[str, float]] = field(default_factory=list)
 
     def frames(self, judged: int) -> dict[str, Any]:
         """Counts, as ``Record`` has them."""
-        skipped = sum(self.reasons.values())
-        counts = {"selected": self.done + skipped, "done": self.done, "judged": judged, "skipped": skipped}
+        skipped, done = sum(self.reasons.values()), len(self.ms)
+        counts = {"selected": done + skipped, "done": done, "judged": judged, "skipped": skipped}
         return {**counts, "reasons": dict(sorted(self.reasons.items()))}
 
     def state(self) -> dict[str, float]:
         """What the method kept over the sequence, as ``Record`` has it."""
         state: dict[str, float] = {}
-        for name in ("bytes", "count"):
-            if name in self.last:
-                mean = self.total[name] / self.done
-                state |= {f"{name}_mean": mean, f"{name}_max": self.most[name], f"{name}_end": self.last[name]}
-        if "anchors" in self.last:
-            state["anchors_mean"] = self.total["anchors"] / self.done
-        if "smoothing_bytes" in self.last:
-            state["smoothing_bytes"] = self.last["smoothing_bytes"]
+        for name, end in (self.memory[-1] if self.memory else {}).items():
+            values = [kept[name] for kept in self.memory]
+            if name in ("bytes", "count"):
+                state |= {f"{name}_mean": sum(values) / len(values), f"{name}_max": max(values), f"{name}_end": end}
+            else:
+                state |= {"anchors_mean": sum(values) / len(values)} if name == "anchors" else {name: end}
         return state
+
+    def median_ms(self) -> dict[str, float]:
+        """Of the typical frame, by stage [ms]."""
+        stages = ("network", "anchors", "uncertainty")
+        times = {stage: [ms[stage] for ms in self.ms if stage in ms] for stage in stages}
+        return {stage: median(values) for stage, values in times.items() if values}
 
 
 class _Accounts(FrameSink):
     """The account of every row, by key."""
 
     def begin(self, stream: FrameStream) -> None:
-        """See :class:`Sink`."""
         self._runners = {row.key: row for row in stream.rows}
         self.rows = {key: _Account() for key in self._runners}
 
     def take(self, result: FrameResult) -> None:
-        """See :class:`Sink`."""
         for key, reason in result.skipped.items():
             self.rows[key].reasons[reason] += 1
         for key, row in result.rows.items():
-            self.rows[key].add(row.ms, self._runners[key].estimator.memory())
+            self.rows[key].ms.append(row.ms)
+            self.rows[key].memory.append(self._runners[key].estimator.memory())
 
 
 def _check_rows(rows: Sequence[Row], networks: Mapping[str, DepthSource]) -> None:
@@ -336,23 +300,8 @@ def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range
         raise SequenceError(f"single images without poses, on which {', '.join(comparing)} cannot compare views")
 
 
-def frame_fault(frame: Frame) -> str | None:
-    """What is wrong with a frame's pose or intrinsics for UfM*, None if nothing is."""
-    pose, K = torch.from_numpy(frame.T_world_cam), torch.from_numpy(frame.intrinsics)
-    pictured = frame.image if frame.image is not None else frame.depth
-    height, width = (1, 1) if pictured is None else pictured.shape[:2]
-    one = torch.ones(1, 1, 1).expand(1, height, width)
-    checked = check_frame(one, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
-    code = int(checked.fault[0])
-    return FRAME_FAULTS[code] if code else None
-
-
 def _result(row: Row, account: _Account, metrics: RowMetrics, sequence: FrameSequence) -> RowResult:
-    """What a row leaves behind.
-
-    Raises:
-        SequenceError: it has judged nothing.
-    """
+    """What a row leaves behind. Raises SequenceError: it has judged nothing."""
     key, frames = row.slug, account.frames(metrics.judged[row.slug])
     if not frames["judged"]:
         reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
@@ -364,6 +313,6 @@ def _result(row: Row, account: _Account, metrics: RowMetrics, sequence: FrameSeq
         figures=metrics.figures(key),
         curves=metrics.curves(key),
         state=account.state(),
-        ms={stage: median(times) for stage, times in account.ms.items() if times},
+        ms=account.median_ms(),
         sums=metrics.sums(key),
     )

@@ -18,24 +18,16 @@ _Batch = TypeVar("_Batch")
 
 @dataclass(frozen=True, eq=False)
 class StreamInput:
-    """What ``UfMStar.forward`` takes of one stream, without the leading dimension.
+    """What ``UfMStar.forward`` takes of one stream, without the leading dimension."""
 
-    Attributes:
-        depth: [H, W] [m].
-        pose: [4, 4] float64 camera-to-world [m].
-        intrinsics: [3, 3] float64 [px].
-        aleatoric, epistemic: [H, W] [m^2], or None.
-        features: [F, H, W], or None.
-        anchors: [1, N], or None.
-    """
-
-    depth: Tensor
-    pose: Tensor
-    intrinsics: Tensor
+    depth: Tensor  # [H, W] [m]
+    pose: Tensor  # [4, 4] float64 camera-to-world [m]
+    intrinsics: Tensor  # [3, 3] float64 [px]
+    # aleatoric, epistemic: [H, W] [m^2], or None.
     aleatoric: Tensor | None = None
     epistemic: Tensor | None = None
-    features: Tensor | None = None
-    anchors: Anchors | None = None
+    features: Tensor | None = None  # [F, H, W], or None
+    anchors: Anchors | None = None  # [1, N], or None
 
 
 class UfMStarStreams:
@@ -68,11 +60,7 @@ class UfMStarStreams:
             module.reset([stream])
 
     def sole(self) -> UfMStar:
-        """The module of a single stream.
-
-        Raises:
-            ValueError: it has several.
-        """
+        """The module of a single stream. Raises ValueError: it has several."""
         if self._count > 1:
             raise ValueError(f"a state goes into a UfM* of one stream, this one has {self._count}")
         return self._modules[None]
@@ -89,26 +77,21 @@ class UfMStarStreams:
         return chosen
 
     def __call__(self, given: Mapping[int, StreamInput]) -> dict[int, UfMStarOutput]:
-        """Take in the next frame of streams of one module; their maps are of one size and kind.
-
-        Returns:
-            The output of each, as of a batch of one.
-
-        Raises:
-            ValueError, RuntimeError: as ``UfMStar.forward``; all streams are as they were.
-        """
+        """The outputs, each as of a batch of one, of streams of one module for their next frame; their maps are of one
+        size and kind. Errors as ``UfMStar.forward``; all streams are as they were then."""
         rows = [given.get(stream) for stream in range(self._count)]
         first = next(row for row in rows if row is not None)
         (module,) = {self.choose(stream, (one.depth.shape[0], one.depth.shape[1])) for stream, one in given.items()}
         nowhere = torch.full_like(first.pose, torch.nan)
+        maps = {
+            name: _stack([None if row is None else getattr(row, name) for row in rows])
+            for name in ("depth", "aleatoric", "epistemic", "features")
+        }
         out = module(
-            _stack([None if row is None else row.depth for row in rows]),
-            torch.stack([nowhere if row is None else row.pose for row in rows]),
-            torch.stack([first.intrinsics if row is None else row.intrinsics for row in rows]),
-            _stack([None if row is None else row.aleatoric for row in rows]),
-            _stack([None if row is None else row.epistemic for row in rows]),
-            features=_stack([None if row is None else row.features for row in rows]),
+            pose=torch.stack([nowhere if row is None else row.pose for row in rows]),
+            intrinsics=torch.stack([first.intrinsics if row is None else row.intrinsics for row in rows]),
             anchors=_padded([None if row is None else row.anchors for row in rows]),
+            **maps,
         )
         for stream, row in enumerate(rows):
             self._absent[stream] += row is None and self._of[stream] is module

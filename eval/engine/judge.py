@@ -1,15 +1,24 @@
-"""Figures against ground truth, as sinks of a stream: of a run, of the rows of an evaluation, of image regions."""
+"""Figures against ground truth, as sinks of a stream: of a run, of the rows of an evaluation, of image regions.
+
+For the figure of NLL by error, the paper looks at the pixels where the ensemble (left panel) or UfM-Ensemble (right) is
+confident and shows the other methods' NLL there. Which pixels these are it leaves open; here, of every frame, the share
+``confident`` of the reference's pixels with the smallest variance. All rows on the same frames are judged on the same
+pixels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.confident import confident_pixels
+from ufmstar_torch.eval.engine.estimators import Estimate
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, RowFrame
+from ufmstar_torch.eval.methods import method
+from ufmstar_torch.eval.methods.row import Row
 
 if TYPE_CHECKING:  # torchmetrics takes seconds to import, which a sequence without ground truth need not wait for
     from ufmstar_torch.eval.metrics import NLLByError, SequenceMetrics
@@ -31,9 +40,6 @@ class Figures(Generic[Key]):
     def __init__(self, bins: str = "ours") -> None:
         self._metrics: dict[Key, SequenceMetrics] = {}
         self._bins = bins
-
-    def __iter__(self) -> Iterator[Key]:
-        return iter(self._metrics)
 
     def of(self, key: Key, *, with_variance: bool = True) -> SequenceMetrics:
         """The metrics of a key, made now if there are none."""
@@ -63,13 +69,7 @@ class Figures(Generic[Key]):
 
 class RunMetrics(FrameSink):
     """The figures of a run's row, ``UFM``, beside them those of its network alone, ``ALONE``, and of its ``POSTERIOR``.
-
-    All are of the pixels that the row uses; the others are masked.
-
-    Args:
-        key: of the row.
-        sums: of an earlier part of the run, from ``figures.state``.
-    """
+    All are of the pixels that the row uses; the others are masked. ``sums`` are those of an earlier part of the run."""
 
     stage: str | None = "metrics"
 
@@ -157,13 +157,8 @@ class RowMetrics(FrameSink):
 
 
 class RegionMetrics(FrameSink):
-    """The figures of every row in every region of the images, and those of all regions together.
-
-    Args:
-        rows: their keys.
-        regions: their names.
-        region_of: [h, w] int64, at every pixel of a row's map, the number of its region.
-    """
+    """The figures of every row (by its key) in every region of the images, and those of all regions together.
+    ``region_of`` returns [h, w] int64, at every pixel of a row's map, the number of its region."""
 
     def __init__(
         self, rows: Sequence[str], regions: Sequence[str], region_of: Callable[[FrameResult, RowFrame], Tensor]
@@ -216,3 +211,40 @@ class RegionMetrics(FrameSink):
     def _rms_sigma(self, row: str, region: str) -> float:
         total, pixels = self._variance[row, region]
         return (total / pixels) ** 0.5 if pixels else float("nan")
+
+
+def references(row: Row, rows: Sequence[Row]) -> list[Row]:
+    """Whose confidence a row is judged by: its base alone, and behind UfM with the fewest points that are among
+    ``rows`` and see the same frames; of several settings the row's own, or else the default."""
+    same = [other for other in rows if other.method.base == row.method.base and _frames(other) == _frames(row)]
+    alone = [other for other in same if other.method.fusion == method.ALONE and other.method.uses_aleatoric]
+    pointwise = [other for other in same if other.method.fusion == method.UFM and not other.method.full]
+    fewest = min((_points(other) for other in pointwise), default=0)
+    chosen = []
+    for kind in (alone, [other for other in pointwise if _points(other) == fewest]):
+        if kind:
+            chosen.append(
+                min(kind, key=lambda other: (other.setting.pose_noise != row.setting.pose_noise, other.setting.slug))
+            )
+    return chosen
+
+
+def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
+    """[h, w] bool, of the pixels with ground truth [h, w] [m] (0 = none) those whose variance is at or below the
+    frame's ``share`` quantile, in (0, 1]."""
+    assert estimate.variance is not None
+    judged = estimate.valid & (truth > 0)
+    values = estimate.variance[judged]
+    if not len(values):
+        return judged
+    threshold = values.kthvalue(max(1, math.ceil(share * len(values)))).values
+    return judged & (torch.where(judged, estimate.variance, torch.inf) <= threshold)
+
+
+def _frames(row: Row) -> tuple[int, str]:
+    """What decides which frames a row sees, and which part of them."""
+    return row.setting.skip, row.setting.preprocess
+
+
+def _points(row: Row) -> float:
+    return math.inf if row.method.max_points is None else row.method.max_points

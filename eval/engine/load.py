@@ -33,22 +33,18 @@ _VERSION = 3  # of the digests: raise it where predictions from the same files c
 class NetworkChoice:
     """A network for a base, as chosen by a user.
 
-    Attributes:
-        base: a key of ``method.BASES``.
-        model: a name that ``load_network`` accepts, or "ground-truth" (of "depth_only": the sequence's own depth, which
-            shows what a method makes of perfect depth).
-        files: its weights, one or several files, in the order of the members. Of "trained", "FILE#2" is member 2 of
-            the file alone. A file .json is the spec that goes with the weights. Of "ground-truth" nothing, or "HxW".
-        label: as shown; "" = derived from the files.
-
     Raises:
         ValueError: no such base or model, no files, or files that do not go together.
     """
 
-    base: str
+    base: str  # a key of ``method.BASES``
+    # a name that ``load_network`` accepts, or "ground-truth" (of "depth_only": the sequence's own depth, which shows
+    # what a method makes of perfect depth).
     model: str
+    # its weights, one or several files, in the order of the members. Of "trained", "FILE#2" is member 2 of the file
+    # alone. A file .json is the spec that goes with the weights. Of "ground-truth" nothing, or "HxW".
     files: tuple[str, ...] = ()
-    label: str = ""
+    label: str = ""  # as shown; "" = derived from the files
 
     def __post_init__(self) -> None:
         if self.base not in BASES:
@@ -71,11 +67,7 @@ class NetworkChoice:
 
     @classmethod
     def parse(cls, text: str, label: str = "") -> NetworkChoice:
-        """From ``BASE=MODEL:FILE[,FILE...]``.
-
-        Raises:
-            ValueError: another form.
-        """
+        """From ``BASE=MODEL:FILE[,FILE...]``. Raises ValueError: another form."""
         base, equals, rest = text.partition("=")
         model, _, files = rest.partition(":")
         if not (base and equals and model):
@@ -214,16 +206,8 @@ def load_members(
     inference: Inference = _AS_USERS,
     device: torch.device = _CPU,
 ) -> list[DepthNetwork]:
-    """The networks in the files, in their order, in eval mode and on the CPU. They want the same input.
-
-    Args:
-        model, spec, offload, inference: as :func:`network_source` has them.
-        files: of weights.
-        device: where they will run.
-
-    Raises:
-        FileNotFoundError, ValueError: as :func:`network_source`.
-    """
+    """The networks in the files, in their order, in eval mode and on the CPU, for a device. They want the same input.
+    Arguments and errors as :func:`network_source`."""
     paths = [Path(file) for file in files]
     for folder in paths if model in DIRECTORIES else []:
         if not folder.is_dir():
@@ -242,11 +226,7 @@ def load_members(
 
 
 def _loaded(model: str, file: Path, options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
-    """The networks in a file.
-
-    Raises:
-        ValueError: as :func:`network_source`.
-    """
+    """The networks in a file. Raises ValueError, as :func:`network_source`."""
     if model == "trained" and not options:
         return load_trained([file], offload=offload)
     try:
@@ -269,11 +249,8 @@ def _require_same_input(members: Iterable[DepthNetwork]) -> None:
 
 
 def _passes(members: list[DepthNetwork], mode: str, samples: int | None) -> int | None:
-    """Passes per image of a network that samples, None of others.
-
-    Raises:
-        ValueError: mode or samples ask for what the members cannot do.
-    """
+    """Passes per image of a network that samples, None of others. Raises ValueError: mode or samples ask for what the
+    members cannot do."""
     alone = len(members) == 1 and mode == "full"
     if alone and not stochastic(members):
         raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")

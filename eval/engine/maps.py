@@ -5,63 +5,41 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
 from ufmstar_torch.eval.methods.setting import CROP
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
 from ufmstar_torch.eval.sequences.own_output import own_output
-from ufmstar_torch.models.network import DepthNetwork
 
 
-@dataclass(frozen=True, eq=False)
-class PredictedMap:
-    """A depth map from elsewhere.
+class PredictedMap(NamedTuple):
+    """A depth map from elsewhere."""
 
-    Attributes:
-        depth: [H, W] float32 [m], 0 = no prediction.
-        variance: [H, W] float32 [m^2], or None.
-        intrinsics: [3, 3] float64 of the map [px].
-    """
-
-    depth: np.ndarray
-    variance: np.ndarray | None
-    intrinsics: np.ndarray
+    depth: np.ndarray  # [H, W] float32 [m], 0 = no prediction
+    variance: np.ndarray | None  # [H, W] float32 [m^2]
+    intrinsics: np.ndarray  # [3, 3] float64 of the map [px]
 
     def resized(self, size: Size | None) -> PredictedMap:
         """At another size (h, w), by taking the nearest pixel."""
-        old = (self.depth.shape[0], self.depth.shape[1])
-        if size is None or size == old:
+        if size is None or size == self.depth.shape:
             return self
-        K = resize_intrinsics(torch.from_numpy(self.intrinsics), old, size).numpy()
+        height, width = self.depth.shape
+        K = resize_intrinsics(torch.from_numpy(self.intrinsics), (height, width), size).numpy()
         variance = None if self.variance is None else resample_nearest(self.variance, self.intrinsics, K, size)
         return PredictedMap(resample_nearest(self.depth, self.intrinsics, K, size), variance, K)
 
 
-class MapSource:
-    """Depth maps that exist already, as a ``DepthSource``.
-
-    Args:
-        read: the map of a frame.
-        identity: plain values that distinguish these maps from others.
-        size: (h, w) to which the maps are brought; None = as they are.
-        is_truth: the maps are the sequence's own depth.
-        label: as tables show it.
-        digest: of the identity.
-    """
-
-    needs_image, cacheable, passes, runtime = False, False, 1, None
-    networks: tuple[DepthNetwork, ...] = ()
-    max_depth: float | None = None
+class MapSource(DepthSource):
+    """Depth maps that exist already, brought to ``size`` (h, w) unless it is None; the rest as ``DepthSource``."""
 
     def __init__(
         self,
@@ -73,8 +51,8 @@ class MapSource:
         label: str = "",
         digest: str = "",
     ) -> None:
-        self._read, self._size = read, size
-        self.identity, self.is_truth, self.label, self.digest = dict(identity), is_truth, label, digest
+        super().__init__(identity, label, digest)
+        self._read, self._size, self.is_truth = read, size, is_truth
 
     def prepared(self, how: str) -> MapSource:
         """Itself: maps show the whole frame; "crop" raises ValueError."""
@@ -82,19 +60,8 @@ class MapSource:
             raise ValueError(f'preprocess = "{CROP}" goes with networks: maps exist already')
         return self
 
-    def turn(self, position: int) -> int:
-        """0: maps have no members."""
-        return 0
-
-    def prepare(self, frame: Frame) -> None:
-        """Nothing."""
-
     def one(self, frame: Frame, n: int) -> Prediction:
-        """The frame's map; no network runs.
-
-        Raises:
-            FrameError: it has none, or it cannot be read.
-        """
+        """The frame's map; no network runs. Raises FrameError: it has none, or it cannot be read."""
         given = self._read(frame).resized(self._size)
         variance = None if given.variance is None else torch.from_numpy(given.variance)
         return Prediction(torch.from_numpy(given.depth), variance, None, torch.from_numpy(given.intrinsics).double())
@@ -146,7 +113,7 @@ def folder_source(
         if own is not None and file.stem in own.intrinsics:
             return PredictedMap(depth, spread, own.intrinsics[file.stem])
         try:
-            K = scaled_to_map(frame.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
+            K = scaled_to_map(frame.intrinsics, sequence.image_size, depth.shape[:2])
         except ValueError as error:
             raise FrameError(file, _cropped(sequence, depth)) from error
         return PredictedMap(depth, spread, K)
@@ -169,7 +136,7 @@ def _check_first(sequence: FrameSequence, maps: DepthMaps, any_shape: bool) -> N
     try:
         depth, _ = maps[0]
         if not any_shape:
-            scaled_to_map(sequence.intrinsics, sequence.image_size, (depth.shape[0], depth.shape[1]))
+            scaled_to_map(sequence.intrinsics, sequence.image_size, depth.shape[:2])
     except FrameError:  # counted when its turn comes
         return
     except ValueError as error:

@@ -58,18 +58,14 @@ def check_members(base: str, members: Sequence[DepthNetwork], device: torch.devi
     if base in ("depth_only", "mc_dropout"):
         return
     for member in members:
-        _check_variances(base, _tried(member, device))
-
-
-def _check_variances(base: str, prediction: DepthPrediction) -> None:
-    """Raises ValueError where a prediction lacks a variance that the base is about, or has another one."""
-    a, e = prediction.aleatoric_variance is not None, prediction.epistemic_variance is not None
-    said = {(True, True): "both variances", (True, False): "an aleatoric one", (False, True): "an epistemic one"}
-    if base == "evidential":
-        _require(a and e, base, "an aleatoric and an epistemic variance", said.get((a, e), "none"))
-    else:
-        _require(a, base, "an aleatoric variance", said.get((a, e), "none"))
-        _require(base != "aleatoric" or not e, base, "an aleatoric variance alone", "an epistemic one as well")
+        prediction = _tried(member, device)
+        has = prediction.aleatoric_variance is not None, prediction.epistemic_variance is not None
+        got = {(True, True): "both variances", (True, False): "an aleatoric one", (False, True): "an epistemic one"}
+        if base == "evidential":
+            _require(all(has), base, "an aleatoric and an epistemic variance", got.get(has, "none"))
+        else:
+            _require(has[0], base, "an aleatoric variance", got.get(has, "none"))
+            _require(base != "aleatoric" or not has[1], base, "an aleatoric variance alone", "an epistemic one as well")
 
 
 def _tried(member: DepthNetwork, device: torch.device) -> DepthPrediction:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ufmstar_torch.eval.engine.clock import StageTimer
-from ufmstar_torch.eval.engine.predictions import Prediction
+from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
 from ufmstar_torch.eval.methods.setting import CROP, OF_NETWORK, RESIZE
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.sequences.images import image_tensor
@@ -28,8 +28,8 @@ from ufmstar_torch.pipeline import NetworksInTurn
 _SAMPLE_STRIDE = 1_000_003
 
 
-class NetworkSource:
-    """Depth from networks (a ``DepthSource``).
+class NetworkSource(DepthSource):
+    """Depth from networks.
 
     Args:
         networks: moved to ``device``.
@@ -43,7 +43,7 @@ class NetworkSource:
         digest: distinguishes these networks from others in a store; "" = their predictions are not stored.
     """
 
-    needs_image, is_truth = True, False
+    needs_image = True
 
     def __init__(
         self,
@@ -56,10 +56,11 @@ class NetworkSource:
         label: str = "",
         digest: str = "",
     ) -> None:
+        super().__init__(identity, label, digest)
         self._turns = networks.to(device)
-        self._members = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
+        self.networks = cast("tuple[DepthNetwork, ...]", tuple(self._turns.networks))
+        self.max_depth, self.passes = self._turns.max_depth, self._turns.passes
         self._device, self._seeding, self._precision = device, seeding, precision
-        self.identity, self.label, self.digest = dict(identity), label, digest
         self._timer = StageTimer(device)
         self._generator = torch.Generator(device)
         self._inputs: WeakKeyDictionary[Frame, tuple[Tensor, Tensor]] = WeakKeyDictionary()
@@ -70,31 +71,13 @@ class NetworkSource:
             set_sampling(network, True, self._generator)
 
     @property
-    def networks(self) -> tuple[DepthNetwork, ...]:
-        """The members, on the device and in eval mode."""
-        return self._members
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] The largest depth that the members can predict, where each of them states one."""
-        return self._turns.max_depth
-
-    @property
     def runtime(self) -> Mapping[str, Any]:
-        """What runs the networks: name, version, threads, precision."""
-        return runtime_of(self._members[0], self._precision)
-
-    @property
-    def passes(self) -> int:
-        """Inferences that all members, or all samples, take."""
-        return self._turns.passes
+        """See :class:`DepthSource`."""
+        return runtime_of(self.networks[0], self._precision)
 
     def prepared(self, how: str) -> NetworkSource:
-        """The same networks, which draw from the same generator, on images that are prepared otherwise.
-
-        Raises:
-            ValueError: the networks do not declare their input by a ``Preprocess``.
-        """
+        """The same networks, which draw from the same generator, on images that are prepared otherwise. Raises
+        ValueError: the networks do not declare their input by a ``Preprocess``."""
         own = self._turns.preprocess
         if how == OF_NETWORK:
             return self
@@ -104,19 +87,14 @@ class NetworkSource:
         if changed == own:
             return self
         other = copy.copy(self)
-        other._turns = NetworksInTurn(self._members, samples=self._turns.samples, preprocess=changed)
+        other._turns = NetworksInTurn(self.networks, samples=self._turns.samples, preprocess=changed)
         other._inputs, other._seeded, other._timer = WeakKeyDictionary(), None, StageTimer(self._device)
         other.identity = {**self.identity, "preprocess": how}
         other.digest = self.digest and hashlib.sha256(f"{self.digest} {how}".encode()).hexdigest()
         return other
 
-    @property
-    def cacheable(self) -> bool:
-        """Whether a store may keep the predictions."""
-        return bool(self.digest)
-
     def turn(self, position: int) -> int:
-        """The member for the image that a row uses after ``position`` others."""
+        """See :class:`DepthSource`."""
         return self._turns.turn(position)
 
     @property
@@ -125,11 +103,7 @@ class NetworkSource:
         return not self._draws
 
     def one(self, frame: Frame, n: int) -> Prediction:
-        """One inference, of member (or sample) n.
-
-        Raises:
-            FrameError: the frame has no image.
-        """
+        """One inference, of member (or sample) n. Raises FrameError: the frame has no image."""
         return self.several([frame], n)[0]
 
     def several(self, frames: Sequence[Frame], n: int) -> list[Prediction]:
@@ -153,10 +127,7 @@ class NetworkSource:
         """Of inputs of one size."""
         x, K = (torch.cat(values) if len(values) > 1 else values[0] for values in zip(*inputs, strict=True))
         reduced = self._precision == BF16
-        with (
-            self._timer.stage("network"),
-            torch.autocast(self._device.type, torch.bfloat16, enabled=reduced),
-        ):
+        with self._timer.stage("network"), torch.autocast(self._device.type, torch.bfloat16, enabled=reduced):
             prediction = self._turns.member(x, K, n)
         made = Prediction.each(prediction, K, self._timer.take()["network"])
         return [one.to(torch.float32) for one in made] if reduced else made

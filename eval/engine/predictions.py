@@ -23,21 +23,13 @@ _SHOWN = 16  # hex digits of a digest in the name of a folder: 64 bits
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A depth map with the variances that come with it.
+    """A depth map with the variances that come with it."""
 
-    Attributes:
-        depth: [h, w] [m].
-        aleatoric: [h, w] A [m^2], or None.
-        epistemic: [h, w] E [m^2], or None.
-        intrinsics: [3, 3] float64 of the depth map [px], on the CPU.
-        ms: of the inference, or of all of them together [ms]; None where no network ran.
-    """
-
-    depth: Tensor
-    aleatoric: Tensor | None
-    epistemic: Tensor | None
-    intrinsics: Tensor
-    ms: float | None = None
+    depth: Tensor  # [h, w] [m]
+    aleatoric: Tensor | None  # [h, w] A [m^2], or None
+    epistemic: Tensor | None  # [h, w] E [m^2], or None
+    intrinsics: Tensor  # [3, 3] float64 of the depth map [px], on the CPU
+    ms: float | None = None  # of the inference, or of all of them together [ms]; None where no network ran
 
     @property
     def size(self) -> tuple[int, int]:
@@ -81,11 +73,8 @@ class Prediction:
 
 
 def combined(predictions: Sequence[Prediction]) -> Prediction:
-    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added.
-
-    Raises:
-        ValueError: no prediction.
-    """
+    """The mixture of all members' or samples' predictions (see ``pipeline.combine``); the times are added. Raises
+    ValueError: no prediction."""
 
     def batch(value: Tensor | None) -> Tensor | None:
         return None if value is None else value[None]
@@ -95,85 +84,64 @@ def combined(predictions: Sequence[Prediction]) -> Prediction:
     return Prediction.of(joint, predictions[0].intrinsics, sum(times) if len(times) == len(predictions) else None)
 
 
-class DepthSource(Protocol):
+class DepthSource:
     """Where depth comes from: networks, or maps that exist already.
 
     Attributes:
-        label: as tables show it.
-        networks: that it runs; () of maps.
         identity: plain values that distinguish this source from another one.
-        digest: the same as a hex digest, the source's name in a store; "" where nothing is stored.
+        label: as tables show it.
+        digest: of the identity, in hex, the source's name in a store; "" where nothing is stored.
+        networks: that it runs; () of maps.
         passes: inferences that all members (or samples) take.
-        needs_image: whether it predicts from the image; from the depth map otherwise.
-        cacheable: whether a store may keep its predictions. They are then of single precision, read or computed.
-        is_truth: whether it is the sequence's own depth, which has no error.
         max_depth: [m] the largest depth that its networks can predict; None where it is not known.
-        runtime: what runs the networks, for the record: name, version, threads, precision; None of maps.
+        needs_image: whether it predicts from the image; from the depth map otherwise.
+        is_truth: whether it is the sequence's own depth, which has no error.
     """
 
+    needs_image = is_truth = False
+    networks: tuple[DepthNetwork, ...] = ()
+    passes = 1
+    max_depth: float | None = None
+
+    def __init__(self, identity: Mapping[str, Any], label: str = "", digest: str = "") -> None:
+        self.identity, self.label, self.digest = dict(identity), label, digest
+
     @property
-    def label(self) -> str: ...
+    def cacheable(self) -> bool:
+        """Whether a store may keep its predictions. They are then of single precision, read or computed."""
+        return self.needs_image and bool(self.digest)
+
     @property
-    def networks(self) -> tuple[DepthNetwork, ...]: ...
-    @property
-    def identity(self) -> Mapping[str, Any]: ...
-    @property
-    def digest(self) -> str: ...
-    @property
-    def passes(self) -> int: ...
-    @property
-    def needs_image(self) -> bool: ...
-    @property
-    def cacheable(self) -> bool: ...
-    @property
-    def is_truth(self) -> bool: ...
-    @property
-    def max_depth(self) -> float | None: ...
-    @property
-    def runtime(self) -> Mapping[str, Any] | None: ...
+    def runtime(self) -> Mapping[str, Any] | None:
+        """What runs the networks, for the record: name, version, threads, precision; None of maps."""
+        return None
 
     def prepared(self, how: str) -> DepthSource:
-        """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change.
-
-        Raises:
-            ValueError: there are no images to prepare.
-        """
-        ...
+        """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change. Raises
+        ValueError: there are no images to prepare."""
+        raise NotImplementedError
 
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""
-        ...
+        return 0
 
     def prepare(self, frame: Frame) -> None:
         """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
-        ...
 
     def one(self, frame: Frame, n: int) -> Prediction:
-        """One timed inference, of member (or sample) n.
-
-        Raises:
-            FrameError: the frame has nothing to predict from.
-        """
-        ...
+        """One timed inference, of member (or sample) n. Raises FrameError: the frame has nothing to predict from."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class PredictionKey:
-    """What a prediction depends on.
+    """What a prediction depends on."""
 
-    Attributes:
-        network: digest of the network(s).
-        sequence: ``sequence_digest``.
-        frame: its name.
-        member: "0", "1", ..., or "all".
-        content: ``frame_digest``.
-    """
-
-    network: str
-    sequence: str
-    frame: str
-    member: str
-    content: str
+    network: str  # digest of the network(s)
+    sequence: str  # ``sequence_digest``
+    frame: str  # its name
+    member: str  # "0", "1", ..., or "all"
+    content: str  # ``frame_digest``
 
     @property
     def path(self) -> Path:
@@ -194,14 +162,8 @@ class PredictionStore(Protocol):
 
 
 class FramePredictions:
-    """The predictions for one frame: each is looked up in memory, then in the store, then computed.
-
-    Args:
-        frame: which.
-        device: of the maps that are returned.
-        store: None = nothing is read or kept.
-        sequence: digest of the sequence, for the store.
-    """
+    """The predictions for one frame, on a device: each is looked up in memory, then in the store (None = there is
+    none), then computed. ``sequence`` is the digest of the sequence."""
 
     def __init__(self, frame: Frame, device: torch.device, store: PredictionStore | None, sequence: str) -> None:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
@@ -209,11 +171,8 @@ class FramePredictions:
         self._known: dict[tuple[object, str], Prediction] = {}
 
     def of(self, source: DepthSource, position: int, every: bool) -> Prediction:
-        """What a row gets that has used ``position`` images before: of all members, or of the one in turn.
-
-        Raises:
-            FrameError: the frame has nothing to predict from.
-        """
+        """What a row gets that has used ``position`` images before: of all members, or of the one in turn. Raises
+        FrameError: the frame has nothing to predict from."""
         n = _pass(source, position, every)
         known = self._looked_up(source, n)
         if known is None:

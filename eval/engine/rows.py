@@ -24,41 +24,35 @@ _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drif
 
 @dataclass(frozen=True, eq=False)
 class RowFrame:
-    """A frame that a row has taken in.
+    """A frame that a row has taken in."""
 
-    Attributes:
-        prediction: the depth map, on the estimator's device.
-        estimate: what the row makes of it, on the CPU.
-        truth: [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
-        T_world_cam: [4, 4] the pose as the row sees it [m].
-        member: which network predicted; None where all did, and of maps.
-        anchors: of the frame; None of a row without anchors.
-        ms: "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms].
-    """
-
-    prediction: Prediction
-    estimate: Estimate
+    prediction: Prediction  # the depth map, on the estimator's device
+    estimate: Estimate  # what the row makes of it, on the CPU
+    # [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
     truth: NDArray[np.float32] | None
-    T_world_cam: NDArray[np.float64]
-    member: int | None
-    anchors: FrameAnchors | None
-    ms: Mapping[str, float]
+    T_world_cam: NDArray[np.float64]  # [4, 4] the pose as the row sees it [m]
+    member: int | None  # which network predicted; None where all did, and of maps
+    anchors: FrameAnchors | None  # of the frame; None of a row without anchors
+    ms: Mapping[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
 
 
-@dataclass(frozen=True, eq=False)
-class RowInput:
-    """A frame on its way into a row; attributes as of :class:`RowFrame`."""
+@dataclass(eq=False)
+class Update:
+    """A frame on its way into a row, for the row's estimator; further attributes as of :class:`RowFrame`."""
 
+    row: RowRunner
     prediction: Prediction
     truth: NDArray[np.float32] | None
     T_world_cam: NDArray[np.float64]
     member: int | None
     anchors: FrameAnchors | None
+    answer: Estimate | RuntimeError | ValueError | None = None  # of the estimator, or the error that the frame raises
+    ms: float = 0.0  # of the estimator; of a batch, divided by its frames [ms]
 
     def of_estimator(self) -> EstimatorInput:
         """What the row's estimator gets."""
         anchors = None if self.anchors is None else self.anchors.anchors
-        return EstimatorInput(self.prediction, torch.from_numpy(self.T_world_cam), anchors)
+        return self.prediction, torch.from_numpy(self.T_world_cam), anchors
 
 
 class RowRunner:
@@ -102,42 +96,39 @@ class RowRunner:
         return selects(self.setting, number)
 
     def predict(self, predictions: FramePredictions) -> Prediction:
-        """The prediction that the row gets for the next frame.
-
-        Raises:
-            FrameError: the frame has nothing to predict from.
-        """
+        """The prediction that the row gets for the next frame. Raises FrameError: the frame has nothing to predict
+        from."""
         return predictions.of(self.source, self.images, self.every)
 
-    def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowInput:
+    def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> Update:
         """The next frame as the row sees it; its ground truth is for anchors of it alone."""
         T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
         anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
         single = self.source.networks and not self.every
         member = self.source.turn(self.images) if single else None
-        return RowInput(prediction, truth, T, member, anchors)
+        return Update(self, prediction, truth, T, member, anchors)
 
-    def finish(self, frame: Frame, given: RowInput, estimate: Estimate, ms: float) -> RowFrame:
-        """Take in the next frame.
-
-        Args:
-            frame: the next one.
-            given: what :meth:`begin` returned for it.
-            estimate: the estimator's.
-            ms: that the estimator took [ms].
+    def finish(self, frame: Frame, update: Update) -> RowFrame:
+        """Take in the next frame, which :meth:`begin` returned and the estimator has answered.
 
         Raises:
             FrameError: the estimator refuses the pose or the intrinsics, and the row skips such frames.
+            RuntimeError, ValueError: as the estimator.
         """
+        estimate = update.answer
+        assert estimate is not None
+        if isinstance(estimate, Exception):
+            raise estimate
         self.images += 1
         if self._skips_faults and estimate.statistics is not None and int(estimate.statistics.fault[0]):
             if self.anchors is not None:
                 self.anchors.undo()
             raise FrameError(frame.name, FRAME_FAULTS[int(estimate.statistics.fault[0])])
-        tracking = None if given.anchors is None else given.anchors.ms
-        times = {"uncertainty": ms, "network": given.prediction.ms, "anchors": tracking}
+        tracking = None if update.anchors is None else update.anchors.ms
+        times = {"uncertainty": update.ms, "network": update.prediction.ms, "anchors": tracking}
         known = {stage: time for stage, time in times.items() if time is not None}
-        return RowFrame(given.prediction, estimate, given.truth, given.T_world_cam, given.member, given.anchors, known)
+        u = update
+        return RowFrame(u.prediction, estimate, u.truth, u.T_world_cam, u.member, u.anchors, known)
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""
@@ -147,11 +138,7 @@ class RowRunner:
         return {_IMAGES: torch.tensor(self.images), **kept}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken.
-
-        Raises:
-            ValueError: it is the state of another kind of row.
-        """
+        """Continue where ``state`` was taken. Raises ValueError: it is the state of another kind of row."""
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

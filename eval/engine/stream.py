@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,8 +19,8 @@ from torch import Tensor
 from ufmstar_torch.eval.engine.ahead import FramesAhead
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
-from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
-from ufmstar_torch.eval.engine.together import Inference, Update, infer_together, update_together
+from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner, Update
+from ufmstar_torch.eval.engine.together import Inference, infer_together, update_together
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 
@@ -32,62 +31,36 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What came of a frame.
+    """What came of a frame."""
 
-    Attributes:
-        number: of the frame among those that the stream selects, from 0.
-        index: of the frame in its sequence.
-        name: of the frame.
-        frame: as it was read; None where no row selects it, or it cannot be used.
-        rows: by key, of the rows that have taken it in.
-        skipped: by key, why a row that selects the frame cannot use it.
-        ms: "read" (what was left to wait for: frames are read ahead), "predict" (without the batches of several
-            streams) and "truth", and the stages of the sinks that came before [ms].
-        state: the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
-    """
-
-    number: int
-    index: int
-    name: str
-    frame: Frame | None = None
-    rows: Mapping[str, RowFrame] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)
+    number: int  # of the frame among those that the stream selects, from 0
+    index: int  # of the frame in its sequence
+    name: str  # of the frame
+    frame: Frame | None = None  # as it was read; None where no row selects it, or it cannot be used
+    rows: Mapping[str, RowFrame] = field(default_factory=dict)  # by key, of the rows that have taken it in
+    skipped: Mapping[str, str] = field(default_factory=dict)  # by key, why a row that selects the frame cannot use it
+    # "read" (what was left to wait for: frames are read ahead), "predict" (without the batches of several streams) and
+    # "truth", and the stages of the sinks that came before [ms].
     ms: dict[str, float] = field(default_factory=dict)
+    # the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
     state: Mapping[str, Tensor] = field(default_factory=dict)
 
 
-class Sink(Protocol):
-    """Takes what comes of the frames: metrics, writers, progress.
-
-    Attributes:
-        stage: its time stands in ``FrameResult.ms`` under this name for the sinks after it; None = it is not timed.
-    """
-
-    stage: str | None
-
-    def begin(self, stream: FrameStream) -> None:
-        """Before the first frame, or the first one after a resume."""
-        ...
-
-    def take(self, result: FrameResult) -> None:
-        """After every frame, skipped ones too. The stream's state is that after the frame."""
-        ...
-
-    def end(self) -> None:
-        """After the last frame; not after a stop or an error."""
-        ...
-
-
 class FrameSink:
-    """The parts of a :class:`Sink` that most sinks leave empty; each defines its own ``take``."""
+    """Takes what comes of the frames: metrics, writers, progress. Each defines its own ``take``."""
 
+    # Its time stands in ``FrameResult.ms`` under this name for the sinks after it; None = it is not timed.
     stage: str | None = None
 
     def begin(self, stream: FrameStream) -> None:
-        """See :class:`Sink`."""
+        """Before the first frame, or the first one after a resume."""
+
+    def take(self, result: FrameResult) -> None:
+        """After every frame, skipped ones too. The stream's state is that after the frame."""
+        raise NotImplementedError
 
     def end(self) -> None:
-        """See :class:`Sink`."""
+        """After the last frame; not after a stop or an error."""
 
 
 class FrameStream:
@@ -130,12 +103,9 @@ class FrameStream:
         self.timer = StageTimer(self._device)
         self.position = start
 
-    def drive(self, sinks: Sequence[Sink], *, stop: Callable[[], bool] = lambda: False) -> None:
-        """Go through the frames that are left; each one's result goes to the sinks in their order.
-
-        Args:
-            sinks: see :class:`Sink`.
-            stop: asked before every frame.
+    def drive(self, sinks: Sequence[FrameSink], *, stop: Callable[[], bool] = lambda: False) -> None:
+        """Go through the frames that are left; each one's result goes to the sinks in their order. ``stop`` is asked
+        before every frame.
 
         Raises:
             Stopped: ``stop`` returned True.
@@ -149,11 +119,8 @@ class FrameStream:
         return {f"{row.key}/{name}": value for row in self.rows for name, value in row.state().items()}
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Bring the rows to where ``state`` was taken; :attr:`position` is the caller's.
-
-        Raises:
-            ValueError: it is the state of other rows.
-        """
+        """Bring the rows to where ``state`` was taken; :attr:`position` is the caller's. Raises ValueError: it is the
+        state of other rows."""
         for row in self.rows:
             prefix = f"{row.key}/"
             row.load_state({name[len(prefix) :]: v for name, v in state.items() if name.startswith(prefix)})
@@ -174,17 +141,8 @@ class FrameStream:
                 row.source.prepare(frame)
 
     def next(self, frames: FramesAhead) -> _Frame:
-        """The way of the next frame; it stops where a network is needed, and where the rows' estimators are.
-
-        Yields:
-            The inferences, which may be made meanwhile; then the updates, which must be answered.
-
-        Returns:
-            What came of the frame.
-
-        Raises:
-            FrameError: without rows, the frame cannot be read.
-        """
+        """The way of the next frame: yields the inferences, which may be made meanwhile, and then the updates, which
+        must be answered; returns what came of the frame. Raises FrameError: without rows, the frame cannot be read."""
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if row.selects(number)]
@@ -198,7 +156,7 @@ class FrameStream:
                 if self._check is not None:
                     self._check(frame)
             known = FramePredictions(frame, self._device, self._store, self._digest)
-            yield [Inference(known, row.source, row.images, row.every) for row in active]
+            yield [Inference(known, row) for row in active]
             with self.timer.stage("predict"):
                 predictions = {row.key: row.predict(known) for row in active}
             with self.timer.stage("truth"):
@@ -208,13 +166,13 @@ class FrameStream:
                 raise
             return FrameResult(number, index, name, skipped={row.key: error.reason for row in active})
         ms = self.timer.take()
-        updates = [Update(row, row.begin(frame, predictions[row.key], truths[row.key])) for row in active]
+        updates = [row.begin(frame, predictions[row.key], truths[row.key]) for row in active]
         yield updates
         taken: dict[str, RowFrame] = {}
         skipped: dict[str, str] = {}
         for one in updates:
             try:
-                taken[one.row.key] = one.row.finish(frame, one.given, one.answered(), one.ms)
+                taken[one.row.key] = one.row.finish(frame, one)
             except FrameError as error:
                 skipped[one.row.key] = error.reason
         return FrameResult(number, index, name, frame, taken, skipped, ms)
@@ -224,7 +182,7 @@ _Frame = Generator[Sequence[Inference | Update], None, FrameResult]
 
 
 def drive_together(
-    streams: Iterator[tuple[FrameStream, Sequence[Sink]]],
+    streams: Iterator[tuple[FrameStream, Sequence[FrameSink]]],
     *,
     at_once: int = 1,
     stop: Callable[[], bool] = lambda: False,
@@ -267,7 +225,7 @@ def drive_together(
 class _Lane:
     """A stream on its way, its sinks, and what keeps an error of its own from other streams."""
 
-    def __init__(self, stream: FrameStream, sinks: Sequence[Sink], broken: tuple[type[Exception], ...]) -> None:
+    def __init__(self, stream: FrameStream, sinks: Sequence[FrameSink], broken: tuple[type[Exception], ...]) -> None:
         self.stream, self._sinks, self._broken = stream, sinks, broken
         self.error: Exception | None = None
         self._frame: _Frame | None = None
@@ -332,7 +290,7 @@ def _one_frame_of_each(lanes: Sequence[_Lane]) -> None:
         wanted = [one for lane in lanes if lane.waits for one in lane.advance()]
 
 
-def hand_over(result: FrameResult, sinks: Sequence[Sink], timer: StageTimer) -> None:
+def hand_over(result: FrameResult, sinks: Sequence[FrameSink], timer: StageTimer) -> None:
     """Give a result to sinks, in their order; the times of their stages are added to it."""
     for sink in sinks:
         if sink.stage is None:
@@ -344,11 +302,8 @@ def hand_over(result: FrameResult, sinks: Sequence[Sink], timer: StageTimer) -> 
 
 
 def _truths(frame: Frame, predictions: Mapping[str, Prediction]) -> dict[str, NDArray[np.float32] | None]:
-    """Ground truth at the pixels of every row's maps, [h, w] [m], 0 = none; once for every camera.
-
-    Raises:
-        FrameError: the depth map has no camera.
-    """
+    """Ground truth at the pixels of every row's maps, [h, w] [m], 0 = none; once for every camera. Raises FrameError:
+    the depth map has no camera."""
     known: dict[tuple[object, ...], NDArray[np.float32] | None] = {}
     truths = {}
     for key, one in predictions.items():

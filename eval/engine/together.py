@@ -3,52 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput, Gaussians
 from ufmstar_torch.eval.engine.networks import NetworkSource
-from ufmstar_torch.eval.engine.predictions import DepthSource, FramePredictions
-from ufmstar_torch.eval.engine.rows import RowInput, RowRunner
+from ufmstar_torch.eval.engine.predictions import FramePredictions
+from ufmstar_torch.eval.engine.rows import RowRunner, Update
 
 
-@dataclass(frozen=True, eq=False)
-class Inference:
-    """What a row needs of a frame's predictions.
-
-    Attributes:
-        predictions: of the frame.
-        source, position, every: as ``FramePredictions.of``.
-    """
+class Inference(NamedTuple):
+    """A frame's predictions, and the row that needs one of them."""
 
     predictions: FramePredictions
-    source: DepthSource
-    position: int
-    every: bool
-
-
-@dataclass(eq=False)
-class Update:
-    """A frame for a row's estimator.
-
-    Attributes:
-        row: which.
-        given: the frame.
-        answer: of the estimator: its estimate, or the error that the frame raises.
-        ms: of the estimator; of a batch, divided by its frames [ms].
-    """
-
     row: RowRunner
-    given: RowInput
-    answer: Estimate | RuntimeError | ValueError | None = None
-    ms: float = 0.0
-
-    def answered(self) -> Estimate:
-        """The estimate; an error is raised."""
-        assert self.answer is not None
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        return self.answer
 
 
 def infer_together(wanted: Sequence[Inference]) -> None:
@@ -59,10 +27,10 @@ def infer_together(wanted: Sequence[Inference]) -> None:
     if len({one.predictions for one in wanted}) < 2:
         return
     frames: dict[tuple[object, int], dict[FramePredictions, NetworkSource]] = {}
-    for one in wanted:
-        if isinstance(one.source, NetworkSource) and one.source.batches:
-            for n in one.predictions.missing(one.source, one.position, one.every):
-                frames.setdefault((one.source.digest or one.source, n), {})[one.predictions] = one.source
+    for predictions, row in wanted:
+        if isinstance(row.source, NetworkSource) and row.source.batches:
+            for n in predictions.missing(row.source, row.images, row.every):
+                frames.setdefault((row.source.digest or row.source, n), {})[predictions] = row.source
     for (_, n), sources in frames.items():
         together = [known for known in sources if known.frame.image is not None]
         if len(together) > 1:
@@ -80,12 +48,12 @@ def update_together(updates: Sequence[Update]) -> None:
     batches: dict[object, list[Update]] = {}
     for n, update in enumerate(updates):
         estimator = update.row.estimator
-        batch = estimator.batch(update.given.prediction) if isinstance(estimator, Gaussians) else n
+        batch = estimator.batch(update.prediction) if isinstance(estimator, Gaussians) else n
         batches.setdefault(batch, []).append(update)
     for batch in batches.values():
         timer = StageTimer(batch[0].row.device)
         with timer.stage("uncertainty"):
-            answers = _answers([one.row.estimator for one in batch], [one.given.of_estimator() for one in batch])
+            answers = _answers([one.row.estimator for one in batch], [one.of_estimator() for one in batch])
         ms = timer.take()["uncertainty"] / len(batch)
         for update, answer in zip(batch, answers, strict=True):
             update.answer, update.ms = answer, ms
@@ -99,7 +67,7 @@ def _answers(
     try:
         if streams:
             return Gaussians.update_together(streams, inputs)
-        return [estimators[0].update(inputs[0].prediction, inputs[0].T_world_cam, inputs[0].anchors)]
+        return [estimators[0].update(*inputs[0])]
     except (RuntimeError, ValueError) as error:
         if len(estimators) == 1:
             return [error]

@@ -29,21 +29,16 @@ _NAME = re.compile(r"(?P<fusion>UfM\*?)-(?P<full>Full)?(?P<base>[A-Za-z]+)(-(?P<
 class Method:
     """A row.
 
-    Attributes:
-        base: a key of ``BASES``.
-        fusion: "alone" (the network's own variance), "ufm" or "ufm_star".
-        full: behind UfM or UfM*, run all members (or samples) on every image instead of one in turn.
-        max_points: of UfM; None = unpruned.
-        fixed_param: of UfM*, the segmentation's thresholds in pixels as at 224 x 224, whatever the image's size.
-
     Raises:
         ValueError: the fields do not go together.
     """
 
-    base: str
-    fusion: str = ALONE
+    base: str  # a key of ``BASES``
+    fusion: str = ALONE  # "alone" (the network's own variance), "ufm" or "ufm_star"
+    # behind UfM or UfM*, run all members (or samples) on every image instead of one in turn.
     full: bool = False
-    max_points: int | None = None
+    max_points: int | None = None  # of UfM; None = unpruned
+    # of UfM*, the segmentation's thresholds in pixels as at 224 x 224, whatever the image's size.
     fixed_param: bool = False
 
     def __post_init__(self) -> None:
@@ -80,11 +75,7 @@ class Method:
 
     @classmethod
     def parse(cls, name: str) -> Method:
-        """The row of that name.
-
-        Raises:
-            ValueError: no row is called so.
-        """
+        """The row of that name. Raises ValueError: no row is called so."""
         by_alone = {alone: base for base, (alone, _) in BASES.items()}
         if name in by_alone:
             return cls(by_alone[name])

@@ -69,18 +69,9 @@ class Drift:
         self._last: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def of(self, T_world_cam: NDArray[np.float64], index: int) -> NDArray[np.float64]:
-        """The pose with drift.
-
-        Args:
-            T_world_cam: [4, 4] camera-to-world of the next frame [m].
-            index: of the frame in its sequence, larger than that of the one before.
-
-        Returns:
-            [4, 4], the pose itself where the setting has no drift.
-
-        Raises:
-            ValueError: frames do not come in order.
-        """
+        """The pose with drift [4, 4], the pose itself where the setting has none, of the next frame at camera-to-world
+        [4, 4] [m]; ``index`` is larger than that of the frame before. Raises ValueError: frames do not come in
+        order."""
         setting = self._setting
         if not (setting.rotation_drift or setting.translation_drift):
             return T_world_cam

@@ -7,24 +7,32 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ufmstar_torch.eval.methods.method import Method
-from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting
+from ufmstar_torch.eval.methods.method import UFM_STAR, Method
+from ufmstar_torch.eval.methods.setting import DEFAULT, TRACKED, Setting, configured
 from ufmstar_torch.recalibrate import split_name
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is judged.
+    """What is judged."""
 
-    Attributes:
-        method: which network, how often it is run, and what judges its views.
-        setting: what an ablation changes about it.
-        title: what tables and figures call it; "" = by method and setting. It makes no other row of it.
-    """
-
-    method: Method
-    setting: Setting = DEFAULT
+    method: Method  # which network, how often it is run, and what judges its views
+    setting: Setting = DEFAULT  # what an ablation changes about it
+    # what tables and figures call it; "" = by method and setting. It makes no other row of it.
     title: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        method, setting = self.method, self.setting
+        of_ufm_star = {", ".join(setting.of_ufm_star): setting.of_ufm_star, "anchors": setting.anchors}
+        for names, given in (of_ufm_star | {"recalibration": setting.recalibration}).items():
+            if given and method.fusion != UFM_STAR:
+                raise ValueError(f"row {method.name}: only UfM* has {names}")
+        if setting.aleatoric_in_h and not method.uses_aleatoric:
+            raise ValueError(f"row {method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
+        try:
+            configured(setting)
+        except ValueError as error:
+            raise ValueError(f"row {method.name}: {error}") from error
 
     @property
     def slug(self) -> str:

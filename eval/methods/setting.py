@@ -96,6 +96,10 @@ class Setting(Checked):
     def __hash__(self) -> int:
         return hash(self.slug)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A mapping proxy cannot be pickled."""
+        return Setting, (dict(self.overrides), *(getattr(self, name) for name in _OWN))
+
     def to_dict(self) -> dict[str, Any]:
         """What differs from the default, flat: {} for the row as it is."""
         own = {f.name: f.default for f in fields(self) if f.name not in ("overrides", "seed")}
@@ -161,11 +165,8 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
 
 
 def value_of(setting: Mapping[str, Any], name: str) -> Any:
-    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it has none.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it has none. Raises
+    ValueError: an unknown name."""
     return setting[name] if name in setting else default_of(name, setting.get("ufm_preset", DEFAULTS))
 
 
@@ -197,11 +198,7 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
 
 
 def configured(setting: Setting) -> UfMStarConfig:
-    """UfM*'s configuration under a setting.
-
-    Raises:
-        ValueError: an unknown name, or a value that it does not take.
-    """
+    """UfM*'s configuration under a setting. Raises ValueError: an unknown name, or a value that it does not take."""
     nested: dict[str, Any] = {}
     for name, value in setting.overrides.items():
         default_of(name)
@@ -210,8 +207,9 @@ def configured(setting: Setting) -> UfMStarConfig:
     config = _start(setting.ufm_preset).replace(anchored=bool(setting.anchors), posterior=setting.posterior)
     if setting.aleatoric_in_h:
         config = config.replace(features=2, add_aleatoric=False)
-    groups = {group: replace(getattr(config, group), **values) for group, values in nested.items() if _group(values)}
-    return config.replace(**{name: value for name, value in nested.items() if not _group(value)}, **groups)
+    groups = {name: value for name, value in nested.items() if isinstance(value, dict)}
+    changed = {group: replace(getattr(config, group), **values) for group, values in groups.items()}
+    return config.replace(**nested | changed)
 
 
 def _start(preset: str) -> UfMStarConfig:
@@ -228,7 +226,3 @@ def _names(config: Any, prefix: str = "") -> list[str]:
         value = getattr(config, f.name)
         names += _names(value, f"{prefix}{f.name}.") if is_dataclass(value) else [f"{prefix}{f.name}"]
     return names
-
-
-def _group(value: Any) -> bool:
-    return isinstance(value, dict)

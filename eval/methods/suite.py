@@ -36,7 +36,7 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import DEFAULT, DEFAULTS, Setting, configured, default_of, setting_from
+from ufmstar_torch.eval.methods.setting import DEFAULTS, default_of, setting_from
 
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
@@ -59,30 +59,19 @@ _ROW_KEYS |= {"label": str}
 class Suite:
     """Rows, in the order of the table.
 
-    Attributes:
-        name: small letters, digits and single dashes.
-        title: one line for people.
-        rows: each of them once.
-        sweep: settings that vary, by the names of ``Setting.to_dict``; () = a table of methods.
-        datasets: that the paper takes.
-        sequences: how many it samples of each; None = all.
-        network: that it judges.
-        size: (h, w) of the network's input in the paper [px].
-        efficiency: whether time, energy and memory are what it is about.
-
     Raises:
         ValueError: a field is impossible.
     """
 
-    name: str
-    title: str
-    rows: tuple[Row, ...]
-    sweep: tuple[str, ...] = ()
-    datasets: tuple[str, ...] = ()
-    sequences: int | None = None
-    network: str = ""
-    size: tuple[int, int] | None = None
-    efficiency: bool = False
+    name: str  # small letters, digits and single dashes
+    title: str  # one line for people
+    rows: tuple[Row, ...]  # each of them once
+    sweep: tuple[str, ...] = ()  # settings that vary, by the names of ``Setting.to_dict``; () = a table of methods
+    datasets: tuple[str, ...] = ()  # that the paper takes
+    sequences: int | None = None  # how many it samples of each; None = all
+    network: str = ""  # that it judges
+    size: tuple[int, int] | None = None  # (h, w) of the network's input in the paper [px]
+    efficiency: bool = False  # whether time, energy and memory are what it is about
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -95,8 +84,6 @@ class Suite:
             raise ValueError(f"suite {self.name} has a row twice: {', '.join(twice)}")
         for name in self.sweep:
             default_of(name)
-        for row in self.rows:
-            check_row(row)
 
     @property
     def bases(self) -> tuple[str, ...]:
@@ -104,11 +91,7 @@ class Suite:
         return tuple(dict.fromkeys(row.method.base for row in self.rows))
 
     def with_bases(self, bases: Iterable[str]) -> Suite:
-        """The suite with the rows of some bases only.
-
-        Raises:
-            ValueError: none is left.
-        """
+        """The suite with the rows of some bases only. Raises ValueError: none is left."""
         given = set(bases)
         kept = tuple(row for row in self.rows if row.method.base in given)
         if not kept:
@@ -117,20 +100,6 @@ class Suite:
                 f"{', '.join(sorted(given)) or 'none'} only: give --network BASE=MODEL:FILES for one of them"
             )
         return replace(self, rows=kept)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The suite as plain values, for another process."""
-        return {**self.__dict__, "rows": [row.to_dict() for row in self.rows]}
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Suite:
-        """The suite of :meth:`to_dict`, also after a way through JSON."""
-        rows = [
-            Row(Method.parse(row["method"]), setting_from(row["setting"]), row.get("label", ""))
-            for row in values["rows"]
-        ]
-        plain = {name: _plain(value) for name, value in values.items()}
-        return cls(**{**plain, "rows": tuple(rows)})
 
 
 def names() -> tuple[str, ...]:
@@ -173,40 +142,15 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
         named: dict[str, Any] = {"name": values.get("name", own), "title": values.get("title", own), "rows": rows}
-        hints: dict[str, Any] = {key: _plain(values[key]) for key in _HINTS if key in values}
+        hints: dict[str, Any] = {key: values[key] for key in _HINTS if key in values}
+        hints |= {key: tuple(value) for key, value in hints.items() if isinstance(value, list)}
         return Suite(**named, sweep=tuple(dict.fromkeys(_sweep(values))), **hints)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from error
 
 
-def check_row(row: Row) -> None:
-    """Raises ValueError unless the setting changes something of the method, in a way that it takes."""
-    if row.setting.of_ufm_star and row.method.fusion != UFM_STAR:
-        names = ", ".join(row.setting.of_ufm_star)
-        raise ValueError(f"row {row.method.name}: {names} is of UfM*, which the row does without")
-    if row.setting.anchors and row.method.fusion != UFM_STAR:
-        raise ValueError(f"row {row.method.name}: anchors are of UfM*, which the row does without")
-    if row.setting.aleatoric_in_h and not row.method.uses_aleatoric:
-        raise ValueError(f"row {row.method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
-    configured(row.setting)
-
-
-def rows_of(methods: Iterable[Method | str], setting: Setting = DEFAULT) -> tuple[Row, ...]:
-    """A row for each method (or its name) under one setting.
-
-    Raises:
-        ValueError: no method is called so.
-    """
-    parsed = [Method.parse(method) if isinstance(method, str) else method for method in methods]
-    return tuple(Row(method, setting) for method in parsed)
-
-
 def _file(name: str) -> Traversable:
-    """The file of a suite.
-
-    Raises:
-        ValueError: no suite is called so.
-    """
+    """The file of a suite. Raises ValueError: no suite is called so."""
     if name.endswith(".toml"):
         return Path(name)
     if name not in names():
@@ -289,7 +233,3 @@ def _words(values: Mapping[str, Any], name: str, default: Iterable[str] = ()) ->
     if not all(isinstance(word, str) for word in words):
         raise ValueError(f"{name} must be a list of words, got {words!r}")
     return tuple(words)
-
-
-def _plain(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value

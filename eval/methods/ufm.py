@@ -17,7 +17,7 @@ from ufmstar_torch.camera import relative_pose, rotation_deviation
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.eval.methods.ufm_cloud import MOMENTS, Cloud, Taken, View, take_in
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
-from ufmstar_torch.stateful import StatefulModule, full_precision
+from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 
 # [1] Share by which a covariance may exceed the bound of Cauchy and Schwarz.
 _ROUNDING = 1e-2
@@ -180,7 +180,7 @@ class UfM(StatefulModule):
             depth, pose, intrinsics, aleatoric, epistemic, valid, None,
             feature_count=0, rotation_tolerance=self.config.rotation_tolerance,
         )  # fmt: skip
-        with torch.inference_mode(False), torch.no_grad(), full_precision(frame.depth.device):
+        with outliving(), torch.no_grad(), full_precision(frame.depth.device):
             if self.config.on_bad_frame == "raise":
                 raise_faults(frame.fault.tolist())
             variance, statistics = self._advance(frame)
@@ -210,7 +210,7 @@ class UfM(StatefulModule):
             ValueError: a mask of the wrong length.
         """
         dtype, device, b = self.moments.dtype, self.moments.device, len(self.points)
-        with torch.inference_mode(False), torch.no_grad():  # buffers must outlive the caller's inference mode
+        with outliving(), torch.no_grad():  # buffers must outlive the caller's inference mode
             if streams is None:
                 self._store(_empty(0, dtype, device))
                 return
@@ -264,11 +264,8 @@ class UfM(StatefulModule):
         return s2
 
     def _streams(self, frame: FrameInput) -> tuple[list[Cloud], dict[str, Tensor]]:
-        """The clouds and the rest of the state, fresh at the start.
-
-        Raises:
-            ValueError: the frame has another number of streams or lies on another device.
-        """
+        """The clouds and the rest of the state, fresh at the start. Raises ValueError: the frame has another number of
+        streams or lies on another device."""
         streams, device, held = frame.depth.shape[0], frame.depth.device, len(self.points)
         if held == 0:
             fresh = _empty(streams, self.moments.dtype, device)

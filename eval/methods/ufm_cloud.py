@@ -22,15 +22,11 @@ MOMENTS = 9
 
 @dataclass(frozen=True)
 class Cloud:
-    """The N points of one stream in the order in which they were added, oldest first.
+    """The N points of one stream in the order in which they were added, oldest first."""
 
-    Attributes:
-        moments: [N, 9] mean x, y, z [m] and covariance xx, xy, xz, yy, yz, zz [m^2], in one frame (the caller's).
-        count: [N] int32 n, observations fused into the point.
-    """
-
+    # [N, 9] mean x, y, z [m] and covariance xx, xy, xz, yy, yz, zz [m^2], in one frame (the caller's).
     moments: Tensor
-    count: Tensor
+    count: Tensor  # [N] int32 n, observations fused into the point
 
     @property
     def mean(self) -> Tensor:
@@ -53,42 +49,25 @@ class Cloud:
 
 @dataclass(frozen=True)
 class View:
-    """What a camera predicts, in one stream.
+    """What a camera predicts, in one stream."""
 
-    Attributes:
-        depth: [H, W] [m], 0 where not valid.
-        variance: [H, W] s^2 [m^2] that the network itself states, 0 where it states none.
-        valid: [H, W] bool, True = use.
-        intrinsics: [3, 3] float64 [px].
-        R_first_cam: [3, 3] float64 rotation from this camera into the first one.
-        t_first_cam: [3] float64 this camera's position in the first one [m].
-    """
-
-    depth: Tensor
-    variance: Tensor
-    valid: Tensor
-    intrinsics: Tensor
-    R_first_cam: Tensor
-    t_first_cam: Tensor
+    depth: Tensor  # [H, W] [m], 0 where not valid
+    variance: Tensor  # [H, W] s^2 [m^2] that the network itself states, 0 where it states none
+    valid: Tensor  # [H, W] bool, True = use
+    intrinsics: Tensor  # [3, 3] float64 [px]
+    R_first_cam: Tensor  # [3, 3] float64 rotation from this camera into the first one
+    t_first_cam: Tensor  # [3] float64 this camera's position in the first one [m]
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A frame taken in.
+    """A frame taken in."""
 
-    Attributes:
-        cloud: afterwards.
-        variance: [H, W] [m^2], NaN where not valid.
-        fused: [] points that met a valid pixel.
-        new: [] pixels appended.
-        dropped: [] points pruned.
-    """
-
-    cloud: Cloud
-    variance: Tensor
-    fused: Tensor
-    new: Tensor
-    dropped: Tensor
+    cloud: Cloud  # afterwards
+    variance: Tensor  # [H, W] [m^2], NaN where not valid
+    fused: Tensor  # [] points that met a valid pixel
+    new: Tensor  # [] pixels appended
+    dropped: Tensor  # [] points pruned
 
 
 def take_in(cloud: Cloud, view: View, max_points: int | None) -> Taken:
@@ -174,16 +153,8 @@ def _fused(cloud: Cloud, met: Tensor, observed: Tensor) -> Cloud:
 
 
 def _read_out(met: Tensor, pixel: Tensor, view: View) -> tuple[Tensor, Tensor]:
-    """Step 3: s^2 everywhere, S'_zz of this camera where a point landed, the newest of several.
-
-    Args:
-        met: [P, 9] fused points, oldest first.
-        pixel: [P] on which they landed.
-        view: the camera.
-
-    Returns:
-        variance [H, W] [m^2], NaN where not valid, and hit [H*W].
-    """
+    """Step 3: s^2 everywhere, S'_zz of this camera where a point landed, the newest of several; of fused points ``met``
+    [P, 9], oldest first, on pixels [P]. Returns variance [H, W] [m^2], NaN where not valid, and hit [H*W]."""
     axis = view.R_first_cam[:, 2].to(met.dtype)
     weight = torch.stack([axis[i] * axis[j] * (1 if i == j else 2) for i, j in zip(_ROW, _COLUMN, strict=True)])
     along_z = (met[:, 3:] * weight).sum(1).clamp_min(0)  # not below 0 by rounding

@@ -49,14 +49,12 @@ class Delta1(SumMetric):
             self.add_count(name)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
         p = select_pixels(depth, None, target, valid)
         n = torch.tensor(p.depth.numel())
         hits, ratio = _delta1_update(p, self.tolerance), _delta1_ratio_update(p, self.tolerance)
         self.add(hits=hits, hits_ratio=ratio, pixels=n, with_truth=p.with_truth)
 
     def compute(self) -> dict[str, Tensor]:
-        """The figures of all updates so far."""
         return {
             "delta1": share(self.hits, self.pixels),
             "delta1_ratio": share(self.hits_ratio, self.pixels),
@@ -65,8 +63,8 @@ class Delta1(SumMetric):
         }
 
 
-class AbsRel(SumMetric):
-    """Mean of |d - g| / g; ``compute()`` returns ``abs_rel``, NaN without a pixel."""
+class _MeanError(SumMetric):
+    """Mean over all pixels of an error, which a subclass defines."""
 
     total: Tensor
     pixels: Tensor
@@ -77,33 +75,28 @@ class AbsRel(SumMetric):
         self.add_count("pixels")
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
-        p = select_pixels(depth, None, target, valid)
-        error = (p.depth - p.target).abs() / p.target
+        error = self._error(select_pixels(depth, None, target, valid))
         self.add(total=error.sum(), pixels=torch.tensor(error.numel()))
 
+    def _error(self, p: Pixels) -> Tensor:
+        raise NotImplementedError
+
+
+class AbsRel(_MeanError):
+    """Mean of |d - g| / g; ``compute()`` returns ``abs_rel``, NaN without a pixel."""
+
+    def _error(self, p: Pixels) -> Tensor:
+        return (p.depth - p.target).abs() / p.target
+
     def compute(self) -> dict[str, Tensor]:
-        """The figure of all updates so far."""
         return {"abs_rel": share(self.total, self.pixels)}
 
 
-class RMSE(SumMetric):
+class RMSE(_MeanError):
     """Root of the mean of (d - g)^2 over all pixels [m]; ``compute()`` returns ``rmse``, NaN without one."""
 
-    total: Tensor
-    pixels: Tensor
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_sum("total")
-        self.add_count("pixels")
-
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the variance is unused."""
-        p = select_pixels(depth, None, target, valid)
-        error = (p.depth - p.target).square()
-        self.add(total=error.sum(), pixels=torch.tensor(error.numel()))
+    def _error(self, p: Pixels) -> Tensor:
+        return (p.depth - p.target).square()
 
     def compute(self) -> dict[str, Tensor]:
-        """The figure of all updates so far."""
         return {"rmse": share(self.total, self.pixels).sqrt()}

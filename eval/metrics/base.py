@@ -12,11 +12,12 @@ from torchmetrics import Metric
 class SumMetric(Metric):
     """A metric whose states are sums of fixed size.
 
-    ``compute()`` returns a dict of float64 tensors by name: scalars, and curves [B] where the metric has
-    one. States reduce by addition: across processes (torchmetrics synchronises at ``compute``; pass
-    ``sync_on_compute=False`` where every process holds another sequence) and through ``merge_state``.
-    Counts are int64 and exact; float64 sums depend on the order of the updates in the last bits only.
-    Float64 rules out MPS: keep the metric on the CPU there.
+    ``update(depth, variance, target, valid=None)`` adds frames: maps of one shape [...] in m and m^2, ``valid`` True =
+    use; metrics of the depth alone ignore the variance. ``compute()`` returns the figures of all updates so far as a
+    dict of float64 tensors by name: scalars, and curves [B] where the metric has one. States reduce by addition: across
+    processes (torchmetrics synchronises at ``compute``; pass ``sync_on_compute=False`` where every process holds
+    another sequence) and through ``merge_state``. Counts are int64 and exact; float64 sums depend on the order of the
+    updates in the last bits only. Float64 rules out MPS: keep the metric on the CPU there.
     """
 
     is_differentiable = False
@@ -53,11 +54,8 @@ class SumMetric(Metric):
             setattr(self, name, state + (value.to(state.device) if isinstance(value, Tensor) else value))
 
     def merge_state(self, incoming_state: dict[str, Any] | Metric) -> None:
-        """Add another metric's sums to this one's.
-
-        Raises:
-            ValueError: the other one was made with other settings, so that its sums mean something else.
-        """
+        """Add another metric's sums to this one's. Raises ValueError: the other one was made with other settings, so
+        that its sums mean something else."""
         if isinstance(incoming_state, SumMetric) and incoming_state.settings != self.settings:
             raise ValueError(
                 f"incoming_state must come from a metric with the settings {self.settings}, "

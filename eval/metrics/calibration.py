@@ -70,13 +70,11 @@ class ECEDelta(SumMetric):
         self.add_count("pixels", bins)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "ECE_delta"), target, valid)
         confidence, accurate, pixels = _ece_delta_update(p, self.delta, self.bins)
         self.add(confidence=confidence, accurate=accurate, pixels=pixels)
 
     def compute(self) -> dict[str, Tensor]:
-        """The error and curve of all updates so far."""
         total = self.pixels.sum()
         gap = self.confidence - self.accurate.double()
         return {
@@ -131,13 +129,11 @@ class ECEQuantile(SumMetric):
         self.add_count("pixels")
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "ECE_q"), target, valid)
         counts = _ece_quantile_update(p, self.thresholds.to(p.depth.device))
         self.add(at_or_below=counts, pixels=torch.tensor(p.depth.numel()))
 
     def compute(self) -> dict[str, Tensor]:
-        """The error and curve of all updates so far."""
         levels = self.levels.to(self.pixels.device)
         observed = share(self.at_or_below, self.pixels)
         return {"ece_q": (observed - levels).abs().mean(), "ece_q_levels": levels, "ece_q_observed": observed}

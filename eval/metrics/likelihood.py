@@ -48,13 +48,11 @@ class NLL(SumMetric):
         self.add_count("with_truth")
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "NLL"), target, valid)
         total, pixels = _nll_update(p)
         self.add(total=total, pixels=pixels, with_truth=p.with_truth)
 
     def compute(self) -> dict[str, Tensor]:
-        """The figures of all updates so far."""
         left_out = share(self.with_truth - self.pixels, self.with_truth)
         return {"nll": share(self.total, self.pixels), "nll_left_out_share": left_out}
 
@@ -92,7 +90,6 @@ class EntropyHistogram(SumMetric):
         self.add_count("pixels")
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use; the target is unused."""
         variance = require_variance(variance, "the entropy")
         check_maps(depth, variance, target, valid)
         predicted = torch.isfinite(depth) & torch.isfinite(variance) & (variance >= 0)
@@ -103,7 +100,6 @@ class EntropyHistogram(SumMetric):
         self.add(counts=counts, total=total, pixels=torch.tensor(positive.numel()))
 
     def compute(self) -> dict[str, Tensor]:
-        """The histogram of all updates so far."""
         return {
             "entropy": share(self.total, self.pixels),
             "entropy_counts": self.counts.double(),

@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.pixels import require_variance
 from ufmstar_torch.eval.metrics.ranking import HIGH, LOW
-
-compiled: Any = njit(cache=True, nogil=True, error_model="numpy")
+from ufmstar_torch.kernels.compile_cpu import kernel
 
 _RANGE = math.log(HIGH / LOW)
 _LOG_TWO_PI = math.log(2 * math.pi)
@@ -80,7 +78,7 @@ def _exchange(metric: Any, states: Mapping[str, NDArray[Any]]) -> None:
         setattr(metric, name, torch.from_numpy(value))
 
 
-@compiled
+@kernel
 def accuracy_sums(depth: Any, target: Any, use: Any, tolerance: float) -> tuple[int, int, int, int, float, float]:
     """Sums over the pixels with ground truth and a finite depth.
 
@@ -112,7 +110,7 @@ def accuracy_sums(depth: Any, target: Any, use: Any, tolerance: float) -> tuple[
     return with_truth, judged, hits, hits_ratio, relative, squared
 
 
-@compiled
+@kernel
 def uncertainty_sums(
     depth: Any, variance: Any, target: Any, use: Any, delta: float, thresholds: Any, edges: Any,
     intervals: tuple[Any, Any, Any], at_or_below: Any, entropies: Any,
@@ -167,7 +165,7 @@ def uncertainty_sums(
     return judged, nll, likely, entropy, spread
 
 
-@compiled
+@kernel
 def ranking_sums(
     depth: Any, variance: Any, target: Any, use: Any, by_variance: tuple[Any, Any, Any], by_squared: tuple[Any, Any],
     by_relative: tuple[Any, Any], joint: Any,
@@ -203,20 +201,20 @@ def ranking_sums(
         joint[_bin(at_v, fewer), _bin(at_s, fewer)] += 1
 
 
-@compiled
+@kernel
 def _position(value: float) -> float:
     """In the range of the bins, 0 to 1; -1 below it."""
     return math.log(value / LOW) if value >= LOW else -1.0
 
 
-@compiled
+@kernel
 def _bin(position: float, bins: int) -> int:
     """``ranking.log_bin`` of a position."""
     at = position * (bins / _RANGE)
     return 0 if position < 0 else bins + 1 if at >= bins else int(at) + 1
 
 
-@compiled
+@kernel
 def _entropy_bin(h: float, edges: Any) -> int:
     """How many edges are at or below h."""
     if not h >= edges[0]:

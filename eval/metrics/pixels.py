@@ -10,30 +10,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Pixels:
-    """The comparable pixels of one or more frames, flat and in float64.
+    """The comparable pixels of one or more frames, flat and in float64."""
 
-    Attributes:
-        depth: [P] predicted depth d [m].
-        variance: [P] predicted variance v [m^2], >= 0; empty where a metric does not need it.
-        target: [P] ground-truth depth [m], > 0.
-        with_truth: [] int64, pixels with valid ground truth, whatever the prediction there.
-    """
-
-    depth: Tensor
-    variance: Tensor
-    target: Tensor
-    with_truth: Tensor
-
-    @property
-    def left_out(self) -> Tensor:
-        """[] int64, pixels with ground truth whose prediction cannot be judged (NaN, infinite, v < 0)."""
-        return self.with_truth - self.depth.numel()
-
-
-def truth_mask(target: Tensor, valid: Tensor | None) -> Tensor:
-    """[...] True where there is ground truth: finite, positive, and in ``valid`` if that is given."""
-    mask = torch.isfinite(target) & (target > 0)
-    return mask if valid is None else mask & valid
+    depth: Tensor  # [P] predicted depth d [m]
+    variance: Tensor  # [P] predicted variance v [m^2], >= 0; empty where a metric does not need it
+    target: Tensor  # [P] ground-truth depth [m], > 0
+    with_truth: Tensor  # [] int64, pixels with valid ground truth, whatever the prediction there
 
 
 def select_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> Pixels:
@@ -49,7 +31,8 @@ def select_pixels(depth: Tensor, variance: Tensor | None, target: Tensor, valid:
         ValueError: an argument has another shape than ``depth`` or the wrong type.
     """
     check_maps(depth, variance, target, valid)
-    truth = truth_mask(target, valid)
+    truth = torch.isfinite(target) & (target > 0)
+    truth = truth if valid is None else truth & valid
     usable = truth & torch.isfinite(depth)
     if variance is not None:
         usable = usable & torch.isfinite(variance) & (variance >= 0)

@@ -84,7 +84,6 @@ class Sparsification(SumMetric):
             self.add_sum(name, bins + 2)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "AUSE"), target, valid)
         squared = (p.depth - p.target).square()
         relative = (p.depth - p.target).abs() / p.target
@@ -100,7 +99,6 @@ class Sparsification(SumMetric):
         )
 
     def compute(self) -> dict[str, Tensor]:
-        """The figures and curves of all updates so far."""
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
         curves = {
             "rmse": kept_mean(self.count, self.squared, kept).sqrt(),
@@ -145,7 +143,6 @@ class SpearmanCorrelation(SumMetric):
         self.add_count("joint", bins + 2, bins + 2)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "Spearman's correlation"), target, valid)
         side = self.bins + 2
         index = log_bin(p.variance, self.bins) * side
@@ -153,7 +150,6 @@ class SpearmanCorrelation(SumMetric):
         self.add(joint=torch.bincount(index, minlength=side * side).reshape(side, side))
 
     def compute(self) -> dict[str, Tensor]:
-        """The correlation of all updates so far."""
         joint = self.joint.double()
         n = joint.sum()
         (x, w_x), (y, w_y) = _centred_ranks(joint.sum(1)), _centred_ranks(joint.sum(0))
@@ -200,7 +196,6 @@ class NLLByError(SumMetric):
         self.add_sum("error", bins + 2)
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        """Add frames: maps of one shape [...] in m and m^2, ``valid`` True = use."""
         p = select_pixels(depth, require_variance(variance, "NLL by error"), target, valid)
         positive = p.variance > 0
         d, v, g = p.depth[positive], p.variance[positive], p.target[positive]
@@ -212,7 +207,6 @@ class NLLByError(SumMetric):
         )
 
     def compute(self) -> dict[str, Tensor]:
-        """The curves of all updates so far."""
         steps = torch.arange(1, self.percentiles + 1, dtype=torch.float64, device=self.count.device)
         kept = steps / self.percentiles
         return {"nll_by_error": self._groups(self.nll, kept), "error_by_error": self._groups(self.error, kept)}
@@ -221,8 +215,3 @@ class NLLByError(SumMetric):
         """[percentiles] mean of each group, from the sums up to its end."""
         upto = kept_mean(self.count, total, kept) * kept
         return torch.diff(upto, prepend=upto.new_zeros(1)) * self.percentiles
-
-
-def confident(variance: Tensor, threshold: float) -> Tensor:
-    """[...] bool, where a method states sigma <= threshold [m] (NaN: False); for ``NLLByError``'s ``valid``."""
-    return variance <= threshold**2

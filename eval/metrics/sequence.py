@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from torch import Tensor, nn
@@ -90,11 +90,7 @@ class SequenceMetrics(nn.Module):
         return {f"metrics.{kind}.{name}": getattr(metric, name) for kind, metric in named for name in metric.states}
 
     def merge_state(self, other: SequenceMetrics) -> None:
-        """Add the sums of another part of the same sequence.
-
-        Raises:
-            ValueError: the other one judges other things.
-        """
+        """Add the sums of another part of the same sequence. Raises ValueError: the other one judges other things."""
         if other.metrics.keys() != self.metrics.keys():
             raise ValueError(f"other must hold the metrics {list(self.metrics)}, got {list(other.metrics)}")
         for mine, theirs in zip(self._all(), other._all(), strict=True):
@@ -141,10 +137,3 @@ def mean_and_ci(values: Iterable[float], *, level: float = 0.95) -> tuple[float,
 
     deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in kept) / (n - 1))
     return mean, float(t.ppf(0.5 + level / 2, n - 1)) * deviation / math.sqrt(n)
-
-
-def over_sequences(results: Iterable[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
-    """Mean and 95 % half-width of each figure over the sequences' ``SequenceMetrics.compute()``."""
-    rows = list(results)
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    return {name: mean_and_ci(row[name] for row in rows if name in row) for name in names}

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -126,17 +127,21 @@ def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list
     return examples
 
 
-def load_arrays(file: Path) -> dict[str, NDArray]:
+def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
     """The arrays of an npz file.
 
     Raises:
-        ValueError: it is none, or broken.
+        ValueError: it is none, or broken, or one of ``names`` is missing.
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
+            arrays = {name: stored[name] for name in stored.files}
     except (BadZipFile, EOFError, KeyError, ValueError) as error:
         raise ValueError(f"{file} is not a readable npz file: {error}") from error
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise ValueError(f"{file} must hold {', '.join(names)}; {', '.join(missing)} is missing")
+    return arrays
 
 
 def _frame_of(stem: str, stems: Mapping[str, Path]) -> str | None:
@@ -151,13 +156,10 @@ def _load(
     folder: Path, frame: str, file: Path, row_files: Mapping[str, Path], labels: Mapping[str, str]
 ) -> list[Example]:
     """The examples of one frame, one for each camera that its rows have."""
-    common = load_arrays(file)
-    _require(file, common, _SCENE)
-    scenes: dict[bytes, dict[str, NDArray]] = {}
-    rows: dict[bytes, dict[str, RowMaps]] = {}
+    common = load_arrays(file, _SCENE)
+    cameras: dict[bytes, tuple[dict[str, Any], dict[str, RowMaps]]] = {}
     for row, row_file in row_files.items():
-        stored = load_arrays(row_file)
-        _require(row_file, stored, ("depth",))
+        stored = load_arrays(row_file, ("depth",))
         scene = {name: stored.get(name, common[name]) for name in _SCENE}
         maps = {name: stored[name] for name in _MAPS if name in stored}
         wrong = [name for name, value in maps.items() if value.shape != scene["truth"].shape]
@@ -165,16 +167,6 @@ def _load(
             raise ValueError(f"{row_file}: {', '.join(wrong)} must have the truth's shape {scene['truth'].shape}")
         if "variance" in maps:
             camera = scene["K"].astype(np.float64).tobytes() + repr(scene["truth"].shape).encode()
-            scenes.setdefault(camera, scene)
-            rows.setdefault(camera, {})[row] = RowMaps(**maps)
-    examples = []
-    for camera, of_camera in rows.items():
-        image, truth, K = (scenes[camera][name] for name in _SCENE)
-        examples.append(Example(folder.parent.name, folder.name, frame, image, truth, K, of_camera, labels))
-    return examples
-
-
-def _require(file: Path, stored: Mapping[str, NDArray], names: tuple[str, ...]) -> None:
-    missing = [name for name in names if name not in stored]
-    if missing:
-        raise ValueError(f"{file} must hold {', '.join(names)}; {', '.join(missing)} is missing")
+            cameras.setdefault(camera, (scene, {}))[1][row] = RowMaps(**maps)
+    about = (folder.parent.name, folder.name, frame)
+    return [Example(*about, **scene, rows=rows, labels=labels) for scene, rows in cameras.values()]

@@ -17,6 +17,7 @@ from ufmstar_torch.eval.report.means import (
     has_variance,
     mean_of,
     mean_over,
+    paired,
     references,
     value_of,
 )
@@ -69,27 +70,38 @@ class PairedComparison:
     def words(self) -> str:
         """ "NLL 1.33 → 0.96 (-0.37 ± 0.11)"."""
         q = self.quantity
-        unit = f" {q.unit}" if q.unit else ""
-        values = f"{number(self.theirs, q.decimals)} → {number(self.mine, q.decimals)}{unit}"
-        change = number(self.difference.value, q.decimals, signed=True)
-        half = "" if math.isnan(self.difference.half) else f" ± {number(self.difference.half, q.decimals)}"
-        return f"{q.name} {values} ({change}{half})"
+        before, after = number(self.theirs, q.decimals), number(self.mine, q.decimals)
+        return f"{q.name} {before} → {after}{_unit(q)} ({change(self.difference, q)})"
+
+
+def change(mean: Mean, quantity: Quantity) -> str:
+    """A difference with its interval, where there is one: "-0.37 ± 0.11"."""
+    half = "" if math.isnan(mean.half) else f" ± {number(mean.half, quantity.decimals)}"
+    return f"{number(mean.value, quantity.decimals, signed=True)}{half}"
+
+
+def _unit(quantity: Quantity) -> str:
+    return f" {quantity.unit}" if quantity.unit else ""
 
 
 def compare(results: Results, row: Row, reference: Row, dataset: str | None = None) -> list[PairedComparison]:
     """A row against a reference in all figures that both have."""
     made = []
     for quantity in DIFFERENCES:
-        delta = difference(results, row, reference, quantity, dataset)
-        if delta.sequences:
-            mine, theirs = _on_common(results, row, reference, quantity, dataset)
+        pairs = paired(results.of(row, dataset), results.of(reference, dataset), quantity)
+        if pairs:
+            mine, theirs = (mean_over(side).value for side in zip(*pairs, strict=True))
+            delta = mean_over(one - other for one, other in pairs)
             made.append(PairedComparison(row, reference, quantity, mine, theirs, delta))
     return made
 
 
-def comparisons(results: Results, dataset: str | None = None) -> dict[tuple[Row, Row], list[PairedComparison]]:
-    """Every row of UfM* with its default settings against its references."""
-    rows = [row for row in results.rows if row.method.fusion == UFM_STAR and row.setting.plain]
+def comparisons(
+    results: Results, dataset: str | None = None, rows: Iterable[Row] | None = None
+) -> dict[tuple[Row, Row], list[PairedComparison]]:
+    """Rows against their references; None: every row of UfM* with its default settings."""
+    if rows is None:
+        rows = (row for row in results.rows if row.method.fusion == UFM_STAR and row.setting.plain)
     pairs = ((row, reference) for row in rows for reference in references(results, row))
     return {pair: made for pair in pairs if (made := compare(results, *pair, dataset))}
 
@@ -126,7 +138,9 @@ def caveats(results: Results) -> list[str]:
         "the means may be far from those of other sequences."
     )
     for dataset in results.datasets:
-        accuracy = _mean_accuracy(results, dataset)
+        values = [mean_of(results.of(row, dataset), DELTA1).value for row in results.rows]
+        known = [value for value in values if not math.isnan(value)]
+        accuracy = math.fsum(known) / len(known) if known else 1.0
         if accuracy < POOR_ACCURACY:
             notes.append(
                 f"On {dataset} only {100 * accuracy:.0f} % of the pixels lie within 25 % of the truth (δ₁). Where "
@@ -137,19 +151,6 @@ def caveats(results: Results) -> list[str]:
     if missing:
         notes.append(f"Rows left out because no network was given for them: {', '.join(missing)}.")
     return notes
-
-
-def _on_common(
-    results: Results, row: Row, reference: Row, quantity: Quantity, dataset: str | None
-) -> tuple[float, float]:
-    """Means of both over the sequences that both have."""
-    sides = [
-        {(r.dataset, r.sequence): quantity.factor * value_of(r, quantity.key) for r in results.of(side, dataset)}
-        for side in (row, reference)
-    ]
-    both = [key for key in sides[0] if not math.isnan(sides[0][key]) and not math.isnan(sides[1].get(key, math.nan))]
-    mine, theirs = (mean_over([side[key] for key in both]).value for side in sides)
-    return mine, theirs
 
 
 def _tally(name: str, made: Sequence[PairedComparison]) -> str:
@@ -199,29 +200,26 @@ def _best(results: Results, quantity: Quantity) -> str:
     """Which row has the best mean of a figure, and whether its lead is beyond chance; "" where rows are not alike."""
     rows = [row for row in results.rows if row.setting.plain]
     if quantity is not DELTA1:
-        rows = [row for row in rows if has_variance(results, row)]
+        rows = [row for row in rows if has_variance(results.of(row))]
     on = {frozenset((r.dataset, r.sequence) for r in results.of(row)) for row in rows}
     means = {row: mean_of(results.of(row), quantity) for row in rows}
     means = {row: mean for row, mean in means.items() if not math.isnan(mean.value)}
     if len(means) < 2 or len(on) > 1:
         return ""
-    sign = 1 if quantity.better == LOWER else -1
-    order = sorted(means, key=lambda row: sign * means[row].value)
-    first = order[0]
-    unit = f" {quantity.unit}" if quantity.unit else ""
-    value = f"{number(means[first].value, quantity.decimals)}{unit}"
-    alike = [row for row in order[1:] if number(means[row].value, quantity.decimals) == value.split(" ")[0]]
+    order = sorted(means, key=lambda row: means[row].value, reverse=quantity.better != LOWER)
+    first, second = order[:2]
+    value, runner_up = (number(means[row].value, quantity.decimals) for row in (first, second))
+    with_unit = f"{value}{_unit(quantity)}"
+    alike = [row for row in order[1:] if number(means[row].value, quantity.decimals) == value]
     if alike:
         shared = join([row_label(row) for row in (first, *alike)])
-        return f"Best {quantity.name}: {value}, shared by {shared}." if len(alike) < 6 else ""
-    lead = difference(results, first, order[1], quantity)
-    ranking = f"Best {quantity.name}: {row_label(first)} with {value}, before {row_label(order[1])}"
-    second = number(means[order[1]].value, quantity.decimals)
+        return f"Best {quantity.name}: {with_unit}, shared by {shared}." if len(alike) < 6 else ""
+    lead = difference(results.of(first), results.of(second), quantity)
+    ranking = f"Best {quantity.name}: {row_label(first)} with {with_unit}, before {row_label(second)}"
     if not lead.decidable:
-        return f"{ranking} ({second})."
+        return f"{ranking} ({runner_up})."
     beyond = "a lead beyond chance" if better(lead, quantity) else "a lead that may be chance"
-    change = f"{number(lead.value, quantity.decimals, signed=True)} ± {number(lead.half, quantity.decimals)}"
-    return f"{ranking} ({second}; {beyond}, {change})."
+    return f"{ranking} ({runner_up}; {beyond}, {change(lead, quantity)})."
 
 
 def _settings(results: Results) -> list[str]:
@@ -237,7 +235,7 @@ def _settings(results: Results) -> list[str]:
         parts = []
         for verdict in (BETTER, WORSE):
             listed = sorted((c for c in of_figure if c.verdict == verdict), key=lambda c: -abs(c.difference.value))
-            named = "; ".join(f"{row_label(c.row)} {_change(c)}" for c in listed[:4])
+            named = "; ".join(f"{row_label(c.row)} {change(c.difference, c.quantity)}" for c in listed[:4])
             more = f"; and {len(listed) - 4} more" if len(listed) > 4 else ""
             parts.append(f"{verdict} with {len(listed)}{f' ({named}{more})' if listed else ''}")
         sentences.append(
@@ -245,11 +243,6 @@ def _settings(results: Results) -> list[str]:
             f"undecided with {sum(c.verdict == OPEN for c in of_figure)}."
         )
     return sentences
-
-
-def _change(c: PairedComparison) -> str:
-    decimals = c.quantity.decimals
-    return f"{number(c.difference.value, decimals, signed=True)} ± {number(c.difference.half, decimals)}"
 
 
 def join(parts: Sequence[str]) -> str:
@@ -262,17 +255,10 @@ def count(n: int, noun: str) -> str:
     return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
-def _mean_accuracy(results: Results, dataset: str) -> float:
-    """δ₁ of a data set, mean over all rows; 1 where there is none."""
-    values = [mean_of(results.of(row, dataset), DELTA1).value for row in results.rows]
-    known = [value for value in values if not math.isnan(value)]
-    return math.fsum(known) / len(known) if known else 1.0
-
-
 def _left_out(results: Results) -> list[str]:
     shares = {}
     for row in results.rows:
-        share = mean_over([value_of(record, "nll_left_out_share") for record in results.of(row)]).value
+        share = mean_over(value_of(record, "nll_left_out_share") for record in results.of(row)).value
         if share > MANY_LEFT_OUT:
             shares[row] = share
     if not shares:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -28,6 +29,7 @@ SIGMA_FLOOR = 1e-6
 # The constant spherical harmonic: viewers show the colour 1/2 + SH_DC f_dc.
 SH_DC = 0.5 / np.sqrt(np.pi)
 OPACITY = 0.8
+RADIUS, SUBDIVISIONS = 2.0, 2  # of the ellipsoids, of the icosahedron: 320 triangles each
 _TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
 
@@ -56,76 +58,42 @@ def write_mixture_ply(
         OSError: see ``write_atomic``.
     """
     parts = _Components(mixture, stream, T_world_first)
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "weight", "disagreement"]
-    table = np.zeros(len(parts.mean), dtype=[*((name, "<f4") for name in names), ("count", "<i4")])
-    _fill(table, "xyz", parts.mean)
-    _fill(table, ("nx", "ny", "nz"), parts.axes[:, :, 0])
-    _fill(table, ("f_dc_0", "f_dc_1", "f_dc_2"), (parts.colour / 255 - 0.5) / SH_DC)
-    table["opacity"] = np.log(OPACITY / (1 - OPACITY))
-    _fill(table, ("scale_0", "scale_1", "scale_2"), np.log(parts.sigma))
-    _fill(
-        table,
-        ("rot_0", "rot_1", "rot_2", "rot_3"),
-        Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True),
-    )
-    for name in ("weight", "disagreement", "count"):
-        table[name] = getattr(parts, name)
+    quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
+    opacity = np.full(len(parts.mean), np.log(OPACITY / (1 - OPACITY)))
+    columns = (parts.mean, parts.axes[:, :, 0], (parts.colour / 255 - 0.5) / SH_DC, opacity, np.log(parts.sigma))
+    names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    kinds = dict.fromkeys((*names.split(), "weight", "disagreement"), "<f4") | {"count": "<i4"}
+    table = _table(kinds, *columns, quaternion, parts.weight, parts.disagreement, parts.count)
     _write_ply(Path(path), {"vertex": table}, [parts.legend])
     return len(table)
 
 
 def write_ellipsoids_ply(
-    path: str | Path,
-    mixture: GaussianMixture,
-    *,
-    stream: int = 0,
-    T_world_first: Tensor | None = None,
-    radius: float = 2.0,
-    subdivisions: int = 2,
+    path: str | Path, mixture: GaussianMixture, *, stream: int = 0, T_world_first: Tensor | None = None
 ) -> int:
-    """Write the occupied components as a triangle mesh of ellipsoids, atomically.
+    """Write the occupied components as a triangle mesh of ellipsoids of ``RADIUS`` standard deviations, atomically.
 
     Opens in MeshLab, Blender and the like. Vertices carry x y z [m], outward normals, red green blue of
-    sqrt(disagreement) as in ``write_mixture_ply``, disagreement [m^2] and the component's number.
-
-    Args:
-        path: the file; its folder must exist.
-        mixture: B streams of K slots.
-        stream: which of the B.
-        T_world_first: [4, 4] or [1, 4, 4] rigid, from the mixture's frame to the world; None = stay there.
-        radius: of the ellipsoids in standard deviations.
-        subdivisions: of the icosahedron; 2 gives 320 triangles each.
-
-    Returns:
-        The number of components written.
-
-    Raises:
-        ValueError: there is no such stream, a shape is wrong, or radius is not positive.
-        OSError: see ``write_atomic``.
+    sqrt(disagreement), disagreement [m^2] and the component's number. Arguments, result and errors as
+    :func:`write_mixture_ply`.
     """
-    if not radius > 0 or subdivisions < 0:
-        raise ValueError(f"radius must be positive and subdivisions >= 0, got {radius} and {subdivisions}")
     parts = _Components(mixture, stream, T_world_first)
-    sphere, triangles = icosphere(subdivisions)
+    sphere, triangles = icosphere(SUBDIVISIONS)
     k, n = len(parts.mean), len(sphere)
     # Sigma^(1/2) u: symmetric with a positive determinant, so triangles keep facing outwards.
     root = np.einsum("kij,kj,klj->kil", parts.axes, parts.sigma, parts.axes)
     inverse = np.einsum("kij,kj,klj->kil", parts.axes, 1 / parts.sigma, parts.axes)
     normal = np.einsum("kij,nj->kni", inverse, sphere)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    fields = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    fields += [(name, "|u1") for name in ("red", "green", "blue")]
-    vertices = np.zeros(k * n, dtype=[*fields, ("disagreement", "<f4"), ("component", "<i4")])
-    _fill(vertices, "xyz", (parts.mean[:, None] + radius * np.einsum("kij,nj->kni", root, sphere)).reshape(-1, 3))
-    _fill(vertices, ("nx", "ny", "nz"), normal.reshape(-1, 3))
-    _fill(vertices, ("red", "green", "blue"), parts.colour.repeat(n, axis=0))
-    vertices["disagreement"] = parts.disagreement.repeat(n)
-    vertices["component"] = np.arange(k).repeat(n)
+    position = (parts.mean[:, None] + RADIUS * np.einsum("kij,nj->kni", root, sphere)).reshape(-1, 3)
+    kinds = dict.fromkeys(("x", "y", "z", "nx", "ny", "nz"), "<f4")
+    kinds |= dict.fromkeys(("red", "green", "blue"), "|u1") | {"disagreement": "<f4", "component": "<i4"}
+    of_component = (parts.colour, parts.disagreement, np.arange(k))
+    vertices = _table(kinds, position, normal.reshape(-1, 3), *(values.repeat(n, axis=0) for values in of_component))
     faces = np.zeros(k * len(triangles), dtype=[("sides", "|u1"), ("vertex_indices", "<i4", (3,))])
     faces["sides"] = 3
     faces["vertex_indices"] = (triangles + n * np.arange(k)[:, None, None]).reshape(-1, 3)
-    legend = [parts.legend, f"ellipsoids of {radius:g} standard deviations"]
+    legend = [parts.legend, f"ellipsoids of {RADIUS:g} standard deviations"]
     _write_ply(Path(path), {"vertex": vertices, "face": faces}, legend)
     return k
 
@@ -216,10 +184,9 @@ def _rotation_translation(T: Tensor | None) -> tuple[NDArray[np.float64], NDArra
     return matrix[:3, :3], matrix[:3, 3]
 
 
-def _fill(table: NDArray[Any], names: Any, columns: NDArray[Any]) -> None:
-    """Set the fields ``names`` of a table that the caller has just made from the columns [N, len(names)]."""
-    for name, column in zip(names, columns.T, strict=True):
-        table[name] = column
+def _table(kinds: Mapping[str, str], *columns: NDArray[Any]) -> NDArray[Any]:
+    """A structured array of columns [N] or [N, c] side by side, with the types by name."""
+    return unstructured_to_structured(np.column_stack(columns), np.dtype(list(kinds.items())))
 
 
 def _write_ply(path: Path, elements: Mapping[str, NDArray[Any]], comments: list[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
@@ -13,7 +13,7 @@ from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import LOWER, Quantity
 from ufmstar_torch.eval.results.record import Record
 
-# With fewer sequences there is neither an interval nor a verdict: Student's interval of two to four values claims a
+# With fewer sequences there is neither an interval nor a verdict: Student's interval of two to four values assumes a
 # normal distribution, which was not checked.
 MIN_SEQUENCES = 5
 
@@ -28,9 +28,9 @@ class Mean:
         sequences: number of sequences that have the figure.
     """
 
-    value: float
-    half: float
-    sequences: int
+    value: float = math.nan
+    half: float = math.nan
+    sequences: int = 0
 
     @property
     def beyond(self) -> bool:
@@ -54,7 +54,7 @@ def value_of(record: Record, key: str) -> float:
     return math.nan if value is None else float(value)
 
 
-def mean_over(values: Sequence[float]) -> Mean:
+def mean_over(values: Iterable[float]) -> Mean:
     """The mean over sequences; NaN (no such figure) is left out."""
     from ufmstar_torch.eval.metrics import mean_and_ci
 
@@ -63,19 +63,32 @@ def mean_over(values: Sequence[float]) -> Mean:
     return Mean(mean, half if len(kept) >= MIN_SEQUENCES else math.nan, len(kept))
 
 
-def mean_of(records: Sequence[Record], quantity: Quantity) -> Mean:
-    """The mean of a figure over the records of one row, in the quantity's unit."""
-    return mean_over([quantity.factor * value_of(record, quantity.key) for record in records])
+def mean_of(records: Iterable[Record], quantity: Quantity) -> Mean:
+    """The mean of a figure over sequences, in the quantity's unit; several seeds of a sequence are averaged first."""
+    return mean_over(_by_sequence(records, quantity).values())
 
 
-def difference(results: Results, row: Row, reference: Row, quantity: Quantity, dataset: str | None = None) -> Mean:
-    """Mean of row - reference over the sequences that both have.
+def paired(mine: Iterable[Record], theirs: Iterable[Record], quantity: Quantity) -> list[tuple[float, float]]:
+    """A figure of both sides on the sequences that have it on both."""
+    others = _by_sequence(theirs, quantity)
+    pairs = ((value, others.get(where, math.nan)) for where, value in _by_sequence(mine, quantity).items())
+    return [pair for pair in pairs if not any(map(math.isnan, pair))]
+
+
+def difference(mine: Iterable[Record], theirs: Iterable[Record], quantity: Quantity) -> Mean:
+    """Mean of mine - theirs over the sequences that both have.
 
     Sequences differ far more than methods do, and that part cancels in each difference.
     """
-    theirs = {(r.dataset, r.sequence): value_of(r, quantity.key) for r in results.of(reference, dataset)}
-    mine = ((r, theirs.get((r.dataset, r.sequence), math.nan)) for r in results.of(row, dataset))
-    return mean_over([quantity.factor * (value_of(r, quantity.key) - other) for r, other in mine])
+    return mean_over(one - other for one, other in paired(mine, theirs, quantity))
+
+
+def _by_sequence(records: Iterable[Record], quantity: Quantity) -> dict[tuple[str, str], float]:
+    by_sequence: dict[tuple[str, str], list[float]] = {}
+    for record in records:
+        value = quantity.factor * value_of(record, quantity.key)
+        by_sequence.setdefault((record.dataset, record.sequence), []).append(value)
+    return {where: math.fsum(values) / len(values) for where, values in by_sequence.items()}
 
 
 def better(mean: Mean, quantity: Quantity) -> bool | None:
@@ -107,9 +120,9 @@ def references(results: Results, row: Row) -> list[Row]:
     if row.setting != plain:  # an ablation's row, or the paper's settings, to ours
         expected += [r for r in mine if r.method == method and r.setting == row.setting.chosen]
         expected += [r for r in mine if r.method == method and row.setting.plain and r.setting == plain]
-    return [r for r in expected if has_variance(results, r)]
+    return [r for r in expected if has_variance(results.of(r))]
 
 
-def has_variance(results: Results, row: Row) -> bool:
+def has_variance(records: Sequence[Record]) -> bool:
     """Whether a row has a variance: a network of depth alone has none."""
-    return any(not math.isnan(value_of(record, "ece_delta")) for record in results.of(row))
+    return any(not math.isnan(value_of(record, "ece_delta")) for record in records)

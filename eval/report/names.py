@@ -34,22 +34,22 @@ class Quantity:
     unit: str = ""
     factor: float = 1.0
 
-    @property
-    def arrow(self) -> str:
-        """↑ or ↓: the better way."""
-        return {LOWER: "↓", HIGHER: "↑", None: ""}[self.better]
+    def with_unit(self, name: str) -> str:
+        """A name with the unit: "RMSE [m]"."""
+        return f"{name} [{self.unit}]" if self.unit else name
 
     @property
     def heading(self) -> str:
-        """For a column: "RMSE [m] ↓"."""
-        return " ".join(filter(None, (self.name, f"[{self.unit}]" if self.unit else "", self.arrow)))
+        """For a column, with an arrow the better way: "RMSE [m] ↓"."""
+        arrow = {LOWER: " ↓", HIGHER: " ↑", None: ""}[self.better]
+        return f"{self.with_unit(self.name)}{arrow}"
 
     @property
     def latex_heading(self) -> str:
         """The same in LaTeX."""
-        arrow = {LOWER: r"$\downarrow$", HIGHER: r"$\uparrow$", None: ""}[self.better]
+        arrow = {LOWER: r" $\downarrow$", HIGHER: r" $\uparrow$", None: ""}[self.better]
         unit = self.unit.replace("%", r"\%").replace("²", "$^2$")
-        return " ".join(filter(None, (self.latex, f"[{unit}]" if unit else "", arrow)))
+        return f"{self.latex}{f' [{unit}]' if unit else ''}{arrow}"
 
 
 DELTA1 = Quantity("delta1", "δ₁", r"$\delta_1$", 3, HIGHER)

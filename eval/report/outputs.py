@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
-from ufmstar_torch.eval.report.panels import FramePanel, PanelScales, contact_sheet, fit_scales
+from ufmstar_torch.eval.report.panels import FramePanel, MapColumn, contact_sheet, map_columns
 from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.writers import read_frame
@@ -30,13 +31,8 @@ from ufmstar_torch.ufmstar import UfMStar
 
 # Rows of the demo beside UfM and UfM*: the member in turn alone, its posterior, and all members on every image.
 NETWORK, POSTERIOR, ENSEMBLE = "network", "posterior", "ensemble"
-SHEET, CURVES, PLY, ELLIPSOIDS, NPZ = (
-    "contact_sheet.png",
-    "calibration.png",
-    "mixture.ply",
-    "ellipsoids.ply",
-    "mixture.npz",
-)
+SHEET, CURVES = "contact_sheet.png", "calibration.png"
+PLY, ELLIPSOIDS, NPZ = "mixture.ply", "ellipsoids.ply", "mixture.npz"
 DEMO_FILES = (SHEET, CURVES, PLY, ELLIPSOIDS, NPZ, "curves.json")
 SHEET_ROWS, POSTERIOR_ROWS, SCALE_FRAMES = 6, 3, 12
 # Without timestamps; and the range in which a recording's own rate is kept.
@@ -65,7 +61,10 @@ class Finished:
         stored = read_frame(self.out / "frames" / f"{record['name']}.npz")
         K, size = pinhole(*record["intrinsics"]), (record["size"][0], record["size"][1])
         K_square, size_square = square_pixels(K, size)
-        frame = self._frame(record["index"])
+        try:
+            frame: Frame | None = self.frames[record["index"]]
+        except FrameError:  # it can be read no more
+            frame = None
         truth = truth_at(frame, K, size) if self.with_error and frame is not None else None
         maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "valid": stored["valid"]}
         note = f"K = {record['components']}"
@@ -98,53 +97,40 @@ class Finished:
             return DEFAULT_FPS
         return float(np.clip(1 / np.median(np.diff(known)), *FPS_RANGE))
 
-    def _frame(self, index: int) -> Frame | None:
-        """The frame again, or None if it cannot be read any more."""
-        try:
-            return self.frames[index]
-        except FrameError:
-            return None
+
+def common_columns(finished: Finished) -> list[MapColumn]:
+    """The maps of sheet and video, on scales that fit frames spread over the whole run."""
+    return map_columns([finished.panel(number) for number in finished.spread(SCALE_FRAMES)])
 
 
-def draw_sheet(finished: Finished, scales: PanelScales, title: str, rows: int = SHEET_ROWS) -> None:
+def draw_sheet(finished: Finished, columns: Sequence[MapColumn], title: str) -> None:
     """Write contact_sheet.png: frames spread over the run, the last one included.
 
     The first is not, unless it is the only one: it was compared with nothing, so its disagreement is 0.
     """
-    if "posterior" in finished.records[-1]:
-        rows = min(rows, POSTERIOR_ROWS)  # wide: before and after
-    numbers = finished.spread(rows + 1)
+    wide = "posterior" in finished.records[-1]  # before and after
+    numbers = finished.spread((POSTERIOR_ROWS if wide else SHEET_ROWS) + 1)
     panels = [finished.panel(number) for number in numbers[1:] or numbers]
-    contact_sheet(panels, finished.out / SHEET, title=title, scales=scales)
+    contact_sheet(panels, finished.out / SHEET, title=title, columns=columns)
 
 
-def draw_video(finished: Finished, scales: PanelScales) -> Iterator[int]:
+def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int]:
     """Write preview.mp4 frame by frame; yields how many are done, so that the caller can report and stop."""
     with VideoWriter(finished.out / "preview.mp4", finished.fps()) as video:
         for number in range(len(finished.records)):
-            video.add(preview_frame(finished.panel(number), scales, with_error=finished.with_error))
+            video.add(preview_frame(finished.panel(number), columns))
             yield number + 1
-
-
-def common_scales(finished: Finished) -> PanelScales:
-    """Colour scales for sheet and video, from frames spread over the whole run."""
-    return fit_scales([finished.panel(number) for number in finished.spread(SCALE_FRAMES)])
 
 
 def mixture_writers(ufm: UfMStar) -> dict[str, Callable[[Path], object]]:
     """By file name, what writes the mixture in world coordinates: as splats, as ellipsoids, and exactly."""
     mixture, first = ufm.mixture, ufm.T_world_first
-    return {
-        PLY: lambda path: write_mixture_ply(path, mixture, T_world_first=first),
-        ELLIPSOIDS: lambda path: write_ellipsoids_ply(path, mixture, T_world_first=first),
-        NPZ: lambda path: write_mixture_npz(path, mixture, T_world_first=first),
+    writers: dict[str, Callable[..., object]] = {
+        PLY: write_mixture_ply,
+        ELLIPSOIDS: write_ellipsoids_ply,
+        NPZ: write_mixture_npz,
     }
-
-
-def write_mixture(out: Path, ufm: UfMStar) -> None:
-    """Write all files of ``mixture_writers`` into a folder."""
-    for name, write in mixture_writers(ufm).items():
-        write(out / name)
+    return {name: partial(write, mixture=mixture, T_world_first=first) for name, write in writers.items()}
 
 
 def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
@@ -179,26 +165,16 @@ def panel(name: str, note: str, result: FrameResult) -> FramePanel:
         note: the kind of room.
         result: the frame through the demo's rows, with an image and ground truth.
     """
-    star, after, truth = result.rows[UFM_STAR].estimate, result.rows[POSTERIOR].estimate, result.rows[UFM_STAR].truth
-    assert result.frame is not None
-    assert result.frame.image is not None
-    assert truth is not None
-    assert star.variance is not None
-    assert after.variance is not None
-    depth, corrected = star.depth.float().numpy(), after.depth.float().numpy()
-    before_error, error = (np.where(truth > 0, np.abs(d - truth), np.nan) for d in (depth, corrected))
-    return FramePanel(
-        name=name,
-        note=note,
-        image=result.frame.image,
-        depth=depth,
-        sigma=star.variance.float().sqrt().numpy(),
-        error=before_error.astype(np.float32),
-        valid=star.valid.numpy(),
-        posterior=corrected,
-        posterior_sigma=after.variance.float().sqrt().numpy(),
-        posterior_error=error.astype(np.float32),
-    )
+    star: Any = result.rows[UFM_STAR]
+    maps: dict[str, Any] = {}
+    for prefix, row in (("", star), ("posterior_", result.rows[POSTERIOR])):
+        estimate: Any = row.estimate
+        depth = estimate.depth.float().numpy()
+        error = np.where(star.truth > 0, np.abs(depth - star.truth), np.nan).astype(np.float32)
+        maps |= {prefix.rstrip("_") or "depth": depth, f"{prefix}error": error}
+        maps[f"{prefix}sigma"] = estimate.variance.float().sqrt().numpy()
+    frame: Any = result.frame
+    return FramePanel(name=name, note=note, image=frame.image, valid=star.estimate.valid.numpy(), **maps)
 
 
 def write_pictures(

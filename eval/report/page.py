@@ -7,7 +7,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from ufmstar_torch.eval.report.findings import PairedComparison, best_rows, cave
 from ufmstar_torch.eval.report.means import MIN_SEQUENCES, value_of
 from ufmstar_torch.eval.report.names import DIFFERENCES, row_label
 from ufmstar_torch.eval.report.pictures import BREAKDOWN, COMPARE, ROOM, STRIP, Picture
-from ufmstar_torch.eval.report.table import number
+from ufmstar_torch.eval.report.table import Table, number
 from ufmstar_torch.eval.report.tables import difference_table, extra_table, main_table, sequence_tables
 from ufmstar_torch.eval.results.files import write_atomic
 
@@ -89,32 +89,34 @@ def write_page(
         ImportError: Pillow or Jinja2 is missing.
         OSError: the file cannot be written.
     """
-    embedder = Embedder(most_bytes)
+    shown, left_out = _pictures(results.out / "figures", figures, pictures, most_bytes)
+    efficiency = [] if results.efficiency is None else efficiency_tables(results.efficiency)
+    sequences = [table for dataset in results.datasets for table in sequence_tables(results, dataset)]
+    more = len(sequences) - MOST_SEQUENCES
+    words = f"The other {more} sequences are in the folder's tables." if more > 0 else ""
     parts = [
         _findings(results),
         *_tables(results),
-        *_pictures(results.out / "figures", figures, pictures, embedder),
-        _efficiency(results),
-        _sequences(results),
+        *shown,
+        *([_part("Efficiency", efficiency)] if efficiency else []),
+        _part("Single sequences", folded=sequences[:MOST_SEQUENCES], words=words),
         _problems(results, undrawn or {}),
         _made(results),
         {"kind": "glossary", "title": "What the words mean"},
     ]
-    sequences = results.sequences()
     frames = {
         (r.dataset, r.sequence): max(0, int(f)) for r in results.records if (f := value_of(r, "frames.done")) == f
     }
-    facts = [(len(results.rows), "rows"), (len(sequences), "sequences" if len(sequences) > 1 else "sequence")]
+    n = len(results.sequences())
+    facts = {"rows": len(results.rows), f"sequence{'s' if n > 1 else ''}": n, "frames": sum(frames.values())}
     text = _template().render(
         results=results,
-        parts=[part for part in parts if part],
+        parts=parts,
         networks=join(list(dict.fromkeys(record.network for record in results.records))),
         datasets=join(list(results.datasets)),
-        facts=[
-            (f"{n:,}".replace(",", "\u202f") if n else "", w) for n, w in (*facts, (sum(frames.values()), "frames"))
-        ],
+        facts=[(f"{total:,}".replace(",", "\u202f") if total else "", word) for word, total in facts.items()],
         min_sequences=MIN_SEQUENCES,
-        left_out=embedder.left_out_words,
+        left_out=left_out,
     )
     path = results.out / PAGE
     write_atomic(path, lambda file: file.write(text.encode()))
@@ -188,6 +190,10 @@ def _verdict(c: PairedComparison) -> dict[str, str]:
     return {"verdict": c.verdict, "means": means, "words": c.words}
 
 
+def _part(title: str, tables: Sequence[Table] = (), folded: Sequence[Table] = (), words: str = "") -> Part:
+    return {"kind": "tables", "title": title, "tables": tables, "folded": folded, "words": words}
+
+
 def _tables(results: Results) -> list[Part]:
     """The main table, paired differences and further figures, over all sequences and, folded, by data set."""
     makers = {"The main table": main_table, "Paired differences": difference_table, "Further figures": extra_table}
@@ -197,47 +203,62 @@ def _tables(results: Results) -> list[Part]:
         tables = [table for table in [make(results, None)] if not table.is_empty]
         folded = [table for dataset in each if not (table := make(results, dataset)).is_empty]
         if tables or folded:
-            parts.append({"kind": "tables", "title": title, "tables": tables, "folded": folded, "words": ""})
+            parts.append(_part(title, tables, folded))
     return parts
 
 
-def _efficiency(results: Results) -> Part | None:
-    if results.efficiency is None:
-        return None
-    tables = efficiency_tables(results.efficiency)
-    return {"kind": "tables", "title": "Efficiency", "tables": tables, "folded": [], "words": ""} if tables else None
-
-
-def _sequences(results: Results) -> Part:
-    tables = [table for dataset in results.datasets for table in sequence_tables(results, dataset)]
-    more = len(tables) - MOST_SEQUENCES
-    words = f"The other {more} sequences are in the folder's tables." if more > 0 else ""
-    folded = tables[:MOST_SEQUENCES]
-    return {"kind": "tables", "title": "Single sequences", "tables": [], "folded": folded, "words": words}
-
-
-def _pictures(folder: Path, figures: Sequence[Path], pictures: Sequence[Picture], embedder: Embedder) -> list[Part]:
-    """Diagrams by kind, those of single sequences folded and last; then pictures by kind."""
-    by_kind: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _PARTS}
-    single = [path for path in figures if _words_of(path)[1:2] == ["sequences"]]
-    for path in [*(path for path in figures if path not in single), *single]:
-        kind, *words = _words_of(path)
-        of_kind = by_kind.get(kind, by_kind["other"])
+def _pictures(
+    folder: Path, figures: Sequence[Path], pictures: Sequence[Picture], room: int
+) -> tuple[list[Part], list[str]]:
+    """Diagrams by kind, those of single sequences folded and last, then pictures by kind, as long as they fit into
+    ``room`` bytes; and the names of those that do not."""
+    todo: list[tuple[str, Path, dict[str, str]]] = []
+    for path in figures:
+        kind, *words = path.stem.replace("_", "-").split("-")
         alt = f"{_PARTS.get(kind, _PARTS['other'])[0]}: {' '.join([kind, *words])}"
-        folded = " ".join(words) if path in single else ""
-        of_kind += embedder.take(path, alt=alt, title="", caption="", folded=folded)
-    for picture in pictures:
-        words_ = {"alt": picture.alt, "title": picture.title, "caption": picture.caption, "folded": ""}
-        by_kind[picture.kind] += embedder.take(folder / picture.file, **words_)
-    return [
+        folded = " ".join(words) if words[:1] == ["sequences"] else ""
+        todo.append((kind, path, {"alt": alt, "title": "", "caption": "", "folded": folded}))
+    todo.sort(key=lambda entry: bool(entry[2]["folded"]))
+    todo += [(picture.kind, folder / picture.file, {**asdict(picture), "folded": ""}) for picture in pictures]
+    by_kind: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _PARTS}
+    left_out = []
+    for kind, path, named in todo:
+        uri, width, height = _embedded(path)
+        if len(uri) > room:
+            left_out.append(path.name)
+        else:
+            room -= len(uri)
+            by_kind.get(kind, by_kind["other"]).append({**named, "uri": uri, "width": width, "height": height})
+    parts = [
         {"kind": "pictures", "title": _PARTS[kind][0], "words": _PARTS[kind][1], "pictures": shown}
         for kind, shown in by_kind.items()
         if shown
     ]
+    return parts, left_out
 
 
-def _words_of(path: Path) -> list[str]:
-    return path.stem.replace("_", "-").split("-")
+def _embedded(path: Path) -> tuple[str, int, int]:
+    """A data URI, and width and height in pixels of the page; a PNG becomes WebP, which is a fifth of it.
+
+    Raises:
+        ValueError: it is neither SVG nor PNG.
+        OSError: it cannot be read.
+    """
+    if path.suffix == ".png":
+        from PIL import Image
+
+        with Image.open(path) as picture:
+            buffer = io.BytesIO()
+            picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=4)
+            return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}", *picture.size
+    data = path.read_bytes() if path.suffix == ".svg" else b""
+    size = []
+    for name in ("width", "height"):  # of the outermost element; a point is 4/3 pixels
+        length = re.search(rf'<svg\b[^>]*?\b{name}="([0-9.]+)(pt|px)?"', data.decode())
+        if length is None:
+            raise ValueError(f"a picture must be an SVG with a {name} in points, or a PNG, got {path.name}")
+        size.append(round(float(length[1]) * (4 / 3 if length[2] == "pt" else 1)))
+    return f"data:image/svg+xml;base64,{base64.b64encode(data).decode()}", size[0], size[1]
 
 
 def _problems(results: Results, undrawn: Mapping[str, str]) -> Part:
@@ -279,7 +300,9 @@ def command(about: Mapping[str, Any]) -> str:
     parts = ["ufmstar eval", f"--suite {about['suite']}"]
     parts += [f"--root {dataset}=DIR" for dataset in about.get("datasets") or []]
     for base, network in (about.get("networks") or {}).items():
-        files = ",".join(f"DIR/{_weights(file)}" for file in network.get("files") or [] if file.get("name"))
+        listed = [(f["name"], f.get("member")) for f in network.get("files") or [] if f.get("name")]
+        # Of a file with several networks, the member that was taken.
+        files = ",".join(f"DIR/{name}" if member is None else f"DIR/{name}#{member}" for name, member in listed)
         parts.append(f"--network {base}={network.get('model', 'MODEL')}:{files or 'DIR'}")
     for name, value in (about.get("settings") or {}).items():
         if name == "frames":  # START:STOP:STEP; "::" is all
@@ -287,72 +310,3 @@ def command(about: Mapping[str, Any]) -> str:
         if value not in ("::", None):
             parts.append(f"--{name.replace('_', '-')} {value}")
     return " ".join([*parts, "--out OUT"])
-
-
-def _weights(file: Mapping[str, Any]) -> str:
-    """A file of weights, and the member of it that was taken."""
-    member = file.get("member")
-    return str(file["name"]) if member is None else f"{file['name']}#{member}"
-
-
-# ---- pictures inside the page ----
-
-
-@dataclass
-class Embedder:
-    """Makes data URIs of pictures, as long as there is room for them.
-
-    Attributes:
-        left: bytes that the data URIs may still take.
-        left_out: names of the pictures that did not fit.
-    """
-
-    left: int = MOST_BYTES
-    left_out: list[str] = field(default_factory=list)
-
-    def take(self, path: Path, **words: str) -> list[dict[str, Any]]:
-        """[uri, width and height in pixels of the page, and the words], [] where the picture would not fit.
-
-        Raises:
-            ValueError: it is neither SVG nor PNG.
-            OSError: it cannot be read.
-        """
-        uri, width, height = _svg(path) if path.suffix == ".svg" else _png(path)
-        if len(uri) > self.left:
-            self.left_out.append(path.name)
-            return []
-        self.left -= len(uri)
-        return [{"uri": uri, "width": width, "height": height, **words}]
-
-    @property
-    def left_out_words(self) -> str:
-        """A sentence about the pictures that did not fit, "" without any."""
-        names = ", ".join(self.left_out)
-        return f"{count(len(self.left_out), 'picture')} did not fit into this page: {names}." if names else ""
-
-
-def _svg(path: Path) -> tuple[str, int, int]:
-    text = path.read_text(encoding="utf-8")
-    size = []
-    for name in ("width", "height"):  # of the outermost element; a point is 4/3 pixels
-        length = re.search(rf'<svg\b[^>]*?\b{name}="([0-9.]+)(pt|px)?"', text)
-        if length is None:
-            raise ValueError(f"a picture must be an SVG with a {name} in points, or a PNG")
-        size.append(round(float(length[1]) * (4 / 3 if length[2] == "pt" else 1)))
-    return _uri("image/svg+xml", text.encode()), size[0], size[1]
-
-
-def _png(path: Path) -> tuple[str, int, int]:
-    """As WebP, which is a fifth of it."""
-    if path.suffix != ".png":
-        raise ValueError(f"a picture must be an SVG or a PNG, got {path.name}")
-    from PIL import Image
-
-    with Image.open(path) as picture:
-        buffer = io.BytesIO()
-        picture.convert("RGB").save(buffer, "WEBP", quality=QUALITY, method=4)
-        return _uri("image/webp", buffer.getvalue()), *picture.size
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

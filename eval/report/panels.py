@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,86 +110,60 @@ def draw_grid(
     """
     if not rows:
         raise ValueError("rows must hold at least one row of pictures")
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    letters = max(8, int(12 * words))
-    layout = _Layout.of(rows, aspect, bool(title), cell, words, letters)
-    figure = Figure(figsize=(layout.width, layout.height), dpi=dpi, facecolor="white")
-    if title:
-        x, y = _MARGIN / layout.width, 1 - 0.2 / layout.height
-        figure.text(x, y, plain(title), size=11, weight="bold", color=INK, va="center")
-    for number, row in enumerate(rows):
-        _draw_words(figure, layout, number, row, letters)
+    names = [break_name(row.title, max(8, int(12 * words))) for row in rows]
+    named = [0.16 * (name.count("\n") + 1) + 0.05 for name in names]
+    heads = [_CAPTION if any(panel.caption for panel in row.panels) else 0.0 for row in rows]
+    # Pictures of a driving car are flatter than the words beside them.
+    tall = [max(cell * aspect, above + 0.145 * len(row.lines)) for above, row in zip(named, rows, strict=True)]
+    step = cell + _GAP
+    width = _MARGIN + words + max(len(row.panels) for row in rows) * step - _GAP + _MARGIN
+    top = (_TITLE if title else _MARGIN) + len(rows) * _GAP + sum(tall) + sum(heads) + _BARS
+    figure = new_sheet(width, top, title, dpi)
+    top -= _TITLE if title else _MARGIN
+    for row, name, above, head, height in zip(rows, names, named, heads, tall, strict=True):
+        top -= head
+        say(figure, _MARGIN, top, name, size=8.5, weight="bold", color=INK, va="top", linespacing=1.15)
+        lines = "\n".join(row.lines)
+        say(figure, _MARGIN, top - above, lines, size=7.5, color=FAINT, va="top", linespacing=1.3)
         for column, panel in enumerate(row.panels):
-            _draw_panel(figure.add_axes(layout.cell(number, column)), panel)
+            left = _MARGIN + words + column * step
+            _draw_panel(axes_at(figure, left, top - cell * aspect, cell, cell * aspect), panel)
+        top -= height + _GAP
+    bottom = _BARS - 0.14 - _BAR
     for bar in bars:
-        draw_bar(figure.add_axes(layout.bar(bar)), bar)
-    _draw_legend(figure, layout)
+        left = _MARGIN + words + bar.column * step + 0.12
+        draw_bar(axes_at(figure, left, bottom, bar.span * step - _GAP - 0.24, _BAR), bar)
+    from matplotlib.patches import Rectangle
+
+    grey = (INVALID_GREY / 255,) * 3
+    figure.add_artist(Rectangle((_MARGIN, bottom), 0.12, _BAR, color=grey, transform=figure.dpi_scale_trans))
+    say(figure, _MARGIN + 0.18, bottom + _BAR / 2, "no value, no truth", size=7.5, color=FAINT, va="center")
     save_png(figure, path)
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Positions on the sheet; lengths in inches, answers in shares of the figure."""
+def new_sheet(width: float, height: float, title: str, dpi: int = 110) -> Any:
+    """An empty figure with a title [in].
 
-    columns: int
-    cell_width: float
-    cell_height: float
-    words_width: float
-    tall: tuple[float, ...]
-    heads: tuple[float, ...]
-    top: float
+    Raises:
+        ImportError: matplotlib is missing.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
 
-    @classmethod
-    def of(
-        cls, rows: Sequence[GridRow], aspect: float, title: bool, cell: float, words: float, letters: int
-    ) -> _Layout:
-        heads = tuple(_CAPTION if any(panel.caption for panel in row.panels) else 0.0 for row in rows)
-        # Pictures of a driving car are flatter than the words beside them.
-        beside = (_title_height(break_name(row.title, letters)) + 0.145 * len(row.lines) for row in rows)
-        tall = tuple(max(cell * aspect, height) for height in beside)
-        columns = max(len(row.panels) for row in rows)
-        return cls(columns, cell, cell * aspect, words, tall, heads, _TITLE if title else _MARGIN)
-
-    @property
-    def width(self) -> float:
-        return _MARGIN + self.words_width + self.columns * (self.cell_width + _GAP) - _GAP + _MARGIN
-
-    @property
-    def height(self) -> float:
-        return self.top + len(self.tall) * _GAP + sum(self.tall) + sum(self.heads) + _BARS
-
-    def cell(self, row: int, column: int) -> tuple[float, float, float, float]:
-        """(left, bottom, width, height)."""
-        above = self.top + sum(self.tall[:row]) + row * _GAP + sum(self.heads[: row + 1])
-        return self._shares(
-            self._left(column), self.height - above - self.cell_height, self.cell_width, self.cell_height
-        )
-
-    def bar(self, bar: Bar) -> tuple[float, float, float, float]:
-        width = bar.span * (self.cell_width + _GAP) - _GAP
-        return self._shares(self._left(bar.column) + 0.12, _BARS - 0.14 - _BAR, width - 0.24, _BAR)
-
-    def _left(self, column: int) -> float:
-        return _MARGIN + self.words_width + column * (self.cell_width + _GAP)
-
-    def _shares(self, left: float, bottom: float, width: float, height: float) -> tuple[float, float, float, float]:
-        return left / self.width, bottom / self.height, width / self.width, height / self.height
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    say(figure, _MARGIN, height - 0.2, title, size=11, weight="bold", color=INK, va="center")
+    return figure
 
 
-def _draw_words(figure: Any, layout: _Layout, number: int, row: GridRow, letters: int) -> None:
-    _, bottom, _, height = layout.cell(number, 0)
-    x, y = _MARGIN / layout.width, bottom + height
-    title = break_name(row.title, letters)
-    figure.text(x, y, plain(title), size=8.5, weight="bold", color=INK, va="top", linespacing=1.15)
-    down = _title_height(title) / layout.height
-    figure.text(x, y - down, plain("\n".join(row.lines)), size=7.5, color=FAINT, va="top", linespacing=1.3)
+def say(figure: Any, x: float, y: float, words: str, **how: Any) -> None:
+    """Words at a place of a sheet [in]."""
+    figure.text(x, y, plain(words), transform=figure.dpi_scale_trans, **how)
 
 
-def _title_height(title: str) -> float:
-    """Of a row's broken title with the space below it [in]."""
-    return 0.16 * (title.count("\n") + 1) + 0.05
+def axes_at(figure: Any, left: float, bottom: float, width: float, height: float) -> Any:
+    """Axes at a place of a sheet [in]."""
+    wide, high = figure.get_size_inches()
+    return figure.add_axes((left / wide, bottom / high, width / wide, height / high))
 
 
 def break_name(name: str, letters: int = 20) -> str:
@@ -238,19 +212,18 @@ def draw_bar(axes: Any, bar: Bar) -> None:
     drawn.set_label(bar.label, size=7.5, color=INK, labelpad=1)
 
 
-def _draw_legend(figure: Any, layout: _Layout) -> None:
-    """What grey means, left of the bars."""
-    from matplotlib.patches import Rectangle
-
-    left, bottom = _MARGIN / layout.width, (_BARS - 0.14 - _BAR) / layout.height
-    size = (0.12 / layout.width, _BAR / layout.height)
-    grey = (INVALID_GREY / 255,) * 3
-    figure.add_artist(Rectangle((left, bottom), *size, color=grey, transform=figure.transFigure))
-    x, y = left + 0.18 / layout.width, bottom + size[1] / 2
-    figure.text(x, y, "no value, no truth", size=7.5, color=FAINT, va="center")
-
-
 # ---- the contact sheet: image | depth | sigma | error, one row per frame ----
+
+# The maps of a frame, in the order of their columns: the label, and the scale that several of them share.
+MAPS = {
+    "depth": ("depth", "depth"),
+    "posterior": ("posterior", "depth"),
+    "sigma": ("σ", "length"),
+    "anchored": ("√B", "length"),
+    "error": ("|error|", "length"),
+    "posterior_sigma": ("σ, posterior", "length"),
+    "posterior_error": ("|error|, posterior", "length"),
+}
 
 
 @dataclass(frozen=True)
@@ -287,27 +260,20 @@ class FramePanel:
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[-1] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be uint8 [H, W, 3], got {self.image.dtype} {self.image.shape}")
-        of_posterior = ("posterior", "posterior_sigma", "posterior_error")
-        for label in ("sigma", "error", "valid", "anchored", *of_posterior):
+        for label in (*MAPS, "valid"):
             value = getattr(self, label)
             if value is not None and value.shape != self.depth.shape:
                 raise ValueError(f"{label} must have the depth's shape {self.depth.shape}, got {value.shape}")
 
 
-# Maps that share the scale of sigma and error.
-_LENGTHS = ("sigma", "error", "posterior_sigma", "posterior_error")
-
-
-@dataclass(frozen=True)
-class PanelScales:
+class PanelScales(NamedTuple):
     """The colour scales that all frames of a sheet or a video share: of depth, and of sigma and error together."""
 
     depth: ColourScale
     length: ColourScale
 
 
-@dataclass(frozen=True)
-class MapColumn:
+class MapColumn(NamedTuple):
     """One kind of map: its name, its scale, and the field of ``FramePanel`` that holds it."""
 
     label: str
@@ -325,42 +291,23 @@ def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
 
     That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
     """
-    corrected = [(p.posterior, p.valid) for p in panels if p.posterior is not None]
-    depth = robust_range([*((p.depth, p.valid) for p in panels), *corrected], from_zero=False)
-    maps = ([(getattr(p, name), p.valid) for p in panels] for name in _LENGTHS)
-    ranges = [robust_range(known, from_zero=True) for of in maps if (known := [m for m in of if m[0] is not None])]
-    return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(0.0, max(high for _, high in ranges), ERROR_MAP))
+    of = {name: [(m, p.valid) for p in panels if (m := getattr(p, name)) is not None] for name in MAPS}
+    depth = robust_range([*of["depth"], *of["posterior"]], from_zero=False)
+    lengths = (of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name])
+    high = max(robust_range(maps, from_zero=True)[1] for maps in lengths)
+    return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(0.0, high, ERROR_MAP))
 
 
-def map_columns(
-    scales: PanelScales,
-    *,
-    with_error: bool,
-    with_anchored: bool = False,
-    with_posterior: bool = False,
-) -> list[MapColumn]:
-    """The columns right of the image: depth, sigma, what anchors add, the error; with a
-    posterior depth, sigma and error before and after."""
-    columns = [MapColumn("depth", scales.depth, "depth")]
-    if with_posterior:
-        columns += [MapColumn("posterior", scales.depth, "posterior"), MapColumn("σ", scales.length, "sigma")]
-        columns += [MapColumn("|error|", scales.length, "error")] if with_error else []
-        columns += [MapColumn("σ, posterior", scales.length, "posterior_sigma")]
-        return columns + ([MapColumn("|error|, posterior", scales.length, "posterior_error")] if with_error else [])
-    columns += [MapColumn("σ", scales.length, "sigma")]
-    columns += [MapColumn("√B", scales.length, "anchored")] if with_anchored else []
-    return columns + ([MapColumn("|error|", scales.length, "error")] if with_error else [])
+def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
+    """The columns right of the image, of all maps that some panel has, on scales that fit all panels."""
+    scales = fit_scales(panels)
+    shown = (name for name in MAPS if any(getattr(panel, name) is not None for panel in panels))
+    return [MapColumn(MAPS[name][0], getattr(scales, MAPS[name][1]), name) for name in shown]
 
 
 def contact_sheet(
-    panels: Sequence[FramePanel],
-    path: str | Path,
-    *,
-    title: str = "",
-    scales: PanelScales | None = None,
-    columns: Sequence[MapColumn] | None = None,
-    dpi: int = 110,
-) -> PanelScales:
+    panels: Sequence[FramePanel], path: str | Path, *, title: str = "", columns: Sequence[MapColumn] | None = None
+) -> None:
     """Draw the frames below each other and write the picture (PNG), atomically.
 
     Neighbouring columns of one scale share a colour bar; invalid pixels are grey.
@@ -369,12 +316,7 @@ def contact_sheet(
         panels: at least one; three to six rows read well.
         path: the file; its folder must exist.
         title: over the sheet.
-        scales: None = ``fit_scales(panels)``.
-        columns: right of the image; None = all maps that some panel has.
-        dpi: pixels per inch.
-
-    Returns:
-        The scales that were used.
+        columns: right of the image; None = ``map_columns(panels)``.
 
     Raises:
         ValueError: there is no panel.
@@ -383,26 +325,19 @@ def contact_sheet(
     if not panels:
         raise ValueError("panels must hold at least one frame")
     require_matplotlib()
-    used = fit_scales(panels) if scales is None else scales
-    if columns is None:
-        fields = ("error", "anchored", "posterior")
-        has = {name: any(getattr(p, name) is not None for p in panels) for name in fields}
-        columns = map_columns(used, **{f"with_{name}": shown for name, shown in has.items()})
-    rows = [
-        GridRow(p.name, p.note.split(", ") if p.note else [], [Panel(p.image), *(_map_panel(c, p) for c in columns)])
-        for p in panels
-    ]
+    columns = map_columns(panels) if columns is None else columns
+    absent = ["no ground truth" if column.field == "error" else "none" for column in columns]
+    rows = []
+    for p in panels:
+        maps = [Panel(column.rgb(p), absent=words) for column, words in zip(columns, absent, strict=True)]
+        rows.append(GridRow(p.name, p.note.split(", ") if p.note else [], [Panel(p.image), *maps]))
     rows[0] = rows[0].captioned(["image", *(column.label for column in columns)])
-    bars, position = [], 1
+    bars: list[Bar] = []
+    position = 1
     for scale, of_scale in groupby(columns, key=lambda column: column.scale):
         labels = [column.label for column in of_scale]
         words = f"{', '.join(labels) if len(labels) < 3 else 'σ and |error|'} [m]"
         bars.append(Bar(words, scale, position, len(labels), "max" if scale.low == 0 else "both"))
         position += len(labels)
     height, width = panels[0].depth.shape
-    draw_grid(Path(path), rows, bars, aspect=height / width, title=title, cell=2.4, words=1.2, dpi=dpi)
-    return used
-
-
-def _map_panel(column: MapColumn, panel: FramePanel) -> Panel:
-    return Panel(column.rgb(panel), absent="no ground truth" if column.field == "error" else "none")
+    draw_grid(Path(path), rows, bars, aspect=height / width, title=title, cell=2.4, words=1.2)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from itertools import groupby
@@ -23,16 +22,12 @@ from ufmstar_torch.eval.report.examples import Example, Map, RowMaps, deviation,
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
-from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.worklist import WorkItem
 
-INDEX = "pictures.json"
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
 # So that a report of a hundred sequences stays one that can be read, and mailed.
 MOST_FRAMES, MOST_ROOMS = 4, 3
 _BREAKDOWN_BASES = ("ensemble", "aleatoric")
-# Errors of drawing, after which a report goes on without the picture.
-DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
 # [nats] The same in all strips, so that they can be compared. 6 is an error of some 3.5 sigma (of sigma = .3 m): beyond
 # it a row is simply wrong there, and how much more so would only flatten the rest of the map. Its map is neither
 # depth's nor that of lengths, and has no grey.
@@ -61,46 +56,16 @@ class Picture:
     alt: str
 
 
-def write_pictures(results: Results, undrawn: dict[str, str]) -> list[Picture]:
-    """Draw strips, breakdowns, comparisons and rooms of the example frames into ``OUT/figures``, with an index.
-
-    Args:
-        results: of the evaluation.
-        undrawn: gets the reason of each picture that cannot be drawn, by its name.
+def pictures_of(results: Results, folder: Path) -> Iterator[tuple[str, Callable[[], Picture]]]:
+    """Name and function of strips, breakdowns, comparisons and rooms of the example frames; the function writes the
+    picture into ``folder``.
 
     Raises:
         ValueError: an example cannot be read; the message names the file.
-        ImportError: matplotlib is missing.
-        OSError: a file cannot be written.
     """
-    folder = results.out / "figures"
-    folder.mkdir(parents=True, exist_ok=True)
     rows = {row.slug: row for row in results.rows}
-    pictures = []
-    for name, draw in [*_of_frames(results, folder, rows), *_of_rooms(results, folder, rows)]:
-        try:
-            pictures.append(draw())
-        except DRAWING_ERRORS as error:
-            undrawn[name] = " ".join(str(error).split()) or type(error).__name__
-    if pictures:
-        write_json_atomic(folder / INDEX, {"pictures": [asdict(picture) for picture in pictures]})
-    return pictures
-
-
-def read_index(folder: Path) -> list[Picture]:
-    """The pictures of a folder whose files exist; [] if none were made.
-
-    Raises:
-        ValueError: the index is not one.
-    """
-    path = folder / INDEX
-    if not path.is_file():
-        return []
-    names = {f.name for f in fields(Picture)}
-    listed = json.loads(path.read_text(encoding="utf-8"))["pictures"]
-    if any(not isinstance(entry, dict) or entry.keys() != names for entry in listed):
-        raise ValueError(f"{path} is not an index of pictures")
-    return [Picture(**entry) for entry in listed if (folder / entry["file"]).is_file()]
+    yield from _of_frames(results, folder, rows)
+    yield from _of_rooms(results, folder, rows)
 
 
 def file_name(*parts: str) -> str:
@@ -144,16 +109,16 @@ def _of_frames(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator
         bases = dict.fromkeys(row.method.base for row in shown)
         frame = f"{e.sequence}, frame {e.frame}"
         for base in bases:
-            of_base = strip_rows(shown, base)
+            of_base = [row.slug for row in strip_rows(shown, base)]
             if of_base:
-                yield f"{frame}: strip of {base}", partial(_strip, folder, e, of_base, base)
+                yield f"{frame}: strip of {base}", partial(draw_strip, folder, e, of_base, base)
         parts = [row for base in _BREAKDOWN_BASES for row in strip_rows(shown, base) if row.method.fusion != UFM]
         if any(row.method.fusion == UFM_STAR for row in parts):
-            yield f"{frame}: breakdown", partial(_breakdown, folder, e, parts)
+            yield f"{frame}: breakdown", partial(draw_breakdown, folder, e, [row.slug for row in parts])
         for base in bases:
-            pair = [row for row in strip_rows(shown, base) if row.method.fusion != ALONE]
+            pair = [row.slug for row in strip_rows(shown, base) if row.method.fusion != ALONE]
             if len(pair) == 2:
-                yield f"{frame}: comparison of {base}", partial(_comparison, folder, e, *pair)
+                yield f"{frame}: comparison of {base}", partial(draw_comparison, folder, e, pair, base)
 
 
 def _of_rooms(results: Results, folder: Path, rows: dict[str, Row]) -> Iterator[Drawing]:
@@ -177,48 +142,18 @@ def _folder_of(results: Results, dataset: str, sequence: str) -> Path:
     return results.out / "records" / WorkItem(dataset, sequence, path="", layout="").folder
 
 
-# ---- the words of each picture ----
+# ---- drawing: each writes its PNG into the folder and returns its words ----
 
 
-def _strip(folder: Path, example: Example, rows: Sequence[Row], base: str) -> Picture:
-    slugs = [row.slug for row in rows]
-    name = file_name(STRIP, example.dataset, example.sequence, example.frame, base)
-    draw_strip(folder / name, example, slugs)
-    return Picture(
-        name,
-        STRIP,
-        f"{example.sequence}, frame {example.frame}: {Method(base).name}",
-        "A good standard deviation σ looks like the error beside it. NLL is bright where a row was too sure of itself; "
-        "its colours are the same in all strips. Lengths share one scale.",
-        f"Depth, error, standard deviation and NLL of {_listed(example, slugs)}.",
-    )
-
-
-def _breakdown(folder: Path, example: Example, rows: Sequence[Row]) -> Picture:
-    slugs = [row.slug for row in rows]
-    name = file_name(BREAKDOWN, example.dataset, example.sequence, example.frame)
-    draw_breakdown(folder / name, example, slugs)
-    return Picture(
-        name,
-        BREAKDOWN,
-        f"{example.sequence}, frame {example.frame}: what the variance is made of",
-        "The parts add up as variances, V = A + E + M; shown are their square roots, in metres, on one scale with the "
-        "error. A and E are the network's own, M is what the views disagree by.",
-        f"Aleatoric, epistemic and multiview parts of {_listed(example, slugs)}.",
-    )
-
-
-def _comparison(folder: Path, example: Example, ufm: Row, ufm_star: Row) -> Picture:
-    name = file_name(COMPARE, example.dataset, example.sequence, example.frame, ufm_star.method.base)
-    draw_comparison(folder / name, example, ufm.slug, ufm_star.slug)
-    return Picture(
-        name,
-        COMPARE,
-        f"{example.sequence}, frame {example.frame}: {row_label(ufm_star)} against {row_label(ufm)}",
-        "Red: UfM* is the less sure of the two; blue: the surer. The blue box marks where they differ most on average, "
-        "enlarged below.",
-        f"Standard deviations and their difference, of {_listed(example, [ufm.slug, ufm_star.slug])}.",
-    )
+def _picture(example: Example, rows: Sequence[str], kind: str, base: str, words: tuple[str, str, str]) -> Picture:
+    """The name and the words of a picture: the end of its title, its caption, and what the alternative text begins
+    with; rows are listed there with their mean NLL, for those who cannot see the picture."""
+    title, caption, shows = words
+    means = ((example.label(row), mean_nll(example, row)) for row in rows)
+    listed = ", ".join(f"{label} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for label, nll in means)
+    name = file_name(kind, example.dataset, example.sequence, example.frame, *filter(None, (base,)))
+    title = f"{example.sequence}, frame {example.frame}: {title}"
+    return Picture(name, kind, title, caption, f"{shows} of {listed}.")
 
 
 def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequence[Snapshot]) -> Picture:
@@ -237,37 +172,16 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
     )
 
 
-def _listed(example: Example, slugs: Sequence[str]) -> str:
-    """Rows with their mean NLL, for those who cannot see the picture."""
-    means = ((slug, mean_nll(example, slug)) for slug in slugs)
-    return ", ".join(
-        f"{example.label(slug)} ({'no NLL' if nll is None else f'mean NLL {nll:.2f}'})" for slug, nll in means
-    )
-
-
-# ---- drawing ----
-
-
-def fit_strip_scales(example: Example, rows: Iterable[str]) -> PanelScales:
+def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
     """Scales over the truth and these rows of a frame: depth between percentiles 1 and 99, lengths from 0 to 99."""
-    listed = list(rows)
-    depths = [(example.truth, example.truth > 0), *((example.rows[r].depth, example.rows[r].valid) for r in listed)]
-    lengths = [(value, None) for r in listed for value in (example.error(r), example.rows[r].sigma)]
+    depths = [(example.truth, example.truth > 0), *((example.rows[r].depth, example.rows[r].valid) for r in rows)]
+    lengths = [(value, None) for r in rows for value in (example.error(r), example.rows[r].sigma)]
     depth, length = robust_range(depths, from_zero=False), robust_range(lengths, from_zero=True)
     return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(*length, ERROR_MAP))
 
 
-def draw_strip(path: Path, example: Example, rows: Sequence[str]) -> PanelScales:
-    """Image and truth, then depth, error, standard deviation and NLL of each row, on common scales.
-
-    Args:
-        path: the picture (PNG).
-        example: the frame.
-        rows: keys of ``example.rows``, at least one.
-
-    Returns:
-        The scales that were used.
-    """
+def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -> Picture:
+    """Image and truth, then depth, error, standard deviation and NLL of each row of a base, on common scales."""
     scales = fit_strip_scales(example, rows)
     truth = Panel(scales.depth.rgb(example.truth, example.truth > 0), "ground truth")
     head = GridRow(example.sequence, [f"frame {example.frame}"], [Panel(example.image, "image"), truth])
@@ -281,12 +195,19 @@ def draw_strip(path: Path, example: Example, rows: Sequence[str]) -> PanelScales
         Bar("|error| and σ [m]", scales.length, 1, span=2),
         Bar("NLL [nats]", NLL_SCALE, 3, extend="both"),
     ]
-    draw_grid(path, [head, *body], bars, aspect=example.aspect)
-    return scales
+    words = (
+        Method(base).name,
+        "A good standard deviation σ looks like the error beside it. NLL is bright where a row was too sure of itself; "
+        "its colours are the same in all strips. Lengths share one scale.",
+        "Depth, error, standard deviation and NLL",
+    )
+    picture = _picture(example, rows, STRIP, base, words)
+    draw_grid(folder / picture.file, [head, *body], bars, aspect=example.aspect)
+    return picture
 
 
-def draw_breakdown(path: Path, example: Example, rows: Sequence[str]) -> PanelScales:
-    """The parts of each row's variance: sqrt of A, E, M and V beside the error and the NLL; see ``draw_strip``."""
+def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Picture:
+    """The parts of each row's variance: sqrt of A, E, M and V beside the error and the NLL."""
     scales = fit_strip_scales(example, rows)
     body = []
     for row in rows:
@@ -300,17 +221,20 @@ def draw_breakdown(path: Path, example: Example, rows: Sequence[str]) -> PanelSc
         Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5),
         Bar("NLL [nats]", NLL_SCALE, 5, extend="both"),
     ]
-    draw_grid(path, body, bars, aspect=example.aspect)
-    return scales
+    words = (
+        "what the variance is made of",
+        "The parts add up as variances, V = A + E + M; shown are their square roots, in metres, on one scale with the "
+        "error. A and E are the network's own, M is what the views disagree by.",
+        "Aleatoric, epistemic and multiview parts",
+    )
+    picture = _picture(example, rows, BREAKDOWN, "", words)
+    draw_grid(folder / picture.file, body, bars, aspect=example.aspect)
+    return picture
 
 
-def draw_comparison(path: Path, example: Example, ufm: str, ufm_star: str) -> Box:
-    """Image, error, sigma by UfM and by UfM*, and UfM* minus UfM; below, the part where they differ most.
-
-    Returns:
-        That part, (left, top, width, height) in pixels of the maps.
-    """
-    scales = fit_strip_scales(example, [ufm, ufm_star])
+def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: str) -> Picture:
+    """Image, error, sigma by UfM and by UfM*, and UfM* minus UfM; below, the part where they differ most."""
+    scales, (ufm, ufm_star) = fit_strip_scales(example, pair), pair
     old, new = example.rows[ufm].sigma, example.rows[ufm_star].sigma
     difference = new - old
     box = largest_difference(difference, ZOOM)
@@ -326,7 +250,7 @@ def draw_comparison(path: Path, example: Example, ufm: str, ufm_star: str) -> Bo
     boxes = [_scaled(box, old.shape, picture.shape) for picture in maps.values()]
     whole = [Panel(picture, name, b) for (name, picture), b in zip(maps.items(), boxes, strict=True)]
     enlarged = [Panel(p[top : top + h, x : x + w]) for p, (x, top, w, h) in zip(maps.values(), boxes, strict=True)]
-    lines = [line for row in (ufm, ufm_star) for line in (f"{example.label(row)}:", *figures_of(example, row))]
+    lines = [line for row in pair for line in (f"{example.label(row)}:", *figures_of(example, row))]
     rows = [
         GridRow(example.sequence, [f"frame {example.frame}"], whole),
         GridRow("where they differ most", lines, enlarged),
@@ -335,8 +259,15 @@ def draw_comparison(path: Path, example: Example, ufm: str, ufm_star: str) -> Bo
         Bar("|error| and σ [m]", scales.length, 1, span=3),
         Bar("UfM* minus UfM [m]", signed, 4, extend="both"),
     ]
-    draw_grid(path, rows, bars, aspect=example.aspect)
-    return box
+    words = (
+        f"{example.label(ufm_star)} against {example.label(ufm)}",
+        "Red: UfM* is the less sure of the two; blue: the surer. The blue box marks where they differ most on average, "
+        "enlarged below.",
+        "Standard deviations and their difference,",
+    )
+    picture = _picture(example, pair, COMPARE, base, words)
+    draw_grid(folder / picture.file, rows, bars, aspect=example.aspect)
+    return picture
 
 
 def largest_difference(difference: NDArray[Any], share: float) -> Box:

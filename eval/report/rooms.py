@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import (
-    ERROR_MAP,
-    FAINT,
-    INK,
-    ColourScale,
-    plain,
-    require_matplotlib,
-    robust_range,
-    save_png,
-)
+from ufmstar_torch.eval.report.colours import ERROR_MAP, FAINT, INK, ColourScale, plain, robust_range, save_png
 from ufmstar_torch.eval.report.examples import load_arrays
-from ufmstar_torch.eval.report.panels import Bar, draw_bar
+from ufmstar_torch.eval.report.panels import Bar, axes_at, draw_bar, new_sheet, say
 
 Array = NDArray[np.float64]
 # A patch that is evenly covered from -a to a has sigma = a / sqrt(3): so drawn, an ellipse is as large as its patch.
@@ -31,6 +22,7 @@ SIGMAS = float(np.sqrt(3.0))
 HEADROOM = 0.3
 MOST_TIMES = 4
 _PATH = "#00a6d6"
+_STORED = ("mean_world", "covariance_world", "disagreement", "T_world_cam")
 _CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.3, 0.62, 0.66  # inches
 
 
@@ -54,6 +46,17 @@ class Snapshot:
     T_world_cam: Array
     path: Array
 
+    @property
+    def root(self) -> Array:
+        """[K] sqrt(m) [m]."""
+        root: Array = np.sqrt(np.maximum(self.disagreement, 0))
+        return root
+
+    def take(self, chosen: NDArray[Any]) -> Snapshot:
+        """The snapshot with the Gaussians chosen by an index or a mask."""
+        kept = {name: getattr(self, name)[chosen] for name in ("mean", "covariance", "disagreement")}
+        return replace(self, **kept)
+
 
 def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
     """The snapshots of one sequence, ``OUT/records/DATASET/SEQUENCE``, by row, in the order of their frames.
@@ -65,15 +68,17 @@ def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
     for file in sorted((folder / "room").glob("*.npz"), key=lambda f: _natural(f.stem)):
         row, _, frame = file.stem.partition("_")
         if row and frame:
-            rooms.setdefault(row, []).append(_load(file, frame))
+            stored = load_arrays(file, _STORED)
+            arrays = {name: stored[name].astype(np.float64) for name in (*_STORED, "path") if name in stored}
+            mean, covariance, disagreement, T = (arrays[name] for name in _STORED)
+            path = arrays.get("path", T[None, :3, 3])
+            rooms.setdefault(row, []).append(Snapshot(frame, mean, covariance, disagreement, T, path))
     return rooms
 
 
 def choose_times(snapshots: Sequence[Snapshot], most: int = MOST_TIMES) -> list[Snapshot]:
     """Spread over the sequence, the last one included."""
-    if len(snapshots) <= most:
-        return list(snapshots)
-    chosen = np.linspace(0, len(snapshots) - 1, most).round().astype(int)
+    chosen = np.linspace(0, len(snapshots) - 1, min(most, len(snapshots))).round().astype(int)
     return [snapshots[i] for i in chosen]
 
 
@@ -94,26 +99,19 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
     """
     if not any(len(snapshot.mean) for snapshot in snapshots):
         raise ValueError("snapshots must hold at least one Gaussian")
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    roots = [np.sqrt(np.maximum(snapshot.disagreement, 0)) for snapshot in snapshots]
-    scale = ColourScale(*robust_range([(root, None) for root in roots], from_zero=True), ERROR_MAP)
+    scale = ColourScale(*robust_range([(snapshot.root, None) for snapshot in snapshots], from_zero=True), ERROR_MAP)
     views = views_of(np.stack([snapshot.T_world_cam for snapshot in snapshots]))
     shown = [below_ceiling(snapshot, views[0].towards, snapshots) for snapshot in snapshots]
     limits = [_limits(view, shown) for view in views]
     tall = [_CELL * (high[1] - low[1]) / (high[0] - low[0]) for low, high in limits]
-    width = _LEFT + len(snapshots) * _CELL + 0.1
-    height = _TOP + sum(tall) + _BOTTOM
-    figure = Figure(figsize=(width, height), dpi=110, facecolor="white")
-    figure.text(0.1 / width, 1 - 0.2 / height, plain(title), size=11, weight="bold", color=INK, va="center")
+    width, bottom = _LEFT + len(snapshots) * _CELL + 0.1, _BOTTOM + sum(tall)
+    figure = new_sheet(width, _TOP + bottom, title)
     for line, (view, (low, high)) in enumerate(zip(views, limits, strict=True)):
-        bottom = height - _TOP - sum(tall[: line + 1])
+        bottom -= tall[line]
         side: dict[str, Any] = {"size": 8, "color": FAINT, "rotation": 90, "va": "center", "ha": "center"}
-        figure.text(0.2 / width, (bottom + tall[line] / 2) / height, view.name, **side)
+        say(figure, 0.2, bottom + tall[line] / 2, view.name, **side)
         for column, snapshot in enumerate(shown):
-            box = ((_LEFT + column * _CELL) / width, bottom / height, _CELL / width, tall[line] / height)
-            axes = figure.add_axes(box)
+            axes = axes_at(figure, _LEFT + column * _CELL, bottom, _CELL, tall[line])
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             _draw_view(axes, view, snapshot, scale)
             if line == 0:
@@ -121,7 +119,7 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
                 axes.set_title(plain(label), size=8.5, color=INK, pad=4)
             if line == 0 and column == 0:
                 _draw_ruler(axes, low, high)
-    bar = figure.add_axes((_LEFT / width, 0.42 / height, min(4.0, width - 2 * _LEFT) / width, 0.1 / height))
+    bar = axes_at(figure, _LEFT, 0.42, min(4.0, width - 2 * _LEFT), 0.1)
     draw_bar(bar, Bar("√m, disagreement between the views [m]", scale, 0))
     save_png(figure, path)
     return scale
@@ -130,15 +128,12 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
 def below_ceiling(snapshot: Snapshot, up: Array, all_times: Sequence[Snapshot]) -> Snapshot:
     """The snapshot without the Gaussians that lie above every camera by more than ``HEADROOM``."""
     highest = max(float((other.path @ up).max()) for other in all_times)
-    kept = snapshot.mean @ up <= highest + HEADROOM
-    chosen = (snapshot.mean[kept], snapshot.covariance[kept], snapshot.disagreement[kept])
-    return Snapshot(snapshot.frame, *chosen, snapshot.T_world_cam, snapshot.path)
+    return snapshot.take(snapshot.mean @ up <= highest + HEADROOM)
 
 
-def painted(view: Projection, snapshot: Snapshot) -> tuple[Ellipses, NDArray[np.intp]]:
-    """The ellipses in the order in which they are painted, the farthest first, and that order [K]."""
-    order = np.argsort(view.nearness(snapshot.mean), kind="stable")
-    return project(view, snapshot.mean[order], snapshot.covariance[order]), order
+def far_to_near(view: Projection, snapshot: Snapshot) -> Snapshot:
+    """The Gaussians in the order in which they are painted, the farthest from the viewer first."""
+    return snapshot.take(np.argsort(snapshot.mean @ view.towards, kind="stable"))
 
 
 def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourScale) -> None:
@@ -149,15 +144,16 @@ def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourSca
     axes.set_yticks([])
     for side in axes.spines.values():
         side.set_color("#d9d9d9")
-    ellipses, order = painted(view, snapshot)
-    colours = scale.rgb(np.sqrt(np.maximum(snapshot.disagreement, 0)))[order] / 255
-    wide, narrow = 2 * ellipses.axes.T
+    painted = far_to_near(view, snapshot)
+    semi_axes, angle = project(view, painted.covariance)
+    colours = scale.rgb(painted.root) / 255
+    wide, narrow = 2 * semi_axes.T
     drawn = EllipseCollection(
         wide,
         np.maximum(narrow, 0.01),  # a plane seen edge-on would vanish
-        ellipses.angle,
+        angle,
         units="xy",
-        offsets=ellipses.centre,
+        offsets=view.plane(painted.mean),
         offset_transform=axes.transData,
         facecolors=np.concatenate([colours, np.full((len(colours), 1), 0.85)], axis=1),
         edgecolors=(1, 1, 1, 0.55),
@@ -193,7 +189,7 @@ def _limits(view: Projection, snapshots: Sequence[Snapshot]) -> tuple[Array, Arr
     A Gaussian of a wrong depth can lie far outside; hence percentiles, and all of the camera's path.
     """
     plane = np.concatenate([view.plane(snapshot.mean) for snapshot in snapshots])
-    reach = np.concatenate([project(view, s.mean, s.covariance).axes[:, :1] for s in snapshots])
+    reach = np.concatenate([project(view, s.covariance)[0][:, :1] for s in snapshots])
     walked = np.concatenate([view.plane(snapshot.path) for snapshot in snapshots])
     low, high = np.percentile(plane - reach, 1, axis=0), np.percentile(plane + reach, 99, axis=0)
     low, high = np.minimum(low, walked.min(0)) - 0.2, np.maximum(high, walked.max(0)) + 0.2
@@ -206,18 +202,6 @@ def _limits(view: Projection, snapshots: Sequence[Snapshot]) -> tuple[Array, Arr
 def _natural(name: str) -> list[tuple[int, str]]:
     """A key that puts frame 9 before frame 10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
-
-
-def _load(file: Path, frame: str) -> Snapshot:
-    stored = load_arrays(file)
-    missing = [name for name in ("mean_world", "covariance_world", "disagreement", "T_world_cam") if name not in stored]
-    if missing:
-        raise ValueError(f"{file} must hold a mixture; {', '.join(missing)} is missing")
-    mean, covariance, disagreement, T = (
-        stored[name].astype(np.float64) for name in ("mean_world", "covariance_world", "disagreement", "T_world_cam")
-    )
-    path = stored["path"].astype(np.float64) if "path" in stored else T[None, :3, 3]
-    return Snapshot(frame, mean, covariance, disagreement, T, path)
 
 
 # ---- Gaussians seen from far away: an orthographic camera, and the ellipses that covariances leave on its image ----
@@ -246,43 +230,25 @@ class Projection:
         """[..., 2] coordinates of world points [..., 3] in the picture [m]."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
-    def nearness(self, points: Array) -> Array:
-        """[...] how near world points [..., 3] are to the viewer [m]; what is larger hides what is smaller."""
-        nearness: Array = points @ self.towards
-        return nearness
 
-
-@dataclass(frozen=True, eq=False)
-class Ellipses:
-    """Ellipses in a picture.
-
-    Attributes:
-        centre: [K, 2] [m].
-        axes: [K, 2] semi-axes, the longer first [m].
-        angle: [K] of the longer one, from right towards up, in (-90, 90] [degrees].
-    """
-
-    centre: Array
-    axes: Array
-    angle: Array
-
-
-def project(view: Projection, mean: Array, covariance: Array, sigmas: float = SIGMAS) -> Ellipses:
+def project(view: Projection, covariance: Array) -> tuple[Array, Array]:
     """The ellipses of Gaussians: P Sigma P^T is the covariance in the picture, P the view's two rows.
 
     Args:
         view: the camera.
-        mean: [K, 3] in the world [m].
-        covariance: [K, 3, 3] [m^2].
-        sigmas: semi-axes in standard deviations.
+        covariance: [K, 3, 3] in the world [m^2].
+
+    Returns:
+        [K, 2] semi-axes of ``SIGMAS`` standard deviations, the longer first [m], and [K] the angle of the longer one,
+        from right towards up, in (-90, 90] [degrees].
     """
     P = np.stack([view.right, view.up])
     flat = P @ covariance @ P.T
     a, b, c = flat[:, 0, 0], (flat[:, 0, 1] + flat[:, 1, 0]) / 2, flat[:, 1, 1]
     middle, spread = (a + c) / 2, np.hypot((a - c) / 2, b)
     # Rounding can leave the smaller eigenvalue of a line just below 0.
-    axes = sigmas * np.sqrt(np.maximum(np.stack([middle + spread, middle - spread], axis=-1), 0))
-    return Ellipses(view.plane(mean), axes, np.degrees(np.arctan2(2 * b, a - c) / 2))
+    axes = SIGMAS * np.sqrt(np.maximum(np.stack([middle + spread, middle - spread], axis=-1), 0))
+    return axes, np.degrees(np.arctan2(2 * b, a - c) / 2)
 
 
 def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[Projection, Projection]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, Method
 from ufmstar_torch.eval.report.colours import FAINT, INK, plain, require_matplotlib
@@ -100,44 +102,30 @@ def finish(axes: Any, *, title: str = "", x: str = "", y: str = "") -> None:
 def spread_apart(places: Sequence[float], gap: float, low: float, high: float) -> list[float]:
     """Places at least ``gap`` apart within [low, high] in the same order, each as near to its own as can be.
 
-    Neighbours that are too close form a group about the mean of their places; groups that touch are joined.
-    Where they do not fit, the gap is smaller.
+    Less k gaps, the places in their order must only not fall, which is isotonic regression. Where they do not fit, the
+    gap is smaller.
     """
+    from scipy.optimize import isotonic_regression
+
     if not places:
         return []
-    gap = min(gap, (high - low) / max(len(places) - 1, 1))
-    order = sorted(range(len(places)), key=lambda i: places[i])
-    groups: list[list[float]] = []  # [number of members, mean of (wanted - offset within the group)]
-    for i in order:
-        groups.append([1, places[i]])
-        while len(groups) > 1 and groups[-2][1] + groups[-2][0] * gap > groups[-1][1]:
-            n, start = groups.pop()
-            m, before = groups.pop()
-            groups.append([m + n, (m * before + n * (start - m * gap)) / (m + n)])
-    spread = [start + k * gap for n, start in groups for k in range(int(n))]
-    # Pushed in from the top, then from the bottom: the gap fits, so both can hold.
-    spread = [min(place, high - (len(spread) - 1 - k) * gap) for k, place in enumerate(spread)]
-    by_index = {i: max(place, low + k * gap) for k, (i, place) in enumerate(zip(order, spread, strict=True))}
-    return [by_index[i] for i in range(len(places))]
+    wanted, order = np.array(places), np.argsort(places, kind="stable")
+    offset = min(gap, (high - low) / max(len(places) - 1, 1)) * np.arange(len(places))
+    spread = np.empty(len(places))
+    nearest = isotonic_regression(wanted[order] - offset).x + offset
+    spread[order] = np.maximum(np.minimum(nearest, high - offset[::-1]), low + offset)
+    return [float(place) for place in spread]
 
 
-def label_ends(axes: Any, ends: Iterable[tuple[float, str, str]], *, size: float = TICK) -> None:
-    """Names right of a panel, level with where their lines end, and apart from each other.
-
-    Call it when the limits of y stand.
-
-    Args:
-        axes: the panel.
-        ends: (y of the line's end, name, colour).
-        size: of the letters [pt].
-    """
-    listed = list(ends)
+def label_ends(axes: Any, ends: Sequence[tuple[float, str, str]]) -> None:
+    """Names right of a panel, level with where their lines end, and apart from each other; call it when the limits of y
+    stand. An end is (y of the line's end, name, colour)."""
     transform = axes.transData + axes.transAxes.inverted()
     x = axes.get_xlim()[1]
-    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _, _ in listed]
+    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _, _ in ends]
     height = axes.get_position().height * axes.figure.get_figheight()
-    for place, (_, name, colour) in zip(spread_apart(wanted, 1.25 * size / 72 / height, 0, 1), listed, strict=True):
-        axes.text(1.02, place, plain(name), transform=axes.transAxes, color=colour, size=size, va="center", ha="left")
+    for place, (_, name, colour) in zip(spread_apart(wanted, 1.25 * TICK / 72 / height, 0, 1), ends, strict=True):
+        axes.text(1.02, place, plain(name), transform=axes.transAxes, color=colour, size=TICK, va="center", ha="left")
 
 
 def save_figure(figure: Any, path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,12 +13,12 @@ from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.means import Mean, mean_over, value_of
-from ufmstar_torch.eval.report.names import Quantity, setting_label
+from ufmstar_torch.eval.report.names import setting_label
+from ufmstar_torch.eval.results.record import Record
 
 COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]
-# Rows that say no number of anchors have at most so many.
+# Rows without a number of anchors have at most so many.
 _COUNTS = {"": 0, TRACKED: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
 # What a row without anchors cannot have, beside what begins with "anchor_".
 _OF_ANCHORS = ("anchors", "track_noise", "corrected", "posterior")
@@ -27,10 +27,11 @@ _ANCHORED = {TRACKED: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"
 
 @dataclass(frozen=True)
 class Point:
-    """A value of a setting, and the rows that have it (several where noise was drawn with several seeds)."""
+    """A value of a setting, the rows that have it (several where noise was drawn with several seeds), their records."""
 
     value: float
     rows: tuple[Row, ...]
+    records: tuple[Record, ...]
 
 
 @dataclass(frozen=True)
@@ -74,35 +75,26 @@ def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
     are prepared is no difference where it is the same of all rows."""
     groups: dict[tuple[Method, Rest], dict[float, list[Row]]] = {}
     rows = [row for row in results.rows if row.method.base == base]
-    prepared = {row.setting.preprocess for row in rows}
+    left_out = {name} if len({row.setting.preprocess for row in rows}) > 1 else {name, "preprocess"}
     for row in rows:
-        value = _value(row, name)
+        value, values = _value(row, name), row.setting.to_dict()
         if _is_number(value):
-            rest = tuple(item for item in _rest(row, name) if item[0] != "preprocess" or len(prepared) > 1)
+            rest = tuple(sorted((other, values[other]) for other in _changed(row) if other not in left_out))
             groups.setdefault((row.method, rest), {}).setdefault(float(value), []).append(row)
-    if name == COUNT:
-        _begin_without_anchors(groups)
+    if name == COUNT:  # lines over several numbers of anchors begin with the rows that do without
+        for (method, rest), by_value in groups.items():
+            without = tuple(i for i in rest if i[0] not in _OF_ANCHORS and not i[0].startswith("anchor_"))
+            plain = groups.get((method, without), {})
+            if len(by_value) > 1 and 0.0 in plain:
+                by_value.setdefault(0.0, plain[0.0])
+
+    def point(value: float, rows: Sequence[Row]) -> Point:
+        return Point(value, tuple(rows), tuple(record for row in rows for record in results.of(row)))
+
     return [
-        SweepLine(method, rest, tuple(Point(value, tuple(rows[value])) for value in sorted(rows)))
-        for (method, rest), rows in groups.items()
+        SweepLine(method, rest, tuple(point(value, by_value[value]) for value in sorted(by_value)))
+        for (method, rest), by_value in groups.items()
     ]
-
-
-def points(results: Results, method: Method, name: str) -> list[Point]:
-    """The values of a setting tried with a method, nothing else being changed, in rising order."""
-    lines = sweep_lines(results, method.base, name)
-    return [point for line in lines if line.method == method and not line.rest for point in line.points]
-
-
-def level(results: Results, point: Point, quantity: Quantity) -> Mean:
-    """Mean over sequences at a point; seeds of one sequence are averaged first."""
-    return mean_over(list(_by_sequence(results, point, quantity).values()))
-
-
-def change(results: Results, point: Point, reference: Point, quantity: Quantity) -> Mean:
-    """Mean over sequences of the difference to a reference."""
-    theirs, mine = (_by_sequence(results, one, quantity) for one in (reference, point))
-    return mean_over([value - theirs.get(where, math.nan) for where, value in mine.items()])
 
 
 def default_value(name: str, preset: str = DEFAULTS) -> float:
@@ -124,33 +116,6 @@ def _value(row: Row, name: str) -> Any:
     return row.setting.to_dict().get(name, default_value(name, row.setting.ufm_preset))
 
 
-def _begin_without_anchors(groups: dict[tuple[Method, Rest], dict[float, list[Row]]]) -> None:
-    """Give lines over several numbers of anchors a point at 0, in place: the rows that do without."""
-    for (method, rest), rows in groups.items():
-        plain = groups.get((method, _without_anchors(rest)), {})
-        if len(rows) > 1 and 0.0 in plain:
-            rows.setdefault(0.0, plain[0.0])
-
-
-def _without_anchors(rest: Iterable[tuple[str, Any]]) -> Rest:
-    return tuple((n, value) for n, value in rest if n not in _OF_ANCHORS and not n.startswith("anchor_"))
-
-
-def _rest(row: Row, name: str) -> Rest:
-    values = row.setting.to_dict()
-    return tuple(sorted((other, values[other]) for other in _changed(row) if other != name))
-
-
-def _changed(row: Row) -> Sequence[str]:
+def _changed(row: Row) -> list[str]:
     """What a row's setting changes, the noise's seed aside."""
     return [name for name in row.setting.to_dict() if name != "seed"]
-
-
-def _by_sequence(results: Results, point: Point, quantity: Quantity) -> Mapping[tuple[str, str], float]:
-    """The figure of each sequence, the mean over the point's rows (the seeds of a noise)."""
-    by_sequence: dict[tuple[str, str], list[float]] = {}
-    for row in point.rows:
-        for record in results.of(row):
-            value = quantity.factor * value_of(record, quantity.key)
-            by_sequence.setdefault((record.dataset, record.sequence), []).append(value)
-    return {where: math.fsum(values) / len(values) for where, values in by_sequence.items()}

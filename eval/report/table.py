@@ -40,8 +40,7 @@ class Cell:
         """A mean with its interval, where there is one and it is at least .01 wide (of differences, any)."""
         if math.isnan(mean.value):
             return cls()
-        if decimals is None:
-            decimals = significant(mean.value)
+        decimals = significant(mean.value) if decimals is None else decimals
         wide = mean.half >= SMALL_INTERVAL or (signed and mean.half > 0)
         return cls(number(mean.value, decimals, signed=signed), number(mean.half, decimals) if wide else "", bold)
 
@@ -71,47 +70,26 @@ class Table:
         name: of its files.
         title: its caption.
         first: heading of the labels.
-        frame: of ``Cell``; index (block, label, bold), columns (group, name, latex).
+        columns: headings of the columns.
+        lines: the rows of all blocks.
         notes: sentences below.
+
+    Raises:
+        ValueError: a line has another number of cells than there are columns.
     """
 
     name: str
     title: str
     first: str
-    frame: pd.DataFrame
-    notes: tuple[str, ...] = ()
+    columns: Sequence[Column]
+    lines: Sequence[Line]
+    notes: Sequence[str] = ()
 
-    @classmethod
-    def of(
-        cls,
-        name: str,
-        title: str,
-        first: str,
-        columns: Sequence[Column],
-        lines: Iterable[Line],
-        notes: Iterable[str] = (),
-    ) -> Table:
-        """A table from its columns and lines; a line with another number of cells raises ValueError."""
-        listed = list(lines)
-        for line in listed:
-            if len(line.cells) != len(columns):
-                raise ValueError(f"{name}: {line.label} has {len(line.cells)} cells for {len(columns)} columns")
-        frame = pd.DataFrame([list(line.cells) for line in listed], columns=range(len(columns)), dtype=object)
-        frame.columns = pd.MultiIndex.from_tuples(columns, names=Column._fields)
-        labels = [[getattr(line, name) for line in listed] for name in Line._fields[:3]]
-        frame.index = pd.MultiIndex.from_arrays(labels, names=Line._fields[:3])
-        return cls(name, title, first, frame, tuple(notes))
-
-    @property
-    def columns(self) -> list[Column]:
-        """Headings of the columns."""
-        return [Column(*labels) for labels in self.frame.columns]
-
-    @property
-    def lines(self) -> list[Line]:
-        """The rows of all blocks."""
-        cells: Iterable[tuple[Cell, ...]] = self.frame.itertuples(index=False, name=None)
-        return [Line(block, label, bold, c) for (block, label, bold), c in zip(self.frame.index, cells, strict=True)]
+    def __post_init__(self) -> None:
+        for line in self.lines:
+            if len(line.cells) != len(self.columns):
+                counts = f"{len(line.cells)} cells for {len(self.columns)} columns"
+                raise ValueError(f"{self.name}: {line.label} has {counts}")
 
     @property
     def blocks(self) -> Iterator[list[Line]]:
@@ -201,14 +179,13 @@ _LATEX = {
 
 def latex(table: Table) -> str:
     """A ``table`` environment, set as the paper's; the document needs the package booktabs."""
-    frame = table.frame.map(_latex_cell)
-    frame.index = pd.Index(
-        [rf"\textbf{{{latex_text(line.label)}}}" if line.bold else latex_text(line.label) for line in table.lines]
-    )
-    heads = [[latex_text(c.group) for c in table.columns], [c.latex for c in table.columns]]
-    names = [None, latex_text(table.first)]
-    frame.columns = pd.MultiIndex.from_arrays(heads, names=names) if table.groups else pd.Index(heads[1], name=names[1])
-    text = frame.style.to_latex(
+    labels = [latex_text(line.label) for line in table.lines]
+    labels = [rf"\textbf{{{label}}}" if line.bold else label for label, line in zip(labels, table.lines, strict=True)]
+    columns: pd.Index = pd.Index([c.latex for c in table.columns], name=latex_text(table.first))
+    if table.groups:
+        columns = pd.MultiIndex.from_arrays([[latex_text(c.group) for c in table.columns], columns])
+    cells = [list(map(_latex_cell, line.cells)) for line in table.lines]
+    text = pd.DataFrame(cells, index=labels, columns=columns, dtype=object).style.to_latex(
         hrules=True,
         column_format=f"l{'c' * len(table.columns)}",
         position="t",

@@ -15,59 +15,24 @@ from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.report.data import FORMAT, Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables, paper_efficiency_tables
-from ufmstar_torch.eval.report.means import (
-    MIN_SEQUENCES,
-    Mean,
-    better,
-    difference,
-    has_variance,
-    mean_of,
-    mean_over,
-    references,
-    value_of,
-)
+from ufmstar_torch.eval.report.findings import comparisons
+from ufmstar_torch.eval.report.means import MIN_SEQUENCES, Mean, better, has_variance, mean_of, mean_over, value_of
 from ufmstar_torch.eval.report.names import DIFFERENCES, ENERGY, EXTRA, MAIN, MEMORY, Quantity, row_labels, shared_words
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
-from ufmstar_torch.eval.report.table import (
-    Cell,
-    Column,
-    Line,
-    Table,
-    csv_text,
-    latex,
-    mark_best,
-    markdown,
-    table_csv,
-)
+from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, csv_text, latex, mark_best, markdown, table_csv
 from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.results.record import Record
 
 METHOD = "Method"
 # [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
 NLL_OF_FEW = 100.0
-# Columns of results.csv and table.csv; "setting" stands for a column for each setting.
-LINE_COLUMNS = ("suite", "dataset", "sequence", "network", "method", "setting", "figure", "value")
-MEAN_COLUMNS = ("suite", "dataset", "network", "method", "setting", "figure", "mean", "half_width", "sequences")
-# The paper's columns, and their LaTeX.
-_PAPER_COLUMNS = {
-    "delta1": ("δ₁", r"$\delta_1$"),
-    "nll": ("NLL", "NLL"),
-    "ece_delta": ("ECE_δ", r"ECE$_{\delta}$"),
-    "ece_q": ("ECE_q", r"ECE$_{q}$"),
-    "energy_mj": ("energy [mJ]", "Energy [mJ]"),
-    "memory_mb": ("memory [MB]", "Memory [MB]"),
-}
+_PAPER_COLUMNS = {quantity.key: quantity for quantity in (*MAIN, ENERGY, MEMORY)}
 
 
 def main_table(results: Results, dataset: str | None = None) -> Table:
-    """The paper's columns; where the suite is the paper's, with the paper's own figures beside ours.
-
-    Args:
-        results: of an evaluation.
-        dataset: one of its data sets; None = all sequences of all.
-    """
-    quoted = paper_table_of(results.suite)
-    return _means(results, dataset, MAIN, "main", quoted)
+    """The paper's columns, over the sequences of a data set or (None) of all; where the suite is the paper's, with the
+    paper's own figures beside ours."""
+    return _means(results, dataset, MAIN, "main", paper_table_of(results.suite))
 
 
 def extra_table(results: Results, dataset: str | None = None) -> Table:
@@ -85,7 +50,7 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
         frames = max((int(count) for count in counts if count == count), default=0)
         lines = _lines({row: _cells(listed, MAIN) for row, listed in records.items()}, MAIN)
         title = f"{name}, {sequence}" + (f": {frames} frames" if frames else "")
-        tables.append(Table.of(f"{name}-{sequence}", title, METHOD, _columns(MAIN, ""), lines))
+        tables.append(Table(f"{name}-{sequence}", title, METHOD, _columns(MAIN, ""), lines))
     return tables
 
 
@@ -93,14 +58,13 @@ def difference_table(results: Results, dataset: str | None = None) -> Table:
     """Row less reference, in pairs on the same sequences; bold where the interval leaves out 0 to the better side."""
     blocks: dict[str, int] = {}
     lines, labels = [], row_labels(results.rows)
-    for row in (row for row in results.rows if has_variance(results, row)):
-        for reference in references(results, row):
-            means = [difference(results, row, reference, q, dataset) for q in DIFFERENCES]
-            count = max(mean.sequences for mean in means)
-            if count:
-                block = blocks.setdefault(row.method.base, len(blocks))
-                cells = (Cell(str(count)), *map(_difference_cell, means, DIFFERENCES))
-                lines.append(Line(block, f"{labels[row]} – {labels[reference]}", False, cells))
+    rows = (row for row in results.rows if has_variance(results.of(row)))
+    for (row, reference), made in comparisons(results, dataset, rows).items():
+        means = {c.quantity: c.difference for c in made}
+        count = max(mean.sequences for mean in means.values())
+        block = blocks.setdefault(row.method.base, len(blocks))
+        cells = (Cell(str(count)), *(_difference_cell(means.get(q, Mean()), q) for q in DIFFERENCES))
+        lines.append(Line(block, f"{labels[row]} – {labels[reference]}", False, cells))
     columns = [
         Column("", "sequences", "Sequences"),
         *(Column("", f"Δ {q.heading}", rf"$\Delta$ {q.latex_heading}") for q in DIFFERENCES),
@@ -114,7 +78,7 @@ def difference_table(results: Results, dataset: str | None = None) -> Table:
         notes.append(f"Of fewer than {MIN_SEQUENCES} sequences there is no confidence interval, and no verdict.")
     title = f"{results.title}, paired differences, {_where(results, dataset)}"
     ordered = sorted(lines, key=lambda line: line.block)
-    return Table.of("differences", title, "Row – reference", columns, ordered, notes)
+    return Table("differences", title, "Row – reference", columns, ordered, notes)
 
 
 def _difference_cell(mean: Mean, quantity: Quantity) -> Cell:
@@ -127,10 +91,8 @@ def _means(
     results: Results, dataset: str | None, quantities: Sequence[Quantity], name: str, quoted: PaperTable | None = None
 ) -> Table:
     """A table of means over the sequences of one data set, or of all; the paper's columns last."""
-    records = {row: results.of(row, dataset) for row in results.rows}
-    records = {row: listed for row, listed in records.items() if listed}
-    on = {row: {(r.dataset, r.sequence) for r in listed} for row, listed in records.items()}
-    alike = len({frozenset(where) for where in on.values()}) == 1
+    records = {row: listed for row in results.rows if (listed := results.of(row, dataset))}
+    alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
     cells = {row: _cells(listed, quantities) for row, listed in records.items()}
     costs = {row: _costs(results.efficiency, row, listed) for row, listed in records.items()} if name == "main" else {}
     if any(cell.value for pair in costs.values() for cell in pair):
@@ -143,23 +105,25 @@ def _means(
         notes.append(_cost_note(results.efficiency or {}))
     if not alike:
         columns = [Column(group, "sequences", "Sequences"), *columns]
-        cells = {row: [Cell(str(len(on[row]))), *listed] for row, listed in cells.items()}
+        cells = {row: [Cell(str(len(records[row]))), *listed] for row, listed in cells.items()}
         notes.append("The rows are means over different sequences, so none is marked as the best.")
     lines = _lines(cells, quantities if alike else ())
     if quoted:
-        columns += [Column("Paper", f"paper: {_PAPER_COLUMNS[c][0]}", _PAPER_COLUMNS[c][1]) for c in quoted.columns]
+        theirs = [_PAPER_COLUMNS[key] for key in quoted.columns]
+        columns += [Column("Paper", f"paper: {q.with_unit(q.name)}", q.with_unit(q.latex)) for q in theirs]
         labels = row_labels(cells)
-        theirs = {labels[row]: quoted.rows.get(row.method.name, {}) for row in plain_rows(cells)}
+        rows = {labels[row]: quoted.rows.get(row.method.name, {}) for row in plain_rows(cells)}
         lines = [
-            line._replace(cells=(*line.cells, *(theirs.get(line.label, {}).get(c, Cell()) for c in quoted.columns)))
+            line._replace(cells=(*line.cells, *(rows.get(line.label, {}).get(c, Cell()) for c in quoted.columns)))
             for line in lines
         ]
         notes.append(
             f"The paper's own figures are of {quoted.network} on {quoted.measured_on}; compare the differences between "
             "rows, not the rows with each other."
         )
-    title = f"{results.title}, {_where(results, dataset)}"
-    return Table.of(name, title, METHOD, columns, lines, filter(None, notes))
+    return Table(
+        name, f"{results.title}, {_where(results, dataset)}", METHOD, columns, lines, tuple(filter(None, notes))
+    )
 
 
 def _cells(records: Sequence[Record], quantities: Sequence[Quantity]) -> list[Cell]:
@@ -173,26 +137,11 @@ def _costs(efficiency: Mapping[str, Any] | None, row: Row, records: Sequence[Rec
     if efficiency is None or line is None:
         return Cell(), Cell()
     where = {(record.dataset, record.sequence) for record in records}
-    of_row = (
-        one["energy_mj"].get(row.label)
-        for one in efficiency.get("sequences", ())
-        if (one["dataset"], one["sequence"]) in where
-    )
-    spent = mean_over([value for value in of_row if value is not None])
+    measured = (one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in where)
+    spent = mean_over(v for one in measured if (v := one["energy_mj"].get(row.label)) is not None)
     network = line["memory"].get("network_uncertainty_bytes")
-    if network is None:
-        return Cell.of(spent, ENERGY.decimals), Cell()
-    kept = [1e-6 * (network + (record.state.get("bytes_mean") or 0.0)) for record in records]
+    kept = [] if network is None else [1e-6 * (network + (r.state.get("bytes_mean") or 0.0)) for r in records]
     return Cell.of(spent, ENERGY.decimals), Cell.of(mean_over(kept), MEMORY.decimals)
-
-
-def _cost_note(efficiency: Mapping[str, Any]) -> str:
-    measured = len(efficiency.get("sequences", ()))
-    used = set(efficiency["devices"]["units"].values())
-    reasons = [why for unit, why in efficiency["power"]["missing"].items() if unit in used]
-    missing = "; ".join(dict.fromkeys(reasons))
-    words = f"; energy is not measurable here: {missing}" if missing else f", energy on {measured} of them"
-    return f"Energy and memory are what uncertainty adds to depth alone, memory on all sequences{words}."
 
 
 def _columns(quantities: Sequence[Quantity], group: str) -> list[Column]:
@@ -217,11 +166,12 @@ def _lines(cells: Mapping[Row, Sequence[Cell]], quantities: Sequence[Quantity]) 
 def _where(results: Results, dataset: str | None) -> str:
     count = len(results.sequences(dataset))
     sequences = f"{count} sequence{'s' if count > 1 else ''}"
-    if dataset is not None:
-        return f"{sequences} of {dataset}"
-    if len(results.datasets) == 1:
-        return f"{sequences} of {results.datasets[0]}"
+    if dataset is not None or len(results.datasets) == 1:
+        return f"{sequences} of {dataset or results.datasets[0]}"
     return f"{sequences} of {len(results.datasets)} data sets ({', '.join(results.datasets)})"
+
+
+# ---- notes ----
 
 
 def _network_note(results: Results) -> str:
@@ -260,16 +210,21 @@ def _nll_note(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quan
     )
 
 
+def _cost_note(efficiency: Mapping[str, Any]) -> str:
+    used = set(efficiency["devices"]["units"].values())
+    missing = "; ".join(dict.fromkeys(why for unit, why in efficiency["power"]["missing"].items() if unit in used))
+    measured = f", energy on {len(efficiency.get('sequences', ()))} of them"
+    words = f"; energy is not measurable here: {missing}" if missing else measured
+    return f"Energy and memory are what uncertainty adds to depth alone, memory on all sequences{words}."
+
+
 # ---- files ----
 
 
 def write_tables(results: Results) -> list[Path]:
     """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: main, extra and differences over all sequences and, where there
     are several data sets, over those of each, ``sequences-DATASET`` for single sequences, and ``efficiency`` with the
-    paper's table 2 below ours where it was measured.
-
-    Returns:
-        Their paths.
+    paper's table 2 below ours where it was measured; their paths.
 
     Raises:
         OSError: a file cannot be written.
@@ -280,12 +235,12 @@ def write_tables(results: Results) -> list[Path]:
     for name, tables in _table_files(results):
         shown = [table for table in tables if not table.is_empty]
         if shown:
-            texts = {
+            forms = {
                 "md": "\n".join(map(markdown, shown)),
                 "tex": "\n".join(map(latex, shown)),
                 "csv": table_csv(shown),
             }
-            written += [_write_text(folder / f"{name}.{kind}", text) for kind, text in texts.items()]
+            written += [_write_text(folder / f"{name}.{kind}", text) for kind, text in forms.items()]
     return written
 
 
@@ -303,69 +258,38 @@ def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
 
 
 def write_tidy(results: Results) -> list[Path]:
-    """Write ``results.json``, ``results.csv`` (a line per figure) and ``table.csv`` (means over sequences).
-
-    Returns:
-        Their paths.
+    """Write ``results.json``, ``results.csv`` (a line per figure) and ``table.csv`` (means over sequences; the data set
+    "*" stands for all together); their paths.
 
     Raises:
         OSError: a file cannot be written.
     """
-    lines, means = tidy_lines(results), mean_lines(results)
-    paths = [results.out / name for name in ("results.json", "results.csv", "table.csv")]
-    write_json_atomic(
-        paths[0],
-        {
-            "format": FORMAT,
-            "suite": results.suite,
-            "title": results.title,
-            "lines": lines,
-            "table": means,
-            "failed": list(results.failed),
-            "missing": [{"dataset": d, "sequence": s, "row": row.slug} for d, s, row in results.missing],
-        },
-    )
-    for path, entries, head in zip(paths[1:], (lines, means), (LINE_COLUMNS, MEAN_COLUMNS), strict=True):
-        _write_text(path, _tidy_csv(entries, head))
-    return paths
-
-
-def tidy_lines(results: Results) -> list[dict[str, Any]]:
-    """One line per (suite, data set, sequence, network, method, setting, figure), with its value."""
-    return [
-        {
-            **{name: getattr(record, name) for name in LINE_COLUMNS[:5]},
-            "setting": dict(record.setting),
-            "figure": key,
-            "value": value,
-        }
+    lines = [
+        {**_of(record, record.dataset, record.sequence), "figure": key, "value": value}
         for record in results.records
         for key, value in _values(record)
     ]
-
-
-def mean_lines(results: Results) -> list[dict[str, Any]]:
-    """Means over sequences with the half-width of their 95 % intervals; the data set "*" stands for all together."""
-    lines = []
+    means = []
     for dataset in (*results.datasets, *((None,) if len(results.datasets) > 1 else ())):
         for row in results.rows:
             records = results.of(row, dataset)
             for key in dict.fromkeys(key for record in records for key, _ in _values(record)):
-                mean = mean_over([value_of(record, key) for record in records])
-                lines.append(
-                    {
-                        "suite": records[0].suite,
-                        "dataset": dataset or "*",
-                        "network": records[0].network,
-                        "method": records[0].method,
-                        "setting": dict(records[0].setting),
-                        "figure": key,
-                        "mean": mean.value,
-                        "half_width": mean.half,
-                        "sequences": mean.sequences,
-                    }
-                )
-    return lines
+                mean = mean_over(value_of(record, key) for record in records)
+                figures = {"mean": mean.value, "half_width": mean.half, "sequences": mean.sequences}
+                means.append({**_of(records[0], dataset or "*"), "figure": key, **figures})
+    missing = [{"dataset": d, "sequence": s, "row": row.slug} for d, s, row in results.missing]
+    about = {"format": FORMAT, "suite": results.suite, "title": results.title}
+    tidy = {**about, "lines": lines, "table": means, "failed": list(results.failed), "missing": missing}
+    write_json_atomic(results.out / "results.json", tidy)
+    tables = {"results.csv": lines, "table.csv": means}
+    written = [_write_text(results.out / name, _tidy_csv(entries)) for name, entries in tables.items()]
+    return [results.out / "results.json", *written]
+
+
+def _of(record: Record, dataset: str, *sequence: str) -> dict[str, Any]:
+    """What a line is of."""
+    named = {"suite": record.suite, "dataset": dataset, **({"sequence": sequence[0]} if sequence else {})}
+    return {**named, "network": record.network, "method": record.method, "setting": dict(record.setting)}
 
 
 def _values(record: Record) -> Iterator[tuple[str, float | None]]:
@@ -376,13 +300,16 @@ def _values(record: Record) -> Iterator[tuple[str, float | None]]:
         yield from ((f"{name}.{key}", value) for key, value in group.items() if isinstance(value, int | float))
 
 
-def _tidy_csv(lines: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
+def _tidy_csv(entries: Sequence[Mapping[str, Any]]) -> str:
     """Lines with a column for each setting in place of "setting"; numbers in full, nothing for a missing value."""
-    settings = sorted({name for line in lines for name in line["setting"]})
-    columns = [c for name in columns for c in (settings if name == "setting" else [name])]
-    flat = [{**line["setting"], **{name: value for name, value in line.items() if name != "setting"}} for line in lines]
-    frame = pd.DataFrame({column: [_field(line.get(column)) for line in flat] for column in columns}, dtype=object)
-    return frame.to_csv(index=False, lineterminator="\n")
+    settings = dict.fromkeys(sorted({name for entry in entries for name in entry["setting"]}))
+    rows = []
+    for entry in entries:
+        row: dict[str, Any] = {}
+        for key, value in entry.items():
+            row |= settings | value if key == "setting" else {key: value}
+        rows.append({key: _field(value) for key, value in row.items()})
+    return pd.DataFrame(rows, dtype=object).to_csv(index=False, lineterminator="\n")
 
 
 def _field(value: Any) -> str:

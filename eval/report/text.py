@@ -12,7 +12,7 @@ from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, ENSEMBLE, NETWORK, PLY, POSTERIOR, SHEET
 from ufmstar_torch.eval.report.table import markdown
-from ufmstar_torch.eval.report.tables import main_table
+from ufmstar_torch.eval.report.tables import NLL_OF_FEW, main_table
 from ufmstar_torch.eval.report.write import Report
 from ufmstar_torch.eval.results.summary import NEAR_ZERO
 
@@ -23,8 +23,6 @@ _DEMO_COLUMNS = {
     "ece_q": "ECE_q",
     "ause_rmse": "AUSE [m]",
 }
-# [nats] Above it, the mean NLL is decided by a few pixels with almost no variance.
-_NLL_DOMINATED = 100.0
 # What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
 _FOUND = {
     "tracked": ("triangulated", "tracked"),
@@ -134,7 +132,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
         lines += aligned([head, *body])
         if summary["network_alone"] is None:
             lines.append(f"network alone: no row, {summary['network_alone_reason']}")
-        if (summary["metrics"]["nll"] or 0) > _NLL_DOMINATED:
+        if (summary["metrics"]["nll"] or 0) > NLL_OF_FEW:
             lines.append(
                 f"NLL: dominated by the {uncertainty['near_zero_share']:.2%} of the pixels with a sigma between "
                 f"0 and {1000 * NEAR_ZERO:g} mm; --ufm.variance_floor 1e-4 bounds what they cost"
@@ -145,11 +143,8 @@ def run_table(summary: Mapping[str, Any]) -> str:
     mixture, time = summary["mixture"], summary["time"]
     stages = ", ".join(f"{s} {ms:.1f}" for s, ms in time["median_ms"].items() if ms is not None)
     rate = time["frames_per_second"]
-    lines += (
-        []
-        if summary["anchors"] is None
-        else _anchor_lines(summary["anchors"], summary["frames"]["done"], summary["source"]["anchors"])
-    )
+    if summary["anchors"] is not None:
+        lines += _anchor_lines(summary["anchors"], summary["frames"]["done"], summary["source"]["anchors"])
     lines += [
         f"K = {mixture['components']} components in {mixture['bytes_in_use'] / 1000:.1f} kB "
         f"({mixture['bytes_allocated'] / 1000:.1f} kB allocated), mean disagreement "

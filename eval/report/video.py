@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,23 +12,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import ColourScale, colour_table, require_matplotlib
-from ufmstar_torch.eval.report.panels import FramePanel, MapColumn, PanelScales, map_columns
+from ufmstar_torch.eval.report.colours import colour_table, require_matplotlib
+from ufmstar_torch.eval.report.panels import FramePanel, MapColumn
 
 GAP, HEAD, FOOT, BAR = 4, 22, 36, 8  # pixels
 PAPER, INK, FAINT = (255, 255, 255), (26, 26, 26), (107, 107, 107)
 
 
 def preview_frame(
-    panel: FramePanel, scales: PanelScales, *, cell_height: int | None = None, with_error: bool | None = None
+    panel: FramePanel, columns: Sequence[MapColumn], *, cell_height: int | None = None
 ) -> NDArray[np.uint8]:
-    """One video frame: image | depth | sigma | error with names, colour bars and units; sqrt(B) where the panel has it.
+    """One video frame: the image and maps side by side, with names, colour bars and units.
 
     Args:
         panel: the frame.
-        scales: fixed for the whole video, from ``fit_scales`` of a few frames, say.
+        columns: the maps, fixed for the whole video: ``map_columns`` of a few frames, say.
         cell_height: height of each map [px], its width follows; None = 240, or less for maps wider than 16:9.
-        with_error: keep a column for the error; None = if the panel has one. All frames of a video need the same.
 
     Returns:
         [H, W, 3] uint8 RGB, H and W even.
@@ -38,9 +37,6 @@ def preview_frame(
     """
     from PIL import Image, ImageDraw
 
-    error = panel.error is not None if with_error is None else with_error
-    others = {"with_anchored": panel.anchored is not None, "with_posterior": panel.posterior is not None}
-    columns = map_columns(scales, with_error=error, **others)
     height, width = panel.depth.shape
     if cell_height is None:
         cell_height = min(240, max(1, round(427 * height / width)))
@@ -72,7 +68,7 @@ def _draw_bar(canvas: Any, draw: Any, left: int, width: int, top: int, column: M
     table = colour_table(column.scale.colour_map)
     strip = table[np.linspace(0, 255, width).astype(np.intp)][None]
     canvas.paste(Image.fromarray(strip).resize((width, BAR)), (left, top + 4))
-    scale: ColourScale = column.scale
+    scale = column.scale
     low = "0" if scale.low == 0 else f"≤ {scale.low:.2g}"
     _text(draw, (left + 1, top + BAR + 15), low, FAINT, "lm")
     _text(draw, (left + width - 1, top + BAR + 15), f"≥ {scale.high:.2g}", FAINT, "rm")
@@ -170,13 +166,3 @@ class VideoWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> int:
-    """Write frames [H, W, 3] uint8 RGB of one even size as an mp4; returns how many. See ``VideoWriter``."""
-    count = 0
-    with VideoWriter(path, fps) as video:
-        for frame in frames:
-            video.add(frame)
-            count += 1
-    return count

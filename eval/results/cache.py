@@ -74,11 +74,7 @@ class PredictionCache:
         return Prediction(maps["depth"], maps.get("aleatoric"), maps.get("epistemic"), K)
 
     def store(self, key: PredictionKey, prediction: Prediction) -> None:
-        """Keep a prediction.
-
-        Raises:
-            CacheError: it cannot be written.
-        """
+        """Keep a prediction. Raises CacheError: it cannot be written."""
         arrays = {name: value.cpu().numpy() for name, value in prediction.maps().items()}
         arrays["intrinsics"] = prediction.intrinsics.numpy()
         arrays["content"] = np.frombuffer(key.content.encode(), np.uint8)

@@ -13,7 +13,6 @@ import os
 import socket
 import tempfile
 import threading
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -58,15 +57,8 @@ class Claim:
 
 
 def claim(place: Path, launch: str) -> Claim | None:
-    """Claim a place; None while another process, or an earlier call, has it.
-
-    Args:
-        place: an existing folder.
-        launch: the same for all processes that were started together.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Claim a place, an existing folder; None while another process, or an earlier call, has it. ``launch`` is the same
+    for all processes that were started together. Raises OSError: the folder cannot be written."""
     last, died = _last(place), False
     if last is not None:
         holder = _read(last)
@@ -85,14 +77,10 @@ def claim(place: Path, launch: str) -> Claim | None:
     if _last(place) != own:
         own.unlink(missing_ok=True)
         return None
-    remove(path for path in place.glob(PATTERN) if path != own)
+    for path in list(place.glob(PATTERN)):
+        if path != own:
+            path.unlink(missing_ok=True)
     return Claim(own, died=died)
-
-
-def remove(claims: Iterable[Path]) -> None:
-    """Remove files of claims that no process needs."""
-    for path in list(claims):
-        path.unlink(missing_ok=True)
 
 
 def _last(place: Path) -> Path | None:

@@ -49,14 +49,9 @@ class EvalFolder:
 
     @classmethod
     def open(cls, out: Path, about: Mapping[str, Any], *, resume: bool, overwrite: bool) -> EvalFolder:
-        """Make the folder, or go on in it; see ``OutputFolder.open``.
-
-        Args:
-            out: created if missing.
-            about: eval.json. Rows, sequences and networks are added to those of an earlier evaluation; suite, settings
-                and the networks of the same base must be the same.
-            resume: go on with the evaluation in the folder; without one, start.
-            overwrite: remove what an earlier evaluation left but for its cache of predictions, and start.
+        """Make the folder, or go on in it; see ``OutputFolder.open``. When going on, rows, sequences and networks of
+        ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the same
+        base must be the same. The cache of predictions is never removed.
 
         Raises:
             FolderError: the folder cannot be used as asked, or a process is at one of its sequences.
@@ -116,11 +111,7 @@ class EvalFolder:
                 )
 
     def keep(self, item: WorkItem, record: Record, result: RowResult) -> None:
-        """Store a row, completely or not at all.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Store a row, completely or not at all. Raises OSError: it cannot be written."""
         path = self.place(item) / f"{result.row.slug}.json"
         sums = {name: {key: pack(value) for key, value in states.items()} for name, states in result.sums.items()}
         path.unlink(missing_ok=True)  # one that could not be read
@@ -171,11 +162,8 @@ def _union(first: list[Any], second: list[Any]) -> list[Any]:
 
 
 def _clear(out: Path) -> None:
-    """Remove what an earlier evaluation and its report left, by their names; the cache stays.
-
-    Raises:
-        FolderError: a process is at one of its sequences.
-    """
+    """Remove what an earlier evaluation and its report left, by their names; the cache stays. Raises FolderError: a
+    process is at one of its sequences."""
     places = sorted({path.parent for path in out.glob(f"records/*/*/{PATTERN}")})
     with ExitStack() as held:
         for place in places:

@@ -13,8 +13,7 @@ Written while a sequence is evaluated, below its folder::
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -34,11 +33,10 @@ _POINTS = 4  # along each side of a pixel, for the picture
 _MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement")
 
 
-@dataclass(frozen=True)
-class Examples:
-    """Where pictures are made from.
+class ExampleWriter(FrameSink):
+    """A sink that writes examples of a sequence.
 
-    Attributes:
+    Args:
         folder: of the sequence; "examples" and "room" are made within it.
         frames: how many, evenly spaced over the frames.
         room: whether to leave UfM*'s mixtures as well, after a quarter, half and all of the frames.
@@ -47,59 +45,41 @@ class Examples:
         ValueError: a negative number of frames.
     """
 
-    folder: Path
-    frames: int = 3
-    room: bool = True
-
-    def __post_init__(self) -> None:
-        if self.frames < 0:
-            raise ValueError(f"frames must be at least 0, got {self.frames}")
-
-
-class ExampleWriter(FrameSink):
-    """A sink that writes what ``Examples`` selects."""
-
-    def __init__(self, examples: Examples) -> None:
-        self._examples = examples
+    def __init__(self, folder: Path, frames: int = 3, *, room: bool = True) -> None:
+        if frames < 0:
+            raise ValueError(f"frames must be at least 0, got {frames}")
+        self._folder, self._count, self._room = folder, frames, room
         self._paths: dict[str, list[NDArray[np.float64]]] = {}
         self._last: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
     def begin(self, stream: FrameStream) -> None:
-        """See ``Sink``."""
-        examples, total = self._examples, len(stream.indices)
-        self._frames = _Schedule([(n + 0.5) / examples.frames for n in range(examples.frames)], total)
-        self._rooms = _Schedule(ROOM_SHARES if examples.room else (), total)
+        total = len(stream.indices)
+        self._frames = _moments([(n + 0.5) / self._count for n in range(self._count)], total)
+        self._rooms = _moments(ROOM_SHARES if self._room else (), total)
         self._gaussians = {row.key: row.estimator for row in stream.rows if isinstance(row.estimator, Gaussians)}
 
     def take(self, result: FrameResult) -> None:
-        """After each frame; one that no row has taken in hands its place to the next.
-
-        Raises:
-            OSError: see ``write_atomic``.
-        """
+        """After each frame; one that no row has taken in hands its place to the next. Raises OSError, see
+        ``write_atomic``."""
         if not result.rows or result.frame is None:
             return
-        for key in self._gaussians if self._examples.room else ():
+        for key in self._gaussians if self._room else ():
             if key in result.rows:
                 self._last[key] = result.name, result.rows[key].T_world_cam
             if key in self._last:
                 self._paths.setdefault(key, []).append(self._last[key][1][:3, 3].copy())
-        if self._frames.due(result.number + 1):
+        if _due(self._frames, result.number + 1):
             self._write_frame(result, result.frame)
-        if self._rooms.due(result.number + 1):
+        if _due(self._rooms, result.number + 1):
             self._write_rooms()
 
     def end(self) -> None:
-        """After the last frame.
-
-        Raises:
-            OSError: see ``write_atomic``.
-        """
-        if self._examples.room:
+        """After the last frame. Raises OSError, see ``write_atomic``."""
+        if self._room:
             self._write_rooms()
 
     def _write_frame(self, result: FrameResult, frame: Frame) -> None:
-        folder = self._examples.folder / "examples"
+        folder = self._folder / "examples"
         folder.mkdir(parents=True, exist_ok=True)
         scenes = {key: _scene(frame, row) for key, row in result.rows.items()}
         first = next(iter(scenes.values()))
@@ -112,29 +92,24 @@ class ExampleWriter(FrameSink):
             _write(folder / f"{frame.name}@{key}.npz", arrays if alike else {**arrays, **scene})
 
     def _write_rooms(self) -> None:
-        folder = self._examples.folder / "room"
+        folder = self._folder / "room"
         folder.mkdir(parents=True, exist_ok=True)
         for key, (name, T_world_cam) in self._last.items():
             arrays = {**_room(self._gaussians[key]), "T_world_cam": T_world_cam, "path": np.array(self._paths[key])}
             _write(folder / f"{key}_{name}.npz", arrays)
 
 
-class _Schedule:
-    """When something is due: after some shares of the frames, or as soon after as there is a frame that can be used.
+def _moments(shares: Iterable[float], total: int) -> list[int]:
+    """The numbers of frames after which something is due: rising shares in (0, 1] of ``total``."""
+    return [max(1, math.ceil(share * total)) for share in shares]
 
-    Args:
-        shares: in (0, 1], rising.
-        total: number of frames.
-    """
 
-    def __init__(self, shares: Sequence[float], total: int) -> None:
-        self._moments = [max(1, math.ceil(share * total)) for share in shares]
-
-    def due(self, done: int) -> bool:
-        """Whether something is due after ``done`` frames; every time once."""
-        passed = [moment for moment in self._moments if moment <= done]
-        self._moments = [moment for moment in self._moments if moment > done]
-        return bool(passed)
+def _due(moments: list[int], done: int) -> bool:
+    """Whether a moment has come after ``done`` frames; those that have come are removed."""
+    coming = [moment for moment in moments if moment > done]
+    due = len(coming) < len(moments)
+    moments[:] = coming
+    return due
 
 
 def _room(estimator: Gaussians) -> dict[str, NDArray]:

@@ -64,11 +64,8 @@ def remove_temporaries(paths: Iterable[Path]) -> None:
 
 
 def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:
-    """Write strict JSON (NaN and infinities become null) atomically and durably.
-
-    Args:
-        path: the file; its folder must exist.
-        data: mappings, sequences, dataclasses, NumPy arrays, tensors, paths, and plain values.
+    """Write strict JSON (NaN and infinities become null) atomically and durably: mappings, sequences, dataclasses,
+    NumPy arrays, tensors, paths, and plain values.
 
     Raises:
         TypeError: a value has no JSON form; the message names its place.
@@ -79,11 +76,8 @@ def write_json_atomic(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def to_json(value: Any, where: str = "data") -> Any:
-    """The value as dict, list, str, int, float, bool or None, with None for NaN and infinities.
-
-    Raises:
-        TypeError: the value, or one inside it, has no JSON form.
-    """
+    """The value as dict, list, str, int, float, bool or None, with None for NaN and infinities. Raises TypeError: the
+    value, or one inside it, has no JSON form."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray | np.generic):

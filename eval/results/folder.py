@@ -35,37 +35,27 @@ class FolderError(ValueError):
 
 @dataclass(frozen=True)
 class FolderKind:
-    """The output folder of one program.
+    """The output folder of one program."""
 
-    Attributes:
-        program: as "ufmstar run"; the manifest contains it.
-        noun: for messages: "run", "evaluation", "training", "demo".
-        manifest: path of the manifest below the folder.
-        clear: removes what earlier work left in a folder, but for the manifest.
-        format: of the manifest and the files beside it; None = work of this kind cannot be continued, and its manifest
-            is replaced by a summary at the end.
-        lock: path of the lock file below the folder; None = no lock.
-        held: "life" = the lock is held until the folder is closed, by one process; "opening" = only while the folder
-            is opened, since several processes work in it.
-        wait: longest time [s] to wait for the lock.
-        allowed: entries that may exist in a folder before its manifest does.
-        temporary: glob patterns below the folder of temporary files that a killed process may have left, and that no
-            running process can own while the lock is held.
-        identity: of (a manifest, another one): the values of the first that must not change.
-        merge: of (the manifest in the folder, the new one): what the folder contains from then on.
-    """
-
-    program: str
-    noun: str
-    manifest: str
-    clear: Callable[[Path], None]
+    program: str  # as "ufmstar run"; the manifest contains it
+    noun: str  # for messages: "run", "evaluation", "training", "demo"
+    manifest: str  # path of the manifest below the folder
+    clear: Callable[[Path], None]  # removes what earlier work left in a folder, but for the manifest
+    # of the manifest and the files beside it; None = work of this kind cannot be continued, and its manifest is
+    # replaced by a summary at the end.
     format: int | None = None
-    lock: str | None = None
+    lock: str | None = None  # path of the lock file below the folder; None = no lock
+    # "life" = the lock is held until the folder is closed, by one process; "opening" = only while the folder is opened,
+    # since several processes work in it.
     held: Literal["life", "opening"] = "life"
-    wait: float = 0.0
-    allowed: tuple[str, ...] = ()
+    wait: float = 0.0  # longest time [s] to wait for the lock
+    allowed: tuple[str, ...] = ()  # entries that may exist in a folder before its manifest does
+    # glob patterns below the folder of temporary files that a killed process may have left, and that no running process
+    # can own while the lock is held.
     temporary: tuple[str, ...] = (".*.tmp",)
+    # of (a manifest, another one): the values of the first that must not change.
     identity: Callable[[Manifest, Manifest], Manifest] = lambda manifest, _: manifest["identity"]
+    # of (the manifest in the folder, the new one): what the folder contains from then on.
     merge: Callable[[Manifest, Manifest], Manifest] = lambda then, _: then
 
     @property
@@ -80,11 +70,7 @@ class FolderKind:
         return plain
 
     def read_manifest(self, out: Path) -> dict[str, Any]:
-        """The manifest of a folder.
-
-        Raises:
-            FolderError: it is damaged, or of another program or format.
-        """
+        """The manifest of a folder. Raises FolderError: it is damaged, or of another program or format."""
         path = out / self.manifest
         try:
             manifest = json.loads(path.read_text(encoding="utf-8"))
@@ -95,11 +81,8 @@ class FolderKind:
             raise FolderError(f"--resume: {path} is not {self.indefinite}'s that can be continued ({error})") from error
 
     def occupied(self, out: Path) -> bool:
-        """Whether the folder contains earlier work of the program.
-
-        Raises:
-            FolderError: it is a file, or contains files that are not the program's.
-        """
+        """Whether the folder contains earlier work of the program. Raises FolderError: it is a file, or contains files
+        that are not the program's."""
         if out.exists() and not out.is_dir():
             raise FolderError(f"--out {out} is a file, expected a folder")
         if (out / self.manifest).is_file() and (self.format is not None or self._read_plain(out) is not None):
@@ -174,7 +157,9 @@ class OutputFolder:
             if kind.lock is not None:
                 lock = hold(out / kind.lock, wait=kind.wait)
                 if lock is None:
-                    raise FolderError(f"--out {out}: {_busy(kind)}")
+                    preparing = f"another process is preparing it for over {kind.wait:g} s"
+                    busy = preparing if kind.held == "opening" else f"another {kind.noun} is writing there now"
+                    raise FolderError(f"--out {out}: {busy}")
                 held.callback(lock.release)
             # Checked again: another process may have made the folder while this one waited.
             kind.require_choice(out, resume=resume, overwrite=overwrite)
@@ -217,20 +202,9 @@ def remover(*patterns: str) -> Callable[[Path], None]:
 
 
 def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
-    """Hold a lock file until it is released or the process ends, however that happens.
-
-    On a network file system the lock holds between computers if it passes on ``flock``.
-
-    Args:
-        path: created if missing; its folder must exist.
-        wait: longest time [s] to wait for another holder.
-
-    Returns:
-        The lock; None where another process, or an earlier call, holds it.
-
-    Raises:
-        OSError: the file cannot be opened, or the file system does not support locks.
-    """
+    """Hold a lock file until it is released or the process ends, however that happens; None where another process, or
+    an earlier call, holds it for more than ``wait`` [s]. On a network file system the lock holds between computers if
+    it passes on ``flock``. Raises OSError: the file cannot be opened, or the file system does not support locks."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
@@ -274,9 +248,3 @@ def _flat(values: Manifest, prefix: str = "") -> dict[str, Any]:
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 40 else text[:16] + '..."'
-
-
-def _busy(kind: FolderKind) -> str:
-    if kind.held == "opening":
-        return f"another process is preparing it for over {kind.wait:g} s"
-    return f"another {kind.noun} is writing there now"

@@ -15,65 +15,21 @@ from ufmstar_torch.eval.engine.rows import RowFrame
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.results.run_folder import Checkpoint, RunFolder
 from ufmstar_torch.eval.results.summary import NEAR_ZERO
-from ufmstar_torch.eval.results.writers import FrameWriter, WrittenFrame
 
+_MAPS = ("depth", "variance", "disagreement", "anchored", "bias", "posterior_depth", "posterior_variance")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
 # A run on maps saves UfM*'s tensors under their own names, and no turn: its files have done so since the first version.
 _TURN, _UFM = "image_index", "ufm."
 
 
-class MapWriter(FrameSink):
-    """Writes the maps of a row's frames.
-
-    Args:
-        key: of the row.
-        writer: of the files.
-
-    Attributes:
-        written: what became of the last frame.
-    """
-
-    stage: str | None = "write"
-
-    def __init__(self, key: str, writer: FrameWriter) -> None:
-        self._key, self._writer = key, writer
-        self.written = WrittenFrame(0, 0)
-
-    def take(self, result: FrameResult) -> None:
-        """Write a frame.
-
-        Raises:
-            OSError: see :meth:`FrameWriter.write`.
-        """
-        if self._key in result.rows:
-            estimate = result.rows[self._key].estimate
-            anchored = ("anchored", "bias", "posterior_depth", "posterior_variance")
-            names = ("depth", "variance", "disagreement", *anchored, "valid")
-            maps = {name: getattr(estimate, name) for name in names}
-            self.written = self._writer.write(result.name, **maps)
-
-
 class Journal(FrameSink):
-    """Commits every frame to the run's folder, with the state that the next one depends on (``FrameResult.state``).
-
-    Args:
-        key: of the row.
-        folder: of the run.
-        sums: the metrics' sums so far.
-        maps: the sink that has written the frame.
-        bare: the row's depth comes from maps.
-    """
+    """Writes every frame's maps to the run's folder, and commits it with the metrics' sums and the state that the next
+    one depends on (``FrameResult.state``). ``bare``: the row's depth comes from maps."""
 
     def __init__(
-        self,
-        key: str,
-        folder: RunFolder,
-        sums: Callable[[], dict[str, dict[str, Tensor]]],
-        maps: MapWriter,
-        *,
-        bare: bool,
+        self, key: str, folder: RunFolder, sums: Callable[[], dict[str, dict[str, Tensor]]], *, bare: bool
     ) -> None:
-        self._key, self._folder, self._sums, self._maps, self._bare = key, folder, sums, maps, bare
+        self._key, self._folder, self._sums, self._bare = key, folder, sums, bare
         self._earlier = list(folder.checkpoint.sessions)
         self._saving = 0.0
 
@@ -82,11 +38,8 @@ class Journal(FrameSink):
         self._first, self._started = stream.position, perf_counter()
 
     def take(self, result: FrameResult) -> None:
-        """Commit a frame.
-
-        Raises:
-            OSError: see :meth:`RunFolder.commit`.
-        """
+        """Write and commit a frame; raises OSError as ``FrameWriter.write`` and ``RunFolder.commit``."""
+        record = self._written(result)
         session = {
             "first": self._first,
             "frames": result.number + 1 - self._first,
@@ -99,22 +52,24 @@ class Journal(FrameSink):
             sessions=[*self._earlier, session],
         )
         before = perf_counter()
-        self._folder.commit(self._record(result), checkpoint)
+        self._folder.commit(record, checkpoint)
         self._saving = 1000 * (perf_counter() - before)
 
     def end(self) -> None:
         """Store the last state, before pictures are drawn."""
         self._folder.store()
 
-    def _record(self, result: FrameResult) -> dict[str, Any]:
-        """The frame's line of frames.jsonl."""
+    def _written(self, result: FrameResult) -> dict[str, Any]:
+        """The frame's line of frames.jsonl, once its maps are written."""
         about = {"index": result.index, "name": result.name}
         if self._key not in result.rows:
             return {**about, "state": "skipped", "reason": result.skipped[self._key]}
-        row = result.rows[self._key]
-        written = {"depth": self._maps.written.depth_saturated, "sigma": self._maps.written.sigma_saturated}
-        times = {"ms": _times(result, row, self._saving)}
-        return {**about, "state": "done", **_figures(row), "saturated": written, **times, **_anchor_figures(row)}
+        row, before = result.rows[self._key], perf_counter()
+        maps = {name: getattr(row.estimate, name) for name in _MAPS}
+        lost = self._folder.writer.write(result.name, valid=row.estimate.valid, **maps)
+        saturated = {"saturated": {"depth": lost.depth_saturated, "sigma": lost.sigma_saturated}}
+        times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
+        return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
 
 
 def row_part(state: Mapping[str, Tensor], key: str) -> dict[str, Tensor]:
@@ -156,7 +111,7 @@ def _figures(row: RowFrame) -> dict[str, Any]:
     }
 
 
-def _times(result: FrameResult, row: RowFrame, saving: float) -> dict[str, float]:
+def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) -> dict[str, float]:
     """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
     this frame's is not known yet. "cycle" is the time since the frame before: stages overlap."""
     ms = result.ms
@@ -166,7 +121,7 @@ def _times(result: FrameResult, row: RowFrame, saving: float) -> dict[str, float
         **optional,
         "ufm": row.ms["uncertainty"],
         "metrics": ms["truth"] + ms["metrics"],
-        "write": ms["write"],
+        "write": writing,
         "save": saving,
         "prepare": ms["predict"] - row.ms.get("network", 0.0),
         "cycle": ms["cycle"],

@@ -2,11 +2,15 @@
 
 Processes on this computer are started and watched here rather than by submitit's local executor, whose jobs end after
 some minutes, are cancelled by SIGINT, outlive a killed starter and write to files instead of the terminal.
+
+``stop`` is asked before every frame, or while processes or jobs run, and ends the work; ``report`` receives a line for
+everything that a user should see.
 """
 
 from __future__ import annotations
 
 import os
+import pickle
 import secrets
 import signal
 import subprocess
@@ -38,45 +42,28 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class LaunchOptions:
-    """Who carries an evaluation out: options of ``ufmstar eval``, under their names.
+    """Who carries an evaluation out: options of ``ufmstar eval``, under their names."""
 
-    Attributes:
-        processes: on this computer.
-        slurm: KEY=VALUE words; see ``Slurm``. () = no cluster.
-        shard: "i/n", the part of the sequences that this process does; None = all.
-        threads: of the CPU, for each process; None = all, divided among them.
-        resume, overwrite: see ``EvalFolder.open``.
-        debug: show tracebacks.
-    """
-
-    processes: int = 1
-    slurm: Sequence[str] = ()
-    shard: str | None = None
-    threads: int | None = None
+    processes: int = 1  # on this computer
+    slurm: Sequence[str] = ()  # KEY=VALUE words; see ``Slurm``. () = no cluster
+    shard: str | None = None  # "i/n", the part of the sequences that this process does; None = all
+    threads: int | None = None  # of the CPU, for each process; None = all, divided among them
+    # resume, overwrite: see ``EvalFolder.open``.
     resume: bool = False
     overwrite: bool = False
-    debug: bool = False
+    debug: bool = False  # show tracebacks
 
 
 @dataclass(frozen=True)
 class EvalOutcome:
-    """How an evaluation ended.
+    """How an evaluation ended."""
 
-    Attributes:
-        job: what was evaluated.
-        finished: False: it was stopped, or a process ended early.
-        stopped: by the caller.
-        failed: why a sequence is broken, by its label.
-        left: number of sequences without all of their rows, broken ones left out.
-        reports: whether this process reports the results; further ones of torchrun are silent.
-    """
-
-    job: EvalJob
-    finished: bool
-    stopped: bool
-    failed: Mapping[str, str]
-    left: int
-    reports: bool = True
+    job: EvalJob  # what was evaluated
+    finished: bool  # False: it was stopped, or a process ended early
+    stopped: bool  # by the caller
+    failed: Mapping[str, str]  # why a sequence is broken, by its label
+    left: int  # number of sequences without all of their rows, broken ones left out
+    reports: bool = True  # whether this process reports the results; further ones of torchrun are silent
 
 
 @dataclass(frozen=True)
@@ -89,11 +76,8 @@ class Rank:
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Rank | None:
-        """The rank in an environment; None where torchrun has not started several processes.
-
-        Raises:
-            ValueError: the variables are not such numbers.
-        """
+        """The rank in an environment; None where torchrun has not started several processes. Raises ValueError: the
+        variables are not such numbers."""
         if any(name not in environment for name in _TORCHRUN):
             return None
         try:
@@ -107,25 +91,15 @@ class Rank:
 
 @dataclass(frozen=True)
 class Slurm:
-    """The words of ``--slurm``.
+    """The words of ``--slurm``."""
 
-    Attributes:
-        jobs: how many share the work.
-        cluster: of submitit: "slurm"; "local" and "debug" run on this computer.
-        parameters: of ``submitit.AutoExecutor``.
-    """
-
-    jobs: int
-    cluster: str
-    parameters: Mapping[str, Any]
+    jobs: int  # how many share the work
+    cluster: str  # of submitit: "slurm"; "local" and "debug" run on this computer
+    parameters: Mapping[str, Any]  # of ``submitit.AutoExecutor``
 
     @classmethod
     def parse(cls, words: Iterable[str]) -> Slurm:
-        """From KEY=VALUE words.
-
-        Raises:
-            ValueError: another form, a key twice, or a number of jobs below 1.
-        """
+        """From KEY=VALUE words. Raises ValueError: another form, a key twice, or a number of jobs below 1."""
         values: dict[str, Any] = {}
         for word in words:
             key, equals, value = word.partition("=")
@@ -152,15 +126,8 @@ def evaluate_suite(
     progress: Callable[[str, int, int], None],
     evaluate: Evaluate = evaluate_sequences,
 ) -> EvalOutcome:
-    """Evaluate a job.
-
-    Args:
-        job: what is evaluated.
-        options: by whom.
-        stop: asked before every frame.
-        report: receives a line when a sequence is finished.
-        progress: see ``WorkerContext``; of this process's own work.
-        evaluate: of this process's own work; see ``evaluate_sequences``.
+    """Evaluate a job; ``progress`` (see ``WorkerContext``) and ``evaluate`` (see ``evaluate_sequences``) are of this
+    process's own work.
 
     Raises:
         FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
@@ -170,7 +137,7 @@ def evaluate_suite(
     if rank is not None:
         _require_plain(options, rank)
         # No common launch: torchrun starts all processes again when one was killed, and the sequence is tried again.
-        task = WorkerTask(job.to_dict(), rank.rank + 1, rank.world, rank.local, "", options.threads)
+        task = WorkerTask(job, rank.rank + 1, rank.world, rank.local, "", options.threads)
         finished = work(task, stop=stop, report=report, waits=rank.rank == 0, evaluate=evaluate)
         return _outcome(job, finished, stop(), reports=rank.rank == 0)
     if options.slurm or options.processes > 1:
@@ -197,33 +164,20 @@ def tasks_of(job: EvalJob, options: LaunchOptions, jobs: int | None = None) -> l
     """The tasks of processes that share a job: ``options.processes`` on this computer, or ``jobs`` on a cluster."""
     launch, count = secrets.token_hex(8), jobs or options.processes
     threads = options.threads if jobs else options.threads or max(1, available_cores() // count)
-    return [
-        WorkerTask(job.to_dict(), n + 1, count, 0 if jobs else n, launch, threads, options.debug) for n in range(count)
-    ]
+    return [WorkerTask(job, n + 1, count, 0 if jobs else n, launch, threads, options.debug) for n in range(count)]
 
 
 def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = _WORKER) -> bool:
-    """Start a process for every task, and wait for all of them.
-
-    One that ends early loses only the sequence in hand: the others do the rest.
-
-    Args:
-        tasks: one for each process.
-        stop: True: all end after the frame in hand.
-        report: receives a line for each process that ends early.
-        command: that runs ``worker.main``.
-
-    Returns:
-        Whether every process came to its end.
-    """
+    """Start a process for every task by ``command``, which runs ``worker.main``, and wait for all; whether every one
+    came to its end. One that ends early loses only the sequence in hand: the others do the rest."""
     running: list[_Process] = []
     try:
         for task in tasks:
             # In a session of its own, so that Ctrl-C reaches this process alone, which passes it on.
-            child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
+            child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
             running.append(_Process(task.label, child))
             assert child.stdin is not None
-            child.stdin.write(task.to_json())
+            pickle.dump(task, child.stdin)
             child.stdin.close()
         return _wait(running, stop, report)
     finally:
@@ -234,16 +188,8 @@ def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, co
 
 
 def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: Report) -> bool:
-    """Submit a job for every task, and wait for all of them; OUT/slurm has their output.
-
-    Args:
-        slurm: the words of ``--slurm``.
-        tasks: one for each job.
-        stop: True: the jobs are cancelled.
-        report: receives a line for the jobs that were submitted, and for each that failed.
-
-    Returns:
-        Whether every job came to its end.
+    """Submit a job for every task, and wait for all of them; whether every one came to its end. OUT/slurm has their
+    output; stopping cancels them.
 
     Raises:
         ImportError: submitit is missing.
@@ -253,7 +199,7 @@ def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: 
         import submitit
     except ImportError as error:
         raise ImportError("--slurm needs submitit: pip install 'ufmstar-torch[cluster]'") from error
-    folder = f"{tasks[0].job['out']}/slurm"
+    folder = f"{tasks[0].job.out}/slurm"
     try:
         executor = submitit.AutoExecutor(folder=folder, cluster=slurm.cluster)
         executor.update_parameters(**{"name": "ufmstar-eval", **slurm.parameters})
@@ -291,7 +237,7 @@ class _Process:
     """A process on this computer."""
 
     label: str
-    child: subprocess.Popen[str]
+    child: subprocess.Popen[bytes]
 
     def outcome(self) -> tuple[bool, str] | None:
         """Whether it came to its end, and a line about what went wrong, or ""; None while it runs."""

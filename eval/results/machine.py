@@ -70,11 +70,8 @@ def cpu_model() -> str:
 
 
 def require_device(name: str) -> str:
-    """The name of a device of torch, checked by an allocation on it.
-
-    Raises:
-        ValueError: the device does not exist here.
-    """
+    """The name of a device of torch, checked by an allocation on it. Raises ValueError: the device does not exist
+    here."""
     import torch
 
     try:

@@ -15,36 +15,27 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Record:
-    """One row of a table on one sequence.
+    """One row of a table on one sequence."""
 
-    Attributes:
-        suite: its name, as "paper-table-1".
-        dataset: as "scannet"; ``sequence``: its name within it.
-        sequence: see ``dataset``.
-        network: as shown, "FastDepth" or "ResNet50-Monodepth2".
-        method: the row's name, ``Method.name``.
-        setting: ``Setting.to_dict()``; {} = as the paper runs it.
-        frames: "selected", "done", "skipped" (counts) and "reasons" (count by reason).
-        figures: ``SequenceMetrics.compute()``: "delta1", "nll", "ece_delta", ... (NaN is kept as None).
-        curves: ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE", "error_by_error:REFERENCE" over the
-            pixels of which the method REFERENCE is confident.
-        state: of the multiview method: "bytes_mean", "bytes_max", "bytes_end" [B], "count_mean", "count_max",
-            "count_end" (points or components), "smoothing_bytes" (the map kept for smoothing) [B]; {} if alone.
-        ms: median time per frame [ms] by stage: "network" (one inference, or all of them), "uncertainty".
-        provenance: "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
-    """
-
-    suite: str
-    dataset: str
-    sequence: str
-    network: str
-    method: str
-    setting: Mapping[str, Any] = field(default_factory=dict)
+    suite: str  # its name, as "paper-table-1"
+    dataset: str  # as "scannet"; ``sequence``: its name within it
+    sequence: str  # see ``dataset``
+    network: str  # as shown, "FastDepth" or "ResNet50-Monodepth2"
+    method: str  # the row's name, ``Method.name``
+    setting: Mapping[str, Any] = field(default_factory=dict)  # ``Setting.to_dict()``; {} = as the paper runs it
+    # "selected", "done", "skipped" (counts) and "reasons" (count by reason).
     frames: Mapping[str, Any] = field(default_factory=dict)
+    # ``SequenceMetrics.compute()``: "delta1", "nll", "ece_delta", ... (NaN is kept as None).
     figures: Mapping[str, float | None] = field(default_factory=dict)
+    # ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE", "error_by_error:REFERENCE" over the pixels of which
+    # the method REFERENCE is confident.
     curves: Mapping[str, Any] = field(default_factory=dict)
+    # of the multiview method: "bytes_mean", "bytes_max", "bytes_end" [B], "count_mean", "count_max", "count_end"
+    # (points or components), "smoothing_bytes" (the map kept for smoothing) [B]; {} if alone.
     state: Mapping[str, float] = field(default_factory=dict)
+    # median time per frame [ms] by stage: "network" (one inference, or all of them), "uncertainty".
     ms: Mapping[str, float] = field(default_factory=dict)
+    # "versions", "machine", "device", "runtime" of the networks, digests of networks and sequence.
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
@@ -53,11 +44,7 @@ class Record:
 
     @classmethod
     def load(cls, path: Path) -> Record:
-        """Read one.
-
-        Raises:
-            ValueError: the file is not a record of this format; the message names it.
-        """
+        """Read one. Raises ValueError: the file is not a record of this format; the message names it."""
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:

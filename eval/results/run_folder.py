@@ -52,20 +52,13 @@ RUN = FolderKind(
 
 @dataclass
 class Checkpoint:
-    """What a run needs to go on.
+    """What a run needs to go on."""
 
-    Attributes:
-        position: number of frames handled, skipped ones included.
-        journal_bytes: length of frames.jsonl then.
-        module: state of UfM* and of the alternation.
-        metrics: sums of the metrics, by name.
-        sessions: {"first", "frames", "seconds"} of every start of the program.
-    """
-
-    position: int = 0
-    journal_bytes: int = 0
-    module: dict[str, Tensor] = field(default_factory=dict)
-    metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    position: int = 0  # number of frames handled, skipped ones included
+    journal_bytes: int = 0  # length of frames.jsonl then
+    module: dict[str, Tensor] = field(default_factory=dict)  # state of UfM* and of the alternation
+    metrics: dict[str, dict[str, Tensor]] = field(default_factory=dict)  # sums of the metrics, by name
+    # {"first", "frames", "seconds"} of every start of the program.
     sessions: list[dict[str, float]] = field(default_factory=list)
 
 
@@ -90,13 +83,8 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | Path, identity: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
-        """Prepare the folder; see ``OutputFolder.open``.
-
-        Args:
-            path: created if missing.
-            identity: plain values that must be those of the run that is to be continued.
-            resume: go on where an earlier run in the folder stopped; without one, start.
-            overwrite: remove what an earlier run left, and start.
+        """Prepare the folder; see ``OutputFolder.open``. ``identity`` holds plain values that must be those of the run
+        that is to be continued.
 
         Raises:
             FolderError: the folder cannot be used as asked, or the state in it cannot be read.
@@ -127,11 +115,8 @@ class RunFolder:
         self._folder.close()
 
     def commit(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
-        """Record a frame as handled, once its files are written; now and then, :meth:`store`.
-
-        Raises:
-            OSError: a full disk, say; the folder stays at the frame before.
-        """
+        """Record a frame as handled, once its files are written; now and then, :meth:`store`. Raises OSError: a full
+        disk, say; the folder stays at the frame before."""
         if self._journal is None:
             raise ValueError("commit needs an open folder: use `with folder:`")
         line = json.dumps(to_json(record), allow_nan=False).encode() + b"\n"
@@ -146,16 +131,15 @@ class RunFolder:
         self.checkpoint = checkpoint
 
     def store(self) -> None:
-        """Keep the state after the last finished frame on disk, for a run that goes on from it.
-
-        Raises:
-            OSError: a full disk, say; the state before stays.
-        """
+        """Keep the state after the last finished frame on disk, for a run that goes on from it. Raises OSError: a full
+        disk, say; the state before stays."""
         if self._stored is not self.checkpoint:
             self._store(self.checkpoint)
 
     def _store(self, checkpoint: Checkpoint) -> None:
-        content = _storable(checkpoint)
+        # Plain values and tensors, large ones by their non-zero entries.
+        sums = {name: {key: pack(value) for key, value in own.items()} for name, own in checkpoint.metrics.items()}
+        content = {**checkpoint.__dict__, "format": FORMAT, "metrics": sums}
         write_atomic(self.path / "resume" / "state.pt", lambda file: torch.save(content, file))
         self._stored, self._stored_at = checkpoint, monotonic()
 
@@ -170,12 +154,6 @@ class RunFolder:
         except OSError:
             self.release_reserve()
             self.writer.write_summary(summary)
-
-
-def _storable(checkpoint: Checkpoint) -> dict[str, Any]:
-    """The checkpoint as it is stored: plain values and tensors, large ones by their non-zero entries."""
-    metrics = {name: {key: pack(value) for key, value in sums.items()} for name, sums in checkpoint.metrics.items()}
-    return {**checkpoint.__dict__, "format": FORMAT, "metrics": metrics}
 
 
 def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from statistics import mean, median
-from typing import Any
+from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
 from ufmstar_torch.eval.results import machine
@@ -21,8 +20,7 @@ STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "s
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 
 
-@dataclass(frozen=True)
-class Ending:
+class Ending(NamedTuple):
     """How a run ended: "finished", "interrupted" or "failed", and why."""
 
     state: str
@@ -43,21 +41,8 @@ def summarise(
     figures: Mapping[str, Mapping[str, float]],
     outputs: Mapping[str, str | None],
 ) -> dict[str, Any]:
-    """The content of summary.json, from what the run has stored.
-
-    Args:
-        ending: of the run.
-        settings: what the user chose.
-        sequence: the frames, of which ``selected`` were asked for.
-        selected: see above.
-        source: what the depth came from.
-        runtime: what ran the networks (``DepthSource.runtime``).
-        records: the lines of frames.jsonl.
-        sessions: of every start of the program.
-        mixture: at the end.
-        figures: metrics by method.
-        outputs: by file, None if it exists, or why it does not.
-    """
+    """The content of summary.json, from what the run has stored: ``records`` are the lines of frames.jsonl, ``mixture``
+    that at the end; ``outputs`` holds for each file None if it exists, or why it does not."""
     done = [record for record in records if record["state"] == "done"]
     return {
         "program": "ufmstar run",

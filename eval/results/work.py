@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from ufmstar_torch.eval.engine.anchors import landmark_digests
-from ufmstar_torch.eval.engine.confident import references
 from ufmstar_torch.eval.engine.evaluate import BROKEN, Judge, RowResult, SequenceTask, evaluate_sequences
+from ufmstar_torch.eval.engine.judge import references
 from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.stream import Stopped
@@ -24,7 +24,7 @@ from ufmstar_torch.eval.methods.suite import Suite
 from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.results.claim import Claim
 from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
-from ufmstar_torch.eval.results.examples import Examples, ExampleWriter
+from ufmstar_torch.eval.results.examples import ExampleWriter
 from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
@@ -41,40 +41,24 @@ _FITTED = "{} recalibrated rows were fitted to this sequence and are not judged 
 
 @dataclass(frozen=True)
 class EvalJob:
-    """What is evaluated.
+    """What is evaluated."""
 
-    Attributes:
-        suite: its rows, of the bases that have a network.
-        missing_bases: bases of rows that were left out.
-        networks: chosen, by base.
-        items: the sequences.
-        out: the folder for everything that is written.
-        frames: which of each sequence.
-        cache: folder of predictions; None = in ``out``.
-        device: "cpu", "cuda", "cuda:1".
-        confident: share of a frame's pixels of which a reference method counts as confident.
-        bins: of the calibration errors: "ours" or "authors", see ``SequenceMetrics``.
-        examples: of each data set, sequences of which a few frames are stored for pictures.
-        samples: passes of MC-Dropout.
-        runtime, precision: of the networks (``Inference``).
-        streams: sequences that a process evaluates at the same time.
-    """
-
-    suite: Suite
-    networks: Mapping[str, NetworkChoice]
-    items: tuple[WorkItem, ...]
-    out: Path
-    missing_bases: tuple[str, ...] = ()
-    frames: slice = field(default_factory=lambda: slice(None))
-    cache: Path | None = None
-    device: str = "cpu"
-    confident: float = 0.5
-    bins: str = "ours"
-    examples: int = 3
-    samples: int | None = None
+    suite: Suite  # its rows, of the bases that have a network
+    networks: Mapping[str, NetworkChoice]  # chosen, by base
+    items: tuple[WorkItem, ...]  # the sequences
+    out: Path  # the folder for everything that is written
+    missing_bases: tuple[str, ...] = ()  # bases of rows that were left out
+    frames: slice = field(default_factory=lambda: slice(None))  # which of each sequence
+    cache: Path | None = None  # folder of predictions; None = in ``out``
+    device: str = "cpu"  # "cpu", "cuda", "cuda:1"
+    confident: float = 0.5  # share of a frame's pixels of which a reference method counts as confident
+    bins: str = "ours"  # of the calibration errors: "ours" or "authors", see ``SequenceMetrics``
+    examples: int = 3  # of each data set, sequences of which a few frames are stored for pictures
+    samples: int | None = None  # passes of MC-Dropout
+    # runtime, precision: of the networks (``Inference``).
     runtime: str = "auto"
     precision: str = "float32"
-    streams: int = 1
+    streams: int = 1  # sequences that a process evaluates at the same time
 
     @property
     def unused(self) -> tuple[str, ...]:
@@ -82,11 +66,8 @@ class EvalJob:
         return tuple(base for base in self.networks if base not in self.suite.bases)
 
     def load(self, device: torch.device) -> dict[str, DepthSource]:
-        """The networks that the rows need.
-
-        Raises:
-            FileNotFoundError, ValueError, ImportError: see ``NetworkChoice.load``.
-        """
+        """The networks that the rows need. Raises FileNotFoundError, ValueError, ImportError, see
+        ``NetworkChoice.load``."""
         passes = {} if self.samples is None else {"samples": self.samples}
         needed = [self.networks[base] for base in self.suite.bases]
         inference = Inference(self.runtime, self.precision)
@@ -116,72 +97,25 @@ class EvalJob:
         same = [other for other in self.items if other.dataset == item.dataset]
         return item in same[: self.examples]
 
-    def to_dict(self) -> dict[str, Any]:
-        """The job as plain values, for another process."""
-        plain = "missing_bases device confident bins examples samples runtime precision streams"
-        own = {name: getattr(self, name) for name in plain.split()}
-        return own | {
-            "suite": self.suite.to_dict(),
-            "networks": [asdict(choice) for choice in self.networks.values()],
-            "items": [asdict(item) for item in self.items],
-            "out": str(self.out),
-            "frames": [self.frames.start, self.frames.stop, self.frames.step],
-            "cache": None if self.cache is None else str(self.cache),
-        }
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> EvalJob:
-        """The job of :meth:`to_dict`, also after a way through JSON."""
-        networks = [NetworkChoice(**{**choice, "files": tuple(choice["files"])}) for choice in values["networks"]]
-        items = [WorkItem(**{**item, "opening": tuple(map(tuple, item["opening"]))}) for item in values["items"]]
-        made = {
-            "suite": Suite.from_dict(values["suite"]),
-            "networks": {choice.base: choice for choice in networks},
-            "items": tuple(items),
-            "out": Path(values["out"]),
-            "missing_bases": tuple(values["missing_bases"]),
-            "frames": slice(*values["frames"]),
-            "cache": None if values["cache"] is None else Path(values["cache"]),
-        }
-        return cls(**{**values, **made})
-
 
 @dataclass(frozen=True)
 class WorkerContext:
-    """How one process takes part in an evaluation.
+    """How one process takes part in an evaluation."""
 
-    Attributes:
-        shard: the part of the sequences that it begins with.
-        helps: take sequences of other parts afterwards; for processes that were started together.
-        waits: stay until the sequences that other processes work on are finished.
-        launch: the same for all processes that were started together; "" = one of its own.
-        stop: asked before every frame.
-        report: receives a line when a sequence is finished.
-        progress: called with a sequence's label, its number of finished frames, and the number of all of them.
-        evaluate: computes rows on sequences; see ``evaluate_sequences``.
-    """
-
-    shard: Shard = field(default_factory=Shard)
-    helps: bool = False
-    waits: bool = False
-    launch: str = ""
-    stop: Callable[[], bool] = lambda: False
-    report: Callable[[str], None] = lambda line: None
+    shard: Shard = field(default_factory=Shard)  # the part of the sequences that it begins with
+    helps: bool = False  # take sequences of other parts afterwards; for processes that were started together
+    waits: bool = False  # stay until the sequences that other processes work on are finished
+    launch: str = ""  # the same for all processes that were started together; "" = one of its own
+    stop: Callable[[], bool] = lambda: False  # asked before every frame
+    report: Callable[[str], None] = lambda line: None  # receives a line when a sequence is finished
+    # called with a sequence's label, its number of finished frames, and the number of all of them.
     progress: Callable[[str, int, int], None] = lambda label, done, total: None
-    evaluate: Evaluate = evaluate_sequences
+    evaluate: Evaluate = evaluate_sequences  # computes rows on sequences; see ``evaluate_sequences``
 
 
 def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext) -> bool:
-    """Evaluate the sequences one after another.
-
-    Args:
-        job: what is evaluated.
-        folder: opened for the job.
-        networks: loaded for the job.
-        context: this process's part in it.
-
-    Returns:
-        Whether it came to the end; False = ``context.stop`` ended it. ``folder.failure`` reports broken sequences.
+    """Evaluate the sequences one after another, with the folder opened and the networks loaded for the job; whether it
+    came to the end (False: ``context.stop`` ended it). ``folder.failure`` reports broken sequences.
 
     Raises:
         FolderError: earlier results were computed from another sequence of that name.
@@ -211,24 +145,18 @@ def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource
 
 @dataclass(frozen=True, eq=False)
 class _InHand:
-    """A sequence that is evaluated.
+    """A sequence that is evaluated."""
 
-    Attributes:
-        item, claim: which, and the claim to it.
-        digest, landmarks: what its rows are computed from.
-        missing: rows to store.
-        left_out: those of them that cannot be had of this sequence, and why.
-        started: [s] ``time.monotonic``.
-    """
-
+    # item, claim: which, and the claim to it.
     item: WorkItem
     claim: Claim
+    # digest, landmarks: what its rows are computed from.
     digest: str
     landmarks: Mapping[str, str]
-    missing: Sequence[Row]
-    left_out: Sequence[Row]
+    missing: Sequence[Row]  # rows to store
+    left_out: Sequence[Row]  # those of them that cannot be had of this sequence, and why
     why: str
-    started: float
+    started: float  # [s] ``time.monotonic``
 
 
 class _Worker:
@@ -241,11 +169,8 @@ class _Worker:
         self._in_hand: dict[SequenceTask, _InHand] = {}
 
     def tasks(self, queue: Iterable[WorkItem], taken: list[WorkItem]) -> Iterator[SequenceTask]:
-        """Claim one sequence of the queue after another; those with rows to compute are opened.
-
-        Args:
-            queue: in this order.
-            taken: gets the sequences that another process has.
+        """Claim one sequence of the queue after another; those with rows to compute are opened. ``taken`` gets the
+        sequences that another process has.
 
         Raises:
             Stopped: the caller asked to stop.
@@ -299,7 +224,7 @@ class _Worker:
             return None
         todo = [row for row in missing if row in possible]
         rows = with_references(todo, possible) if todo else missing
-        sinks = [ExampleWriter(Examples(self.folder.place(item)))] if self.job.keeps_examples(item) else []
+        sinks = [ExampleWriter(self.folder.place(item))] if self.job.keeps_examples(item) else []
         task = SequenceTask(sequence, rows, sinks, partial(self.context.progress, item.label))
         self._in_hand[task] = one
         return task

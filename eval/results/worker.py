@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
+import pickle
 import signal
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -23,33 +22,21 @@ DONE, FAILED, STOPPED = 0, 1, 130
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """What one process does; plain values.
+    """What one process does; pickled for it."""
 
-    Attributes:
-        job: ``EvalJob.to_dict``; the output folder exists already.
-        index, count: which part it begins with, from 1, of how many.
-        local: number of the process on its computer, from 0, which decides its GPU.
-        launch: the same for all processes that were started together; "" = one of its own.
-        threads: of the CPU; None = torch's own choice.
-        debug: show tracebacks.
-    """
-
-    job: Mapping[str, Any]
+    job: EvalJob  # what is evaluated; the output folder exists already
+    # index, count: which part it begins with, from 1, of how many.
     index: int
     count: int
-    local: int
-    launch: str
-    threads: int | None = None
-    debug: bool = False
+    local: int  # number of the process on its computer, from 0, which decides its GPU
+    launch: str  # the same for all processes that were started together; "" = one of its own
+    threads: int | None = None  # of the CPU; None = torch's own choice
+    debug: bool = False  # show tracebacks
 
     @property
     def label(self) -> str:
         """For people."""
         return f"{self.index}/{self.count}"
-
-    def to_json(self) -> str:
-        """The task as :func:`main` reads it."""
-        return json.dumps(asdict(self))
 
 
 def work(
@@ -60,15 +47,11 @@ def work(
     waits: bool = False,
     evaluate: Evaluate = evaluate_sequences,
 ) -> bool:
-    """Take part; True when nothing is left to do.
-
-    Raises:
-        FolderError, OSError, ValueError, ImportError: the work cannot be begun, or nothing can be written.
-    """
+    """Take part; True when nothing is left to do. Raises FolderError, OSError, ValueError, ImportError: the work cannot
+    be begun, or nothing can be written."""
     if task.threads is not None:
         torch.set_num_threads(task.threads)
-    job = EvalJob.from_dict(task.job)
-    job = replace(job, device=device_of(job.device, task.local))
+    job = replace(task.job, device=device_of(task.job.device, task.local))
     networks = job.load(torch.device(job.device))
     folder = EvalFolder.open(job.out, job.about(networks), resume=True, overwrite=False)
     shard = Shard(task.index, task.count)
@@ -77,19 +60,16 @@ def work(
 
 
 def device_of(name: str, local: int) -> str:
-    """The device of the process with that number on its computer: "cuda" is the GPU in turn, else as it stands.
-
-    Raises:
-        ValueError: the device does not exist.
-    """
+    """The device of the process with that number on its computer: "cuda" is the GPU in turn, else as it stands. Raises
+    ValueError: the device does not exist."""
     if name == "cuda" and torch.cuda.is_available():
         name = f"cuda:{local % torch.cuda.device_count()}"
     return require_device(name)
 
 
 def main() -> int:
-    """Do the task that standard input contains as JSON; 0 done, 1 failed, 130 stopped."""
-    task = WorkerTask(**json.loads(sys.stdin.read()))
+    """Do the task that standard input contains as a pickle; 0 done, 1 failed, 130 stopped."""
+    task: WorkerTask = pickle.load(sys.stdin.buffer)
     parent, received = os.getppid(), list[int]()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda n, _: received.append(n))

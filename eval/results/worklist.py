@@ -22,20 +22,13 @@ _SHARD = re.compile(r"(\d+)/(\d+)")
 
 @dataclass(frozen=True, order=True)
 class WorkItem:
-    """A sequence that is not opened yet; items are in the order of data set and name.
+    """A sequence that is not opened yet; items are in the order of data set and name."""
 
-    Attributes:
-        dataset: as "scannet".
-        sequence: its name, unique within the data set.
-        path: what ``open_sequence`` takes, ``tour:SEED`` included.
-        layout: likewise.
-        opening: further options of ``open_sequence``, by name.
-    """
-
-    dataset: str
-    sequence: str
-    path: str
-    layout: str
+    dataset: str  # as "scannet"
+    sequence: str  # its name, unique within the data set
+    path: str  # what ``open_sequence`` takes, ``tour:SEED`` included
+    layout: str  # likewise
+    # further options of ``open_sequence``, by name.
     opening: tuple[tuple[str, Any], ...] = field(default=(), compare=False)
 
     @property
@@ -49,11 +42,7 @@ class WorkItem:
         return f"{self.dataset}/{self.sequence}"
 
     def open(self) -> FrameSequence:
-        """Open it.
-
-        Raises:
-            FileNotFoundError, ValueError: it cannot be opened.
-        """
+        """Open it. Raises FileNotFoundError, ValueError: it cannot be opened."""
         from ufmstar_torch.eval.tour.open import open_sequence
 
         return open_sequence(self.path, self.layout, **dict(self.opening))
@@ -63,16 +52,12 @@ class WorkItem:
 class Shard:
     """One of several equal parts of the work.
 
-    Attributes:
-        index: which, from 1.
-        count: number of parts.
-
     Raises:
         ValueError: no such part.
     """
 
-    index: int = 1
-    count: int = 1
+    index: int = 1  # which, from 1
+    count: int = 1  # number of parts
 
     def __post_init__(self) -> None:
         if not 1 <= self.index <= self.count:
@@ -80,11 +65,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> Shard:
-        """From "i/n", i from 1 to n.
-
-        Raises:
-            ValueError: another form.
-        """
+        """From "i/n", i from 1 to n. Raises ValueError: another form."""
         match = _SHARD.fullmatch(text)
         if match is None:
             raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
@@ -96,11 +77,7 @@ class Shard:
 
 
 def find_work(
-    roots: Iterable[str],
-    *,
-    sample: int | None = None,
-    seed: int = 0,
-    only: Iterable[str] | None = None,
+    roots: Iterable[str], *, sample: int | None = None, seed: int = 0, only: Iterable[str] | None = None
 ) -> list[WorkItem]:
     """All sequences below the roots, sorted.
 

@@ -107,13 +107,9 @@ def _as_frame_numbers(names: Sequence[str], stamps: np.ndarray, timed: bool) -> 
 def attach_given(
     frames: Sequence[Entry | Skipped], root: Path, options: Options, times: np.ndarray | None = None
 ) -> list[Entry | Skipped]:
-    """A layout's frames with the poses of ``options.trajectory`` instead of their own; as they are without one.
-
-    Args:
-        frames: all frames on disk, in order; their own poses are not looked at (``UNKNOWN``).
-        root: the sequence's folder.
-        options: see :func:`attach`.
-        times: [N] of the frames [s]. With ``fps``, or without ``times``: frame number / fps.
+    """A layout's frames, all that are on disk, with the poses of ``options.trajectory`` instead of their own
+    (``UNKNOWN``); as they are without one. ``times`` [N] of the frames [s]: with ``fps``, or without ``times``, frame
+    number / fps.
 
     Raises:
         FileNotFoundError: no such trajectory.

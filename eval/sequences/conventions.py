@@ -34,11 +34,8 @@ CONVENTIONS = {
 
 
 def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
-    """The sequence with its poses, which were written so, as camera-to-world ones with our axes.
-
-    Raises:
-        ValueError: an unknown convention, or a sequence without poses.
-    """
+    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: an
+    unknown convention, or a sequence without poses."""
     if convention not in CONVENTIONS:
         raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
     if convention == OURS:

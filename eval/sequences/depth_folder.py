@@ -10,14 +10,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import pair_by_name
 from ufmstar_torch.eval.sequences.frame import FrameError
-from ufmstar_torch.eval.sequences.images import (
-    DEPTH_SUFFIXES,
-    SCALE_KEY,
-    check_scale,
-    list_files,
-    read_depth,
-    read_map,
-)
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, SCALE_KEY, check_scale, list_files, read_depth, read_map
 
 _VARIANCE_SUFFIXES = (".npy", ".npz", ".exr", ".tif", ".tiff")
 
@@ -90,20 +83,9 @@ class DepthFolder:
     def for_frames(
         self, names: Sequence[str], names_on_disk: Sequence[str] = (), selected: Sequence[str] | None = None
     ) -> DepthMaps:
-        """The maps of a sequence's frames: by stem, or by the numbers in the names, or else in sorted order.
-
-        Args:
-            names: the frames' names (:attr:`FrameSequence.names`).
-            names_on_disk: the same with the frames that the sequence skips (:attr:`FrameSequence.names_on_disk`);
-                sorted order counts on there being as many maps as one of the two, or as ``selected``.
-            selected: those of ``names`` whose maps are wanted, in order; None = all.
-
-        Returns:
-            The maps of ``selected``.
-
-        Raises:
-            ValueError: some frames have no map (they are listed).
-        """
+        """The maps of a sequence's frames (of those ``selected``, in order): by stem, or by the numbers in the names,
+        or else in sorted order, which counts on as many maps as ``names`` (the frames'), ``names_on_disk`` (with those
+        that the sequence skips) or ``selected`` has. Raises ValueError: some frames have no map (they are listed)."""
         expected = names if selected is None else selected
         orders = (names_on_disk or names, names, expected)
         depth = _paired(self.path, self.files, expected, orders)

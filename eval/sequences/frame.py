@@ -24,11 +24,8 @@ _MAX_PIXELS = 2**27
 
 
 def parse_size(text: str | None, option: str = "--size") -> Size | None:
-    """HxW as (H, W), None for None.
-
-    Raises:
-        ValueError: another form, or more pixels than an image can have; the message names ``option``.
-    """
+    """HxW as (H, W), None for None. Raises ValueError: another form, or more pixels than an image can have; the message
+    names ``option``."""
     if text is None:
         return None
     parts = text.lower().split("x")
@@ -226,11 +223,8 @@ def make_sequence(
 
 
 def parse_slice(text: str | None) -> slice:
-    """START:STOP:STEP as a slice of frames, any part of it left out.
-
-    Raises:
-        ValueError: another form, or a step below 1.
-    """
+    """START:STOP:STEP as a slice of frames, any part of it left out. Raises ValueError: another form, or a step below
+    1."""
     parts = (text or ":").split(":")
     try:
         numbers = [int(part) if part.strip() else None for part in parts]

@@ -59,20 +59,14 @@ def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.int
 
 
 def scaled_to_map(K: NDArray, image_size: Size | None, map_size: Size) -> NDArray:
-    """[3, 3] K of an image (H, W), for a map of the whole image at another size.
-
-    Raises:
-        ValueError: the aspect ratios differ, so that the map does not show the whole image.
-    """
+    """[3, 3] K of an image (H, W), for a map of the whole image at another size. Raises ValueError: the aspect ratios
+    differ, so that the map does not show the whole image."""
     return K if image_size is None else scale_intrinsics(K, image_size, map_size)
 
 
 def depth_camera(frame: Frame) -> NDArray:
-    """[3, 3] intrinsics of the frame's depth map [px].
-
-    Raises:
-        FrameError: depth and image have aspect ratios of their own, and no intrinsics are known for the depth.
-    """
+    """[3, 3] intrinsics of the frame's depth map [px]. Raises FrameError: depth and image have aspect ratios of their
+    own, and no intrinsics are known for the depth."""
     if frame.depth_intrinsics is not None or frame.depth is None or frame.image is None:
         return frame.intrinsics if frame.depth_intrinsics is None else frame.depth_intrinsics
     try:
@@ -82,16 +76,8 @@ def depth_camera(frame: Frame) -> NDArray:
 
 
 def truth_at(frame: Frame, K: NDArray, size: Size) -> NDArray | None:
-    """Ground truth [h, w] float32 [m] at the pixels of a prediction, 0 = none; None without a depth map.
-
-    Args:
-        frame: with its depth.
-        K: [3, 3] of the prediction [px].
-        size: (h, w) of the prediction.
-
-    Raises:
-        FrameError: see ``depth_camera``.
-    """
+    """Ground truth [h, w] float32 [m] at the pixels of a prediction with camera K [3, 3] [px] and ``size`` (h, w), 0 =
+    none; None without a depth map. Raises FrameError, see ``depth_camera``."""
     return None if frame.depth is None else resample_nearest(frame.depth, depth_camera(frame), K, size)
 
 
@@ -120,16 +106,8 @@ def register_depth(
 
 
 def project(points: np.ndarray, K: np.ndarray, size: Size) -> np.ndarray:
-    """The depth map of points: each pixel takes the nearest one that falls on it.
-
-    Args:
-        points: [3, N] in the camera's frame [m].
-        K: [3, 3] of the camera [px].
-        size: (H, W) of its images.
-
-    Returns:
-        ``size`` float32 depth along z [m], 0 where there is none.
-    """
+    """The depth map, ``size`` (H, W) float32 along z [m], of points [3, N] in the frame of a camera K [3, 3] [m, px]:
+    each pixel takes the nearest one that falls on it, 0 = none."""
     x, y, z = points[:, points[2] > 0]
     column = np.rint((K[0, 0] * x + K[0, 1] * y) / z + K[0, 2])
     row = np.rint(K[1, 1] * y / z + K[1, 2])

@@ -11,8 +11,9 @@ import re
 import struct
 import zipfile
 from collections.abc import Iterable
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from functools import lru_cache, partial
+from io import StringIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,7 +21,6 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ufmstar_torch.eval.sequences.exr import read_exr
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
@@ -34,14 +34,13 @@ _RGB, _GREY_16 = (8, 2, 0, 0, 0), (16, 0, 0, 0, 0)
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">8s8x2I5B")
 _MILLIMETRE = 1e-3
+# Names of a depth channel of an EXR file, best first; Blender prefixes its layer ("ViewLayer.Depth.Z").
+_DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
 
 
 def read_color(path: str | Path) -> np.ndarray:
-    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped).
-
-    Raises:
-        FrameError: missing, truncated, corrupt, or not an 8-bit image.
-    """
+    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped). Raises FrameError: missing, truncated,
+    corrupt, or not an 8-bit image."""
     return decode_color(path, path)
 
 
@@ -93,7 +92,7 @@ def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
     scale = None
     try:
         if suffix == ".exr":
-            values = read_exr(path)
+            values = _read_exr(path)
         elif suffix == ".npy":
             values = np.load(path, allow_pickle=False)
         elif suffix == ".npz":
@@ -110,11 +109,8 @@ def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
 
 
 def image_tensor(frame: Frame) -> torch.Tensor:
-    """The frame's image [1, 3, H, W] uint8 RGB, as a network's ``preprocess`` takes it.
-
-    Raises:
-        FrameError: the frame has no image.
-    """
+    """The frame's image [1, 3, H, W] uint8 RGB, as a network's ``preprocess`` takes it. Raises FrameError: the frame
+    has no image."""
     if frame.image is None:
         raise FrameError(frame.name, "no image")
     return torch.from_numpy(frame.image).permute(2, 0, 1)[None]
@@ -230,3 +226,41 @@ def _from_npz(path: Path, key: str) -> np.ndarray:
         if key not in names and len(names) != 1:
             raise KeyError(f"expected the key {key!r} or a single array, got {names}")
         return archive[key if key in names else names[0]]
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    """The depth channel of an OpenEXR file as [H, W] float32, values as stored.
+
+    It is the only channel, or the first one called Z, depth, V, Y or R (after a layer prefix).
+
+    Raises:
+        FrameError: not an OpenEXR file, truncated, a deep image, or no such channel.
+        ModuleNotFoundError: OpenEXR is not installed.
+    """
+    try:
+        import OpenEXR
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("EXR files need OpenEXR: pip install 'ufmstar-torch[eval]'") from error
+    try:
+        with redirect_stdout(StringIO()):  # the library prints a remark on damaged files
+            parts = OpenEXR.File(str(path), separate_channels=True).parts
+        if not parts:
+            raise ValueError("no pixels can be decoded")
+        channels = {name: channel for part in parts for name, channel in part.channels.items()}
+        channel = channels[_depth_channel(list(channels))]
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise FrameError(path, f"cannot be decoded as OpenEXR: {error}") from error
+    pixels = channel.pixels
+    if pixels.ndim != 2 or pixels.dtype == object or (channel.xSampling, channel.ySampling) != (1, 1):
+        raise FrameError(path, "cannot be decoded as OpenEXR: the depth channel is deep or subsampled")
+    return np.asarray(pixels, dtype=np.float32)
+
+
+def _depth_channel(names: list[str]) -> str:
+    if len(names) == 1:
+        return names[0]
+    for wanted in _DEPTH_NAMES:
+        matching = [name for name in names if name.rsplit(".", 1)[-1].lower() == wanted.lower()]
+        if len(matching) == 1:
+            return matching[0]
+    raise ValueError(f"no channel is the depth: expected one of {_DEPTH_NAMES}, got {names}")

@@ -20,11 +20,8 @@ _ASPECT_TOLERANCE = 0.02
 
 
 def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
-    """[3, 3] float64 [px] from a text file or numbers: 3x3, 4x4, 3x4, or ``fx fy cx cy``.
-
-    Raises:
-        ValueError: the file or array has another shape.
-    """
+    """[3, 3] float64 [px] from a text file or numbers: 3x3, 4x4, 3x4, or ``fx fy cx cy``. Raises ValueError: the file
+    or array has another shape."""
     if isinstance(source, str | Path):
         values, source_name = read_matrix(source), f"intrinsics file {source}"
     else:
@@ -40,10 +37,7 @@ def read_intrinsics(source: IntrinsicsLike) -> np.ndarray:
 
 def parse_intrinsics(words: Sequence[str], option: str) -> str | list[float] | None:
     """Words of a command line as :func:`read_intrinsics` takes them: a file, or fx, fy, cx, cy [px]; None for no words.
-
-    Raises:
-        ValueError: neither; the message names ``option``.
-    """
+    Raises ValueError: neither; the message names ``option``."""
     if len(words) <= 1:
         return words[0] if words else None
     try:
@@ -77,11 +71,8 @@ def depth_camera_matrix(
 
 
 def scale_intrinsics(K: np.ndarray, old: Size, new: Size) -> np.ndarray:
-    """K [3, 3] of images (H, W) ``old`` after they were resized to ``new``.
-
-    Raises:
-        ValueError: the aspect ratios differ, so that the images were not only resized.
-    """
+    """K [3, 3] of images (H, W) ``old`` after they were resized to ``new``. Raises ValueError: the aspect ratios
+    differ, so that the images were not only resized."""
     if old == new:
         return K.copy()
     if abs((new[1] / new[0]) / (old[1] / old[0]) - 1) > _ASPECT_TOLERANCE:

@@ -285,10 +285,7 @@ def _affine(values: np.ndarray, path: Path) -> np.ndarray:
 
 def read_scan(path: Path) -> np.ndarray:
     """[3, N] float64 points of a scan in the laser's frame [m], without the car's own and those that are not finite.
-
-    Raises:
-        FrameError: the file is missing, or its size is not that of a scan.
-    """
+    Raises FrameError: the file is missing, or its size is not that of a scan."""
     try:
         values = np.fromfile(path, "<f4")
     except OSError as error:

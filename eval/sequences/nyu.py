@@ -68,11 +68,8 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def read_h5(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """``rgb`` [3, H, W] uint8 and ``depth`` [H, W] floating-point [m] as they are; nothing stays open.
-
-    Raises:
-        FrameError: it cannot be read, lacks one of them, or they have other types or shapes.
-    """
+    """``rgb`` [3, H, W] uint8 and ``depth`` [H, W] floating-point [m] as they are; nothing stays open. Raises
+    FrameError: it cannot be read, lacks one of them, or they have other types or shapes."""
     import h5py
 
     try:

@@ -75,11 +75,8 @@ class Options:
 
 
 def resolve(root: Path, given: str | Path) -> Path:
-    """A path as the user gave it: inside the sequence's folder, or else from the working folder.
-
-    Raises:
-        FileNotFoundError: it is in neither.
-    """
+    """A path as the user gave it: inside the sequence's folder, or else from the working folder. Raises
+    FileNotFoundError: it is in neither."""
     for path in (root / given, Path(given)):
         if path.exists():
             return path

@@ -24,11 +24,8 @@ class OwnOutput(NamedTuple):
 
 
 def own_output(path: Path) -> OwnOutput | None:
-    """The output of a run in a folder, or around it where it is OUT/frames or OUT/depth; None: it is none.
-
-    Raises:
-        ValueError: a line of frames.jsonl is none of a run's; file and line are named.
-    """
+    """The output of a run in a folder, or around it where it is OUT/frames or OUT/depth; None: it is none. Raises
+    ValueError: a line of frames.jsonl is none of a run's; file and line are named."""
     for out in (path, path.parent) if path.name in ("frames", "depth") else (path,):
         if (out / JOURNAL).is_file() and (out / "frames").is_dir():
             records = read_journal((out / JOURNAL).read_bytes(), out / JOURNAL)
@@ -43,11 +40,7 @@ def own_output(path: Path) -> OwnOutput | None:
 
 def read_journal(content: bytes, file: Path) -> list[dict]:
     """The lines of frames.jsonl, each with "name" and "state", and "intrinsics" or "reason"; ``file`` names it in
-    messages.
-
-    Raises:
-        ValueError: another line; it is named.
-    """
+    messages. Raises ValueError: another line; it is named."""
     records = []
     for number, line in enumerate(content.splitlines(), start=1):
         try:

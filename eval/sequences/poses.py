@@ -60,15 +60,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
         ValueError: a line (named by file and number) is no pose of a known format, the number of columns
             changes, a quaternion's norm is not 1, a bottom row is not 0 0 0 1; or there is no pose at all.
     """
-    rows: list[list[float]] = []
-    lines: list[str] = []
-    for number, text in numbered_lines(path):
-        content = _strip_comment(text)
-        if content:
-            where = f"{path}:{number}"
-            rows.append([_number(token, where) for token in content.split()])
-            lines.append(where)
-            _check_columns(len(rows[-1]), len(rows[0]), where)
+    rows, lines = _numbers(path)
+    for row, where in zip(rows, lines, strict=True):
+        _check_columns(len(row), len(rows[0]), where)
     if not rows:
         raise ValueError(f"{path}: no pose found, expected lines of 7, 8, 12, 13, 16 or 17 numbers")
     values = np.array(rows, dtype=np.float64)
@@ -142,28 +136,18 @@ def associate(first: np.ndarray, second: np.ndarray, max_difference: float) -> d
 
 
 def read_matrix(path: str | Path) -> np.ndarray:
-    """The numbers of a small text file, one row per line, [R, C] float64; non-finite ones are kept.
-
-    Raises:
-        ValueError: a line holds something else than numbers, or lines differ in length.
-    """
-    rows: list[list[float]] = []
-    for number, text in numbered_lines(path):
-        where = f"{path}:{number}"
-        row = [_number(token, where) for token in _strip_comment(text).split()]
-        if row and rows and len(row) != len(rows[0]):
+    """The numbers of a small text file, one row per line, [R, C] float64; non-finite ones are kept. Raises ValueError:
+    a line holds something else than numbers, or lines differ in length."""
+    rows, lines = _numbers(path)
+    for row, where in zip(rows, lines, strict=True):
+        if len(row) != len(rows[0]):
             raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first line, got {len(row)}")
-        if row:
-            rows.append(row)
     return np.array(rows, dtype=np.float64)
 
 
 def read_pose(path: str | Path) -> np.ndarray:
-    """The camera-to-world pose [4, 4] of a file with one 4x4 matrix; all NaN if an entry is not finite.
-
-    Raises:
-        ValueError: the file does not hold 4x4 numbers with the bottom row 0 0 0 1.
-    """
+    """The camera-to-world pose [4, 4] of a file with one 4x4 matrix; all NaN if an entry is not finite. Raises
+    ValueError: the file does not hold 4x4 numbers with the bottom row 0 0 0 1."""
     T = read_matrix(path)
     if T.shape != (4, 4):
         raise ValueError(f"{path}: expected a 4x4 matrix, got {' x '.join(map(str, T.shape))} numbers")
@@ -179,11 +163,7 @@ def poses_from_quaternions(position: np.ndarray, quaternion_xyzw: np.ndarray) ->
 
 
 def numbered_lines(path: str | Path) -> list[tuple[int, str]]:
-    """Line numbers from 1, and the lines of a text file.
-
-    Raises:
-        ValueError: it is no text file (UTF-8).
-    """
+    """Line numbers from 1, and the lines of a text file. Raises ValueError: it is no text file (UTF-8)."""
     try:
         return list(enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1))
     except UnicodeDecodeError as error:
@@ -222,9 +202,16 @@ def _check_columns(count: int, expected: int, where: str) -> None:
         raise ValueError(f"{where}: expected {expected} numbers as in the first pose, got {count}")
 
 
-def _strip_comment(text: str) -> str:
-    """The line without its comment; a ``#`` inside a token (Windows' 1.#IND) starts none."""
-    return re.split(r"(?:^|\s)#", text, maxsplit=1)[0].strip()
+def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:
+    """The numbers of each line that has any, and FILE:LINE of each; a ``#`` inside a token (Windows' 1.#IND) starts no
+    comment."""
+    rows, lines = [], []
+    for number, text in numbered_lines(path):
+        tokens, where = re.split(r"(?:^|\s)#", text, maxsplit=1)[0].split(), f"{path}:{number}"
+        if tokens:
+            rows.append([_number(token, where) for token in tokens])
+            lines.append(where)
+    return rows, lines
 
 
 def _number(token: str, where: str) -> float:

@@ -57,13 +57,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         file = path / "intrinsic" / "intrinsic_depth.txt"
         K_depth = _intrinsics(options.depth_intrinsics, file, _NATIVE_DEPTH, size)
     return make_sequence(
-        path.resolve().name,
-        "scannet",
-        frames,
-        K,
-        image_size=color_size,
-        depth_intrinsics=K_depth,
-        depth_size=size,
+        path.resolve().name, "scannet", frames, K, image_size=color_size, depth_intrinsics=K_depth, depth_size=size
     )
 
 

@@ -107,11 +107,8 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _read_header(file: BinaryIO, path: Path) -> SensHeader:
-    """The header of a file that is opened at its beginning; the frames follow.
-
-    Raises:
-        ValueError: it is cut off, of another version, holds impossible values, or compressions that are not read here.
-    """
+    """The header of a file that is opened at its beginning; the frames follow. Raises ValueError: it is cut off, of
+    another version, holds impossible values, or compressions that are not read here."""
     version = _unpack(file, path, "<I")[0]
     if version != _VERSION:
         raise ValueError(f"{path}: expected version {_VERSION} of the .sens format, got {version}")

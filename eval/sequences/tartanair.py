@@ -37,12 +37,8 @@ def detect(path: Path) -> bool:
 
 
 def read(path: Path, options: Options) -> FrameSequence:
-    """Opens a TartanAir trajectory (left camera). A given ``trajectory`` has our axes already.
-
-    Raises:
-        ValueError: no usable frame; several trajectories below ``path``; another number of poses than of
-            images; a malformed pose line.
-    """
+    """Opens a TartanAir trajectory (left camera). A given ``trajectory`` has our axes already. Raises ValueError: no
+    usable frame; several trajectories below ``path``; another number of poses than of images; a malformed pose line."""
     folders = trajectory_folders(path)
     if len(folders) > 1:
         raise ValueError(f"{path} holds the trajectories {[folder.name for folder in folders]}: open one of them")

@@ -23,11 +23,7 @@ LOOKED_FOR = "rgb.txt and groundtruth.txt"
 SCALE = 1 / 5000
 _NATIVE_SIZE = (480, 640)
 # The colour cameras' published calibration, by robot; their distortion is left in the images.
-_INTRINSICS = {
-    "1": (517.3, 516.5, 318.6, 255.3),
-    "2": (520.9, 521.0, 325.1, 249.7),
-    "3": (535.4, 539.2, 320.1, 247.6),
-}
+_INTRINSICS = {"1": (517.3, 516.5, 318.6, 255.3), "2": (520.9, 521.0, 325.1, 249.7), "3": (535.4, 539.2, 320.1, 247.6)}
 
 
 def detect(path: Path) -> bool:
@@ -68,11 +64,8 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def read_file_list(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Timestamps [N] [s] and file names of lines ``timestamp filename``; ``#`` starts a comment line.
-
-    Raises:
-        ValueError: a line (named by file and number) has another form.
-    """
+    """Timestamps [N] [s] and file names of lines ``timestamp filename``; ``#`` starts a comment line. Raises
+    ValueError: a line (named by file and number) has another form."""
     times, files = [], []
     for number, text in numbered_lines(path):
         words = text.split(maxsplit=1)

@@ -53,11 +53,8 @@ class Video:
         return self._length
 
     def read(self, index: int) -> np.ndarray:
-        """Frame ``index`` as [H, W, 3] uint8 RGB.
-
-        Raises:
-            FrameError: the file ends, or cannot be decoded, before that frame.
-        """
+        """Frame ``index`` as [H, W, 3] uint8 RGB. Raises FrameError: the file ends, or cannot be decoded, before that
+        frame."""
         if self._capture is None or index < self._next:
             self._capture = self._open()
             self._next = 0

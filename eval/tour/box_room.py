@@ -22,23 +22,15 @@ _IN_FRONT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class BoxRoom:
-    """Axis-aligned boxes inside an axis-aligned box, seen from within.
+    """Axis-aligned boxes inside an axis-aligned box, seen from within."""
 
-    Attributes:
-        walls: [2, 3] lower and upper corner of the room [m].
-        boxes: [N, 2, 3] the same of the things in it.
-    """
-
-    walls: Array
-    boxes: Array
+    walls: Array  # [2, 3] lower and upper corner of the room [m]
+    boxes: Array  # [N, 2, 3] the same of the things in it
 
     @classmethod
     def furnished(cls, boxes: int = 60, seed: int = 0) -> BoxRoom:
-        """A room of 7 x 2.8 x 7 m whose floor and walls are lined with boxes; the middle stays free to walk.
-
-        Raises:
-            ValueError: a negative number of boxes.
-        """
+        """A room of 7 x 2.8 x 7 m whose floor and walls are lined with boxes; the middle stays free to walk. Raises
+        ValueError: a negative number of boxes."""
         if boxes < 0:
             raise ValueError(f"boxes must not be negative, got {boxes}")
         rng = np.random.default_rng(seed)
@@ -88,11 +80,8 @@ def walk(frames: int, period: int = 100) -> Iterator[Array]:
 
 
 def render(room: BoxRoom, T_world_cam: Array, K: Array, height: int, width: int) -> Array:
-    """Exact depth [height, width] along the optical axis [m] of the room, from a camera inside it.
-
-    Raises:
-        ValueError: the camera stands outside the room or inside a box.
-    """
+    """Exact depth [height, width] along the optical axis [m] of the room, from a camera inside it. Raises ValueError:
+    the camera stands outside the room or inside a box."""
     origin = T_world_cam[:3, 3]
     inside = ((room.boxes[:, 0] < origin) & (origin < room.boxes[:, 1])).all(-1)
     if not ((room.walls[0] < origin) & (origin < room.walls[1])).all() or inside.any():
@@ -110,13 +99,8 @@ def render(room: BoxRoom, T_world_cam: Array, K: Array, height: int, width: int)
 
 
 def flicker(depth: Array, amount: float, rng: np.random.Generator) -> Array:
-    """What a network makes of a depth map: a smooth random relative error, new in every frame.
-
-    Args:
-        depth: [H, W] [m].
-        amount: its standard deviation relative to the depth.
-        rng: where the error comes from.
-    """
+    """What a network makes of a depth map [H, W] [m]: a smooth random relative error of standard deviation ``amount``,
+    new in every frame."""
     height, width = depth.shape
     y, x = np.linspace(0, 1, height)[:, None], np.linspace(0, 1, width)[None]
     a, b, c = rng.normal(size=3)

@@ -23,46 +23,26 @@ _HALL_FROM = 7.0  # rooms with a side from here on are stock as halls [m]
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A lamp's or a window's light.
+    """A lamp's or a window's light."""
 
-    Attributes:
-        position: [3] [m].
-        color: [3] linear RGB at the distance ``reach``, facing it.
-        reach: [m].
-        size: how far its parts lie apart, which softens shadows [m].
-    """
-
-    position: Array
-    color: Array
-    reach: float
-    size: float
+    position: Array  # [3] [m]
+    color: Array  # [3] linear RGB at the distance ``reach``, facing it
+    reach: float  # [m]
+    size: float  # how far its parts lie apart, which softens shadows [m]
 
 
 @dataclass(eq=False)
 class Furnished:
-    """What a room holds; it grows while the room is stock.
+    """What a room holds; it grows while the room is stock."""
 
-    Attributes:
-        parts: primitives.
-        lights: at most ``LIGHTS``.
-        taken: [2, 3] lower and upper corners of the space that is taken [m].
-    """
-
-    parts: list[Part] = field(default_factory=list)
-    lights: list[Light] = field(default_factory=list)
-    taken: list[Array] = field(default_factory=list)
+    parts: list[Part] = field(default_factory=list)  # primitives
+    lights: list[Light] = field(default_factory=list)  # at most ``LIGHTS``
+    taken: list[Array] = field(default_factory=list)  # [2, 3] lower and upper corners of the space that is taken [m]
 
 
 def furnish(room: Room, doors: list[Door], way: Array, palette: Palette, rng: np.random.Generator) -> Furnished:
-    """Furnishes a room.
-
-    Args:
-        room: its shell.
-        doors: those of this room.
-        way: [M, 2] x and z of all points where a camera may be [m].
-        palette: of the room.
-        rng: where the draws come from.
-    """
+    """Furnishes a room, whose doors are given, clear of ``way`` [M, 2], x and z of all points where a camera may be
+    [m]."""
     stock = Furnished()
     for door in doors:
         across = door.along * (door.width / 2 + 0.15) + np.abs(door.normal) * 0.5

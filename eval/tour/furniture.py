@@ -17,16 +17,11 @@ from ufmstar_torch.eval.tour.shapes import Finish, Part, ball, box, tilt, tube, 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A piece of furniture.
+    """A piece of furniture."""
 
-    Attributes:
-        name: what it is.
-        parts: its primitives.
-        width, depth, height: the space it takes [m].
-    """
-
-    name: str
-    parts: list[Part]
+    name: str  # what it is
+    parts: list[Part]  # its primitives
+    # width, depth, height: the space it takes [m].
     width: float
     depth: float
     height: float

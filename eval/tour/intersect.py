@@ -6,8 +6,6 @@ alone, so with directions of camera z = 1, t is the depth. A miss is infinity.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -23,14 +21,9 @@ _MISS = float("inf")
 
 
 def entry(kind: int, origin: Scalars, direction: Components, taper: float) -> Tensor:
-    """The ray parameter t > 0 at which rays first meet a unit shape from outside; infinity where they miss it.
-
-    Args:
-        kind: QUAD, BOX, ELLIPSOID or FRUSTUM.
-        origin: x, y, z of the rays' common origin, or of one origin per ray.
-        direction: x, y, z of the rays' directions, any shape.
-        taper: of a frustum.
-    """
+    """The ray parameter t > 0 at which rays first meet a unit shape (QUAD, BOX, ELLIPSOID or FRUSTUM with its
+    ``taper``) from outside; infinity where they miss it. Origin and direction are x, y, z, the origin common to all
+    rays or one per ray."""
     return _ENTRIES[kind](origin, direction, taper)
 
 
@@ -88,9 +81,4 @@ def _frustum(o: Scalars, d: Components, taper: float) -> Tensor:
     return best
 
 
-_ENTRIES: dict[int, Callable[[Scalars, Components, float], Tensor]] = {
-    QUAD: _quad,
-    BOX: _box,
-    ELLIPSOID: _ellipsoid,
-    FRUSTUM: _frustum,
-}
+_ENTRIES = {QUAD: _quad, BOX: _box, ELLIPSOID: _ellipsoid, FRUSTUM: _frustum}

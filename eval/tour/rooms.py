@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,18 +23,13 @@ _TRIES = 400
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """A rectangle of floor with walls up to a ceiling.
+    """A rectangle of floor with walls up to a ceiling."""
 
-    Attributes:
-        lower, upper: [2] x and z of its corners [m].
-        height: of the ceiling [m].
-        style: how it is furnished.
-    """
-
+    # lower, upper: [2] x and z of its corners [m].
     lower: Array
     upper: Array
-    height: float
-    style: TourStyle
+    height: float  # of the ceiling [m]
+    style: TourStyle  # how it is furnished
 
     @property
     def centre(self) -> Array:
@@ -44,22 +39,15 @@ class Room:
 
 @dataclass(frozen=True, eq=False)
 class Door:
-    """An opening in the wall between two rooms.
+    """An opening in the wall between two rooms."""
 
-    Attributes:
-        rooms: the earlier and the later room.
-        middle: [2] x and z of its middle, halfway through the wall [m].
-        normal: [2] unit vector from the earlier into the later room.
-        width, height: of the opening [m].
-        thickness: of the wall [m].
-    """
-
-    rooms: tuple[int, int]
-    middle: Array
-    normal: Array
+    rooms: tuple[int, int]  # the earlier and the later room
+    middle: Array  # [2] x and z of its middle, halfway through the wall [m]
+    normal: Array  # [2] unit vector from the earlier into the later room
+    # width, height: of the opening [m].
     width: float
     height: float
-    thickness: float
+    thickness: float  # of the wall [m]
 
     @property
     def along(self) -> Array:
@@ -133,16 +121,17 @@ def shell(index: int, room: Room, doors: list[Door], palette: Palette) -> Iterat
     x, z = room.centre
     half = (room.upper - room.lower) / 2 + _OVERLAP
     own = (index, -1)
-    yield _in_rooms(part(QUAD, (x, 0, z), (half[0], 1, half[1]), palette.finish("floor"), label="floor"), own)
+    floor = part(QUAD, (x, 0, z), (half[0], 1, half[1]), palette.finish("floor"), label="floor")
+    yield replace(floor, rooms=own)
     over = np.diag([1.0, -1.0, -1.0])
     ceiling = part(QUAD, (x, -room.height, z), (half[0], 1, half[1]), palette.finish("ceiling"), over, label="ceiling")
-    yield _in_rooms(ceiling, own)
+    yield replace(ceiling, rooms=own)
     usual, special, board = palette.finish("wall"), palette.finish("wall"), palette.finish("paint")
     accent = int(room.lower.sum() * 1000) % 4
     for number, (axis, sign) in enumerate(((0, -1), (0, 1), (1, -1), (1, 1))):
         finish = special if number == accent else usual
         for piece in _wall(room, axis, sign, _openings(index, room, axis, sign, doors), finish, board):
-            yield _in_rooms(piece, own)
+            yield replace(piece, rooms=own)
 
 
 def _openings(index: int, room: Room, axis: int, sign: int, doors: list[Door]) -> list[tuple[float, float, float]]:
@@ -194,15 +183,10 @@ def frame(door: Door, finish: Finish) -> Iterator[Part]:
 
     def piece(offset: float, y: float, half_along: float, half_y: float, half_through: float) -> Part:
         centre, half = door.middle + a * offset, a * half_along + n * half_through
-        return _in_rooms(
-            part(BOX, (centre[0], y, centre[1]), (half[0], half_y, half[1]), finish, label="door"), door.rooms
-        )
+        own = part(BOX, (centre[0], y, centre[1]), (half[0], half_y, half[1]), finish, label="door")
+        return replace(own, rooms=door.rooms)
 
     for side in (-1, 1):
         yield piece(side * (door.width / 2 + 0.015), -door.height / 2, 0.035, door.height / 2 + 0.03, through)
     yield piece(0.0, -door.height - 0.015, door.width / 2 + 0.05, 0.035, through)
     yield piece(0.0, 0.005, door.width / 2, 0.013, through - 0.005)
-
-
-def _in_rooms(piece: Part, rooms: tuple[int, int]) -> Part:
-    return Part(piece.kind, piece.centre, piece.half, piece.finish, piece.rotation, piece.taper, rooms, piece.label)

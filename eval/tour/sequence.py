@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +24,7 @@ class _Renderer:
 
     def __init__(self, tour: Tour, poses: torch.Tensor, K: np.ndarray, size: Size, sensor: bool) -> None:
         self._tour, self._poses, self._K, self._size, self._sensor = tour, poses, torch.from_numpy(K), size, sensor
-        self._kept: OrderedDict[int, TourView] = OrderedDict()
+        self._kept: dict[int, TourView] = {}
 
     def image(self, index: int) -> np.ndarray:
         """[H, W, 3] uint8 RGB."""
@@ -38,10 +37,9 @@ class _Renderer:
     def _view(self, index: int) -> TourView:
         if index not in self._kept:
             seed = self._tour.seed * 1_000_003 + index if self._sensor else None
-            view = render(self._tour, self._poses[index], self._K, *self._size, frame_seed=seed)
-            self._kept[index] = view
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
+            self._kept[index] = render(self._tour, self._poses[index], self._K, *self._size, frame_seed=seed)
+            if len(self._kept) > _KEPT:
+                del self._kept[next(iter(self._kept))]
         return self._kept[index]
 
 

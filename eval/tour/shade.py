@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -24,34 +23,19 @@ _CAP = 1e-3  # how near to a frustum's end a point is on its cap, in unit coordi
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where pixels see a surface; P of them, float32, pixels of the same room, kind and texture side by side.
+    """Where pixels see a surface; P of them, float32, pixels of the same room, kind and texture side by side."""
 
-    Attributes:
-        surface: [P] int64.
-        point: [3, P] [m].
-        normal: [3, P] unit, towards the camera.
-        uv: [2, P] coordinates on the surface [m].
-        footprint: [P] size of a pixel there [m].
-    """
-
-    surface: Tensor
-    point: Tensor
-    normal: Tensor
-    uv: Tensor
-    footprint: Tensor
+    surface: Tensor  # [P] int64
+    point: Tensor  # [3, P] [m]
+    normal: Tensor  # [3, P] unit, towards the camera
+    uv: Tensor  # [2, P] coordinates on the surface [m]
+    footprint: Tensor  # [P] size of a pixel there [m]
 
 
 def shade(tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float) -> Tensor:
-    """[3, P] linear RGB, about 0 to 1.
-
-    Args:
-        tour: what is seen.
-        surface: [P] int64 which primitive.
-        depth: [P] float32 along z [m].
-        direction: [3, P] float32 of the rays, with depth 1.
-        origin: [3] of the camera [m].
-        pixel_angle: size of a pixel at depth 1 [m].
-    """
+    """[3, P] linear RGB, about 0 to 1, of pixels that see the primitives ``surface`` [P] int64 of a tour at ``depth``
+    [P] float32 along z [m], on rays ``direction`` [3, P] float32 (of depth 1) from ``origin`` [3] [m]; ``pixel_angle``
+    is the size of a pixel at depth 1 [m]."""
     s = tour.surfaces
     group, order = torch.sort((s.rooms[:, 0] * 4 + s.kind)[surface] * _TEXTURES + s.texture[surface], stable=True)
     values, counts = torch.unique_consecutive(group, return_counts=True)
@@ -77,13 +61,7 @@ def _merged(spans: list[Span], divisor: int) -> list[Span]:
 
 
 def _hits(
-    tour: Tour,
-    surface: Tensor,
-    depth: Tensor,
-    direction: Tensor,
-    origin: Tensor,
-    pixel_angle: float,
-    kinds: list[Span],
+    tour: Tour, surface: Tensor, depth: Tensor, direction: Tensor, origin: Tensor, pixel_angle: float, kinds: list[Span]
 ) -> Hits:
     s = tour.surfaces
     geometry = torch.cat([s.rotation.flatten(1), s.centre, s.half, s.taper[:, None]], dim=1).float().T.contiguous()
@@ -140,12 +118,7 @@ def _frustum(q: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(cap, flat, side), uv
 
 
-_LOCAL: dict[int, Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]] = {
-    QUAD: _quad,
-    BOX: _box,
-    ELLIPSOID: _ellipsoid,
-    FRUSTUM: _frustum,
-}
+_LOCAL = {QUAD: _quad, BOX: _box, ELLIPSOID: _ellipsoid, FRUSTUM: _frustum}
 
 
 def _albedo(tour: Tour, hits: Hits, spans: list[Span]) -> Tensor:

@@ -26,71 +26,44 @@ NOBODY = -1
 
 @dataclass(frozen=True)
 class Finish:
-    """How a surface looks.
+    """How a surface looks."""
 
-    Attributes:
-        texture: one of ``TEXTURES``.
-        first, second: its two colours, linear RGB in [0, 1].
-        period: of the pattern [m].
-        glow: light of its own, 0 = none.
-    """
-
-    texture: str = "plain"
+    texture: str = "plain"  # one of ``TEXTURES``
+    # first, second: its two colours, linear RGB in [0, 1].
     first: tuple[float, float, float] = (0.5, 0.5, 0.5)
     second: tuple[float, float, float] = (0.3, 0.3, 0.3)
-    period: float = 0.3
-    glow: float = 0.0
+    period: float = 0.3  # of the pattern [m]
+    glow: float = 0.0  # light of its own, 0 = none
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One primitive while a tour is built.
+    """One primitive while a tour is built."""
 
-    Attributes:
-        kind: QUAD, BOX, ELLIPSOID or FRUSTUM.
-        centre: [3] [m].
-        half: [3] half its extent along its own axes [m]; a quad's is (x, 1, z).
-        finish: how it looks.
-        rotation: [3, 3] its axes in the world, as columns.
-        taper: of a frustum.
-        rooms: the one or two rooms from which it can be seen directly.
-        label: what it is part of.
-    """
-
-    kind: int
-    centre: Array
-    half: Array
-    finish: Finish
-    rotation: Array
-    taper: float = 1.0
-    rooms: tuple[int, int] = (0, NOBODY)
-    label: str = ""
+    kind: int  # QUAD, BOX, ELLIPSOID or FRUSTUM
+    centre: Array  # [3] [m]
+    half: Array  # [3] half its extent along its own axes [m]; a quad's is (x, 1, z)
+    finish: Finish  # how it looks
+    rotation: Array  # [3, 3] its axes in the world, as columns
+    taper: float = 1.0  # of a frustum
+    rooms: tuple[int, int] = (0, NOBODY)  # the one or two rooms from which it can be seen directly
+    label: str = ""  # what it is part of
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The primitives of a tour as tensors; N of them.
+    """The primitives of a tour as tensors; N of them."""
 
-    Attributes:
-        kind: [N] int64.
-        centre: [N, 3] float64 [m].
-        half: [N, 3] float64 [m].
-        rotation: [N, 3, 3] float64.
-        taper: [N] float64.
-        rooms: [N, 2] int64.
-        texture: [N] int64, index into ``TEXTURES``.
-        corners: [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m].
-        look: [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m].
-    """
-
-    kind: Tensor
-    centre: Tensor
-    half: Tensor
-    rotation: Tensor
-    taper: Tensor
-    rooms: Tensor
-    texture: Tensor
+    kind: Tensor  # [N] int64
+    centre: Tensor  # [N, 3] float64 [m]
+    half: Tensor  # [N, 3] float64 [m]
+    rotation: Tensor  # [N, 3, 3] float64
+    taper: Tensor  # [N] float64
+    rooms: Tensor  # [N, 2] int64
+    texture: Tensor  # [N] int64, index into ``TEXTURES``
+    # [N, 8, 3] float64 of the boxes around them, by signs along x, y, z as binary digits [m].
     corners: Tensor
+    # [N, 10] float32: two colours, period [m], glow, and two random offsets of the pattern [m].
     look: Tensor
 
     def __len__(self) -> int:

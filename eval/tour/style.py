@@ -13,18 +13,8 @@ Range = tuple[float, float]
 
 # The two sets are disjoint on purpose: a texture of the second is something a network never saw.
 HOME_TEXTURES = (
-    "plain",
-    "plaster",
-    "wood",
-    "checks",
-    "stripes",
-    "tiles",
-    "bricks",
-    "fabric",
-    "books",
-    "painting",
-    "window",
-)
+    "plain", "plaster", "wood", "checks", "stripes", "tiles", "bricks", "fabric", "books", "painting", "window"
+)  # fmt: skip
 HALL_TEXTURES = ("dots", "zigzag", "marble", "terrazzo", "hexagons", "rings")
 TEXTURES = HOME_TEXTURES + HALL_TEXTURES
 
@@ -85,11 +75,7 @@ class TourStyle:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TourStyle:
-        """From plain values.
-
-        Raises:
-            ValueError: an unknown name, or a value out of its range.
-        """
+        """From plain values. Raises ValueError: an unknown name, or a value out of its range."""
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
             raise ValueError(f"unknown field {unknown} of TourStyle, expected some of {[f.name for f in fields(cls)]}")
@@ -130,11 +116,7 @@ STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED}
 
 
 def style_of(style: str | TourStyle) -> TourStyle:
-    """A style by its name.
-
-    Raises:
-        ValueError: no such name.
-    """
+    """A style by its name. Raises ValueError: no such name."""
     if isinstance(style, TourStyle):
         return style
     if style not in STYLES:

@@ -21,24 +21,19 @@ _POSITIVE = 4096.0  # cells added so that truncation rounds down; a multiple of 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Pixels that see one kind of texture; P of them.
+    """Pixels that see one kind of texture; P of them."""
 
-    Attributes:
-        u, v: [P] coordinates on the surface [periods], shifted at random.
-        own_u, own_v: [P] the same from the surface's middle.
-        pixel: [P] size of a pixel there [periods].
-        first, second: [3, P] the texture's colours.
-        table: see :func:`noise_table`.
-    """
-
+    # u, v: [P] coordinates on the surface [periods], shifted at random.
     u: Tensor
     v: Tensor
+    # own_u, own_v: [P] the same from the surface's middle.
     own_u: Tensor
     own_v: Tensor
-    pixel: Tensor
+    pixel: Tensor  # [P] size of a pixel there [periods]
+    # first, second: [3, P] the texture's colours.
     first: Tensor
     second: Tensor
-    table: Tensor
+    table: Tensor  # see :func:`noise_table`
 
     def mixed(self, share: Tensor, mean: float = 0.5) -> Tensor:
         """[3, P] from the first to the second colour; ``mean`` where the pattern is too fine to be seen."""
@@ -205,22 +200,8 @@ def _rings(p: Patch) -> Tensor:
     return p.mixed(_square(4 * (u * u + v * v).sqrt(), p.pixel))
 
 
-_PATTERNS: dict[str, Callable[[Patch], Tensor]] = {
-    "plain": _plain,
-    "plaster": _plaster,
-    "wood": _wood,
-    "checks": _checks,
-    "stripes": _stripes,
-    "tiles": _tiles,
-    "bricks": _bricks,
-    "fabric": _fabric,
-    "books": _books,
-    "painting": _painting,
-    "window": _window,
-    "dots": _dots,
-    "zigzag": _zigzag,
-    "marble": _marble,
-    "terrazzo": _terrazzo,
-    "hexagons": _hexagons,
-    "rings": _rings,
-}
+_FUNCTIONS: tuple[Callable[[Patch], Tensor], ...] = (
+    _plain, _plaster, _wood, _checks, _stripes, _tiles, _bricks, _fabric, _books, _painting, _window,
+    _dots, _zigzag, _marble, _terrazzo, _hexagons, _rings,
+)  # fmt: skip
+_PATTERNS = {function.__name__.removeprefix("_"): function for function in _FUNCTIONS}

@@ -33,13 +33,7 @@ class TourView:
 
 
 def render(
-    tour: Tour,
-    T_world_cam: Tensor,
-    K: Tensor,
-    height: int,
-    width: int,
-    *,
-    frame_seed: int | None = None,
+    tour: Tour, T_world_cam: Tensor, K: Tensor, height: int, width: int, *, frame_seed: int | None = None
 ) -> TourView:
     """Renders one view, on the tour's device.
 

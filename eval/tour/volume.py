@@ -20,15 +20,8 @@ _SMALL = 0.05  # half extents below this cast no shadow worth a ray [m]
 
 
 def light_volumes(rooms: Tensor, surfaces: Surfaces, lights: Tensor, sizes: Tensor, casts: Tensor) -> Tensor:
-    """[R, L, *GRID] float32 share of each light in [0, 1] at a room's points.
-
-    Args:
-        rooms: [R, 2, 3] corners [m].
-        surfaces: the primitives.
-        lights: [R, L, 7] positions first [m].
-        sizes: [R, L] of the lights [m].
-        casts: [N] bool which primitives cast a shadow.
-    """
+    """[R, L, *GRID] float32 share of each light in [0, 1] at the points of rooms with corners [R, 2, 3] [m]. The lights
+    [R, L, 7] (positions first [m]) have the sizes [R, L] [m]; ``casts`` [N] bool: which surfaces cast a shadow."""
     volume = torch.ones(*lights.shape[:2], *GRID)
     for r, (lower, upper) in enumerate(rooms.float()):
         x, y, z = (lower[k] + (upper[k] - lower[k]) * torch.linspace(0, 1, GRID[n]) for k, n in enumerate((2, 0, 1)))

@@ -34,7 +34,7 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.regress_cpu import EPSILON
-from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
+from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare, slots_in_use
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
@@ -343,7 +343,7 @@ def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight,
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
-    occupied, whitening, log_peak = prepare(mean, covariance, weight)
+    occupied, whitening, log_peak = prepare(slots_in_use(weight), mean, covariance, weight)
     share = math.log(epsilon / max(occupied.size, 1))
     boxes = _boxes(mean, covariance, occupied, log_peak, share + math.log(prior_weight))
     start, order = _grid(pixel, chosen, _SOME)[4:]

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import OPTIONS
+from ufmstar_torch.kernels.compile_cpu import kept
 from ufmstar_torch.kernels.field_cpu import Floats, fast
 from ufmstar_torch.posterior.model import Model
 
 # What is claimed may be NaN.
-with_nan: Any = njit(**OPTIONS, fastmath={"contract", "reassoc", "nsz", "arcp"})
+with_nan = kept(fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 def cell_means(logs: NDArray[Any], valid: NDArray[np.bool_], rows: int, cols: int) -> Floats:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.frame import DEPTH_RANGE, FARTHEST, FOCAL_RANGE, LARGEST, POLAR_STEPS, FrameInput, FrameMaps
+from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.threads_cpu import each
 
@@ -20,44 +21,62 @@ from ufmstar_torch.kernels.threads_cpu import each
 def check_values(
     maps: FrameMaps, pose: Tensor, intrinsics: Tensor, *, rotation_tolerance: float, max_depth: float
 ) -> FrameInput:
-    """As :func:`ufmstar_torch.frame.check_values`, for maps on the CPU."""
-    b, height, width = maps.depth.shape
-    T, K = np.empty((b, 4, 4)), np.empty((b, 3, 3))
-    fault, deviation = np.empty(b, np.int64), np.empty(b)
-    given = (value.cpu().contiguous().numpy() for value in (pose, intrinsics))
-    _cameras(*given, height, width, rotation_tolerance, FARTHEST, FOCAL_RANGE, POLAR_STEPS, T, K, fault, deviation)
-    depth = maps.depth.contiguous().view(b, -1).numpy()
+    """As :func:`ufmstar_torch.frame.check_values`, for the CPU. Depth that is valid everywhere is not copied."""
+    shape = b, *size = tuple(maps.depth.shape)
+    depth = array(maps.depth).reshape(b, -1)
     none = np.empty((b, 0, depth.shape[1]), depth.dtype)
-    mask = np.empty((b, 0), np.bool_) if maps.mask is None else maps.mask.contiguous().view(b, -1).numpy()
+    mask = np.empty((b, 0), np.bool_) if maps.mask is None else array(maps.mask).reshape(b, -1)
     A, E, features = (
-        none if value is None else value.detach().contiguous().view(b, -1, depth.shape[1]).numpy()
+        none if value is None else array(value).reshape(b, -1, depth.shape[1])
         for value in (maps.aleatoric, maps.epistemic, maps.features)
     )
-    safe, use, counts = np.empty_like(depth), np.empty(depth.shape, np.bool_), np.empty((2, b), np.int64)
-    limits = np.array([max_depth, *DEPTH_RANGE, LARGEST], depth.dtype)
-
-    def stream(s: int) -> None:
-        counts[:, s] = _maps(depth[s], mask[s], A[s], E[s], features[s], fault[s] == 0, limits, safe[s], use[s])
-
-    each(stream, [(s,) for s in range(b)])
-    shape = maps.depth.shape
-    maps_out = (safe.reshape(shape), T, K, use.reshape(shape))
-    tensors = map(torch.from_numpy, (*maps_out, fault, deviation, counts[0], counts[1]))
-    safe_depth, T_safe, K_safe, valid, codes, deviations, beyond, out_of_range = tensors
+    given = (np.asarray(array(camera), np.float64).reshape(-1, *camera.shape[-2:]) for camera in (pose, intrinsics))
+    cameras = *given, *size, rotation_tolerance, FARTHEST, FOCAL_RANGE, POLAR_STEPS
+    limits = float(max_depth), *DEPTH_RANGE, LARGEST
+    T, K, deviation, counts = np.empty((b, 4, 4)), np.empty((b, 3, 3)), np.empty(b), np.empty((4, b), np.int64)
+    safe, use = np.empty_like(depth), np.empty(depth.shape, np.bool_)
+    values, written = (depth, mask, A, E, features, limits), (T, K, deviation, counts, safe, use)
+    each(_stream, [(s, cameras, values, written) for s in range(b)])
+    whole = [kept == depth.shape[1] for kept in counts[3].tolist()]
+    if all(whole):
+        safe = depth
+    elif any(whole):
+        safe[whole] = depth[whole]
+    results = safe.reshape(shape), T, K, use.reshape(shape), deviation, *counts[:3]
+    safe_depth, T_safe, K_safe, valid, deviations, fault, beyond, out_of_range = map(torch.from_numpy, results)
     return FrameInput(
-        safe_depth, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, valid, codes, deviations, beyond,
-        out_of_range, codes,
+        safe_depth, T_safe, K_safe, maps.aleatoric, maps.epistemic, maps.features, valid, fault, deviations, beyond,
+        out_of_range, fault,
     )  # fmt: skip
 
 
 @kernel
+def _stream(s, cameras, values, written):
+    """Check stream ``s``: its camera to ``T`` and ``K`` with the rotation's ``deviation``, its maps to ``use`` and,
+    unless all pixels are valid, ``safe``; to ``counts`` [4, B] the code of the fault, and how many pixels lie beyond
+    the largest depth, are out of range and are valid."""
+    pose, intrinsics, height, width, tolerance, farthest, focal, steps = cameras
+    P, C = pose[s if len(pose) > 1 else 0], intrinsics[s if len(intrinsics) > 1 else 0]
+    depth, mask, aleatoric, epistemic, features, limits = values
+    T, K, deviation, counts, safe, use = written
+    deviation[s] = _deviation(P)
+    fault = _camera(P, C, height, width, deviation[s], tolerance, farthest, focal, steps, T[s], K[s])
+    beyond, near, kept = _maps(
+        depth[s], mask[s], aleatoric[s], epistemic[s], features[s], fault == 0, limits, safe[s], use[s]
+    )
+    counts[0, s], counts[1, s], counts[2, s], counts[3, s] = fault, beyond, near, kept
+
+
+@part
 def _maps(depth, mask, aleatoric, epistemic, features, fine, limits, safe, use):
-    """One stream [N]: depth where valid and else 0, which pixels are valid, and how many are beyond or out of range.
+    """One stream [N]: which pixels are valid; unless all are, depth where they are and else 0. Returns how many are
+    beyond, out of range and valid.
 
     Few conditions a loop, which the compiler turns into vector instructions.
     """
-    farthest, low, high, largest = limits
-    most, zero = min(farthest, high), depth.dtype.type(0)
+    real = depth.dtype.type
+    farthest, low, high, largest, zero = real(limits[0]), real(limits[1]), real(limits[2]), real(limits[3]), real(0)
+    most, kept = min(farthest, high), 0
     for i in range(depth.size):
         use[i] = (depth[i] >= low) & (depth[i] <= most) & fine
     for i in range(mask.size):
@@ -66,12 +85,14 @@ def _maps(depth, mask, aleatoric, epistemic, features, fine, limits, safe, use):
         for f in range(maps.shape[0]):
             for i in range(depth.size):
                 use[i] = use[i] & (maps[f, i] >= least) & (maps[f, i] <= largest)
-    kept = 0
+    for i in range(depth.size):
+        kept += use[i]
+    if kept == depth.size:
+        return 0, 0, kept
     for i in range(depth.size):
         safe[i] = depth[i] if use[i] else zero
-        kept += use[i]
     beyond = near = 0
-    if fine and kept < depth.size:
+    if fine:
         for i in range(depth.size):
             d = depth[i]
             given = (d > 0) & (d < np.inf)
@@ -80,30 +101,24 @@ def _maps(depth, mask, aleatoric, epistemic, features, fine, limits, safe, use):
             beyond += given & (d > farthest)
             near += given & (d <= farthest)
         near -= kept
-    return beyond, near
+    return beyond, near, kept
 
 
-@kernel
-def _cameras(pose, intrinsics, height, width, tolerance, farthest, focal, steps, T, K, fault, deviation):
-    """Of every stream: the pose with its nearest rotation, the intrinsics, the code of the first fault, and how far the
-    rotation given is from one. An identity and a unit camera where there is a fault."""
-    for b in range(fault.size):
-        P, C = pose[b], intrinsics[b]
-        deviation[b] = _deviation(P)
-        fault[b] = _pose_fault(P, deviation[b], tolerance, farthest)
-        if fault[b] == 0:
-            fault[b] = _intrinsics_fault(C, height, width, focal)
-        for i in range(4):
-            for j in range(4):
-                T[b, i, j] = 1.0 if i == j else 0.0
-        for i in range(3):
-            for j in range(3):
-                K[b, i, j] = C[i, j] if fault[b] == 0 else 1.0 if i == j else 0.0
-        if fault[b] == 0:
-            for i in range(3):
-                for j in range(4):
-                    T[b, i, j] = P[i, j]
-        _nearest_rotation(T[b], steps)
+@part
+def _camera(P, C, height, width, deviation, tolerance, farthest, focal, steps, T, K):
+    """Write the pose with its nearest rotation and the intrinsics, an identity and a unit camera where there is a
+    fault; return the code of the first fault."""
+    fault = _pose_fault(P, deviation, tolerance, farthest)
+    if fault == 0:
+        fault = _intrinsics_fault(C, height, width, focal)
+    for i in range(4):
+        for j in range(4):
+            T[i, j] = P[i, j] if fault == 0 and i < 3 else 1.0 if i == j else 0.0
+    for i in range(3):
+        for j in range(3):
+            K[i, j] = C[i, j] if fault == 0 else 1.0 if i == j else 0.0
+    _nearest_rotation(T, steps)
+    return fault
 
 
 @part

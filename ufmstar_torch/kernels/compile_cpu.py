@@ -7,24 +7,42 @@ kernel notices a change of these options, nor of a part in another file: delete 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from numba import njit
 from numba.extending import register_jitable
 
-OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
-kernel: Any = njit(**OPTIONS)
-part: Any = register_jitable(error_model="numpy")
+
+def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile at the first call, and keep the result on disk; in memory alone where no folder can be written to."""
+
+    def decorated(function: Callable[..., Any]) -> Any:
+        try:
+            return njit(cache=True, **_OPTIONS, **options)(function)
+        except RuntimeError:  # numba: "no locator available"
+            return njit(**_OPTIONS, **options)(function)
+
+    return decorated
+
+
+def _inner(**options: Any) -> Any:
+    return register_jitable(error_model="numpy", no_cfunc_wrapper=True, **options)
+
+
+kernel = kept()
+part = _inner()
 
 # A part that allocates nothing; the kernel that calls it holds its arrays. numba counts the references of every view of
 # an array (``table[i]`` as an argument, say) by an atomic operation, which takes as long as some forty others; here
 # it is compiled out, and a function that allocates is refused.
-leaf: Any = register_jitable(error_model="numpy", _nrt=False)
+leaf = _inner(_nrt=False)
 # A leaf in which multiply and add are joined where the processor can: one rounding less, not one more.
-contracted: Any = register_jitable(error_model="numpy", _nrt=False, fastmath={"contract"})
+contracted = _inner(_nrt=False, fastmath={"contract"})
 
 # A kernel and a leaf whose sums may be taken in any order, so that they run in vectors.
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
-reordered: Any = njit(cache=True, nogil=True, error_model="numpy", fastmath=_ANY_ORDER)
-reordered_leaf: Any = register_jitable(error_model="numpy", _nrt=False, fastmath=_ANY_ORDER)
+reordered = kept(fastmath=_ANY_ORDER)
+reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)

@@ -6,20 +6,20 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import part
 
 
-@kernel
-def matches(mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening):
+@part
+def matches(slots, mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening):
     """The matched pairs of one stream, as :func:`ufmstar_torch.correspond.correspond` states them.
 
-    Components k [K] and c [C] are in the camera frame, float64.
+    Components k [K] and c [C] are in the camera frame, float64. Of the k only ``slots`` [n], increasing, are looked at.
 
     Returns:
         c [P], k [P] and the overlap beta_ck [P] of every pair, in increasing c and then k.
     """
-    index_k, image_k = _project(mean_k, cov_k, weight_k, K, height, width, near, widening)
-    index_c, image_c = _project(mean_c, cov_c, weight_c, K, height, width, near, widening)
+    index_k, image_k = _project(slots, mean_k, cov_k, weight_k, K, height, width, near, widening)
+    index_c, image_c = _project(np.arange(weight_c.size), mean_c, cov_c, weight_c, K, height, width, near, widening)
     limit, limit_occl = _limit(eta), _limit(eta_occl)
     members, overlap = np.empty(index_k.size, np.int64), np.empty(index_k.size)
     c, k, beta = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64)
@@ -68,13 +68,13 @@ def _hidden(image, members, n, a, eta_occl, limit):
 
 
 @part
-def _project(mean, covariance, weight, K, height, width, near, widening):
-    """Indices of the candidates, and per candidate u, v, the covariance's xx, xy, yy, and the depth."""
-    index = np.empty(weight.size, np.int64)
-    image = np.empty((weight.size, 6))
+def _project(slots, mean, covariance, weight, K, height, width, near, widening):
+    """Indices of the candidates among ``slots``, and per candidate u, v, the covariance's xx, xy, yy, and the depth."""
+    index = np.empty(slots.size, np.int64)
+    image = np.empty((slots.size, 6))
     n = 0
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    for k in range(weight.size):
+    for k in slots:
         x, y, z = mean[k]
         if not (weight[k] > 0 and z > near):
             continue

@@ -8,13 +8,12 @@ variances. Node i has the place i mod 32, so that every loop runs over rows of o
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from ufmstar_torch.kernels.compile_cpu import OPTIONS, kernel, part
+from ufmstar_torch.kernels.compile_cpu import kept, kernel, part
 
 WINDOW = 32
 # Right-hand sides: the features and y, and zeros to a multiple of four.
@@ -22,7 +21,7 @@ RIGHT = 16
 _WIDTH = WINDOW + RIGHT
 
 # Kernels (``compile_cpu``) in which sums have any order, and neither infinity nor NaN occurs.
-fast: Any = njit(**OPTIONS, fastmath=True)
+fast = kept(fastmath=True)
 Floats = NDArray[np.float64]
 
 

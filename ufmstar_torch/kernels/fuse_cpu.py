@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import part
 
 _SWEEPS = 12  # an upper bound: the loops end when a sweep no longer rotates
 _NEGLIGIBLE = 16 * np.finfo(np.float64).eps
@@ -153,7 +153,7 @@ def floor_covariance(covariance, floor):
                 S[j, i] = value
 
 
-@kernel
+@part
 def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance_out):
     """Write the covariances of occupied slots with the floor that a segment needs (``step``): the variance across one
     pixel, and ``epsilon`` times the trace for storage."""
@@ -170,7 +170,7 @@ def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance
         floor_covariance(covariance_out[n : n + 1], least)
 
 
-@kernel
+@part
 def fuse_pairs(
     mean, covariance, weight, disagreement, count, features,
     mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon, changed,
@@ -208,7 +208,7 @@ def fuse_pairs(
         count[k] += 1
 
 
-@kernel
+@part
 def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_c, weight_c, features_c, new, occupied):
     """Add the components c where ``new`` [C] from slot ``occupied`` on, in place; return how many found no free one."""
     slot = occupied

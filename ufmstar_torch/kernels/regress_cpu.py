@@ -6,6 +6,7 @@ out components that cannot matter, and state the error. The paper's neighbourhoo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -46,8 +47,12 @@ def regress_maps(
     intrinsics: Tensor,
     config: UfMStarConfig,
     pixels: Tensor | None = None,
+    near: Sequence[tuple[NDArray[np.int64], int]] | None = None,
 ) -> Regression:
-    """:func:`regress_image` of a depth that is positive where it is valid, and only there."""
+    """:func:`regress_image` of a depth that is positive where it is valid, and only there.
+
+    ``near`` are the slots of each stream that can matter, in increasing order, and how many are occupied; None = all.
+    """
     if pixels is not None and config.regression != "exact":
         return regress_pixels(mixture_cam, depth, intrinsics, depth > 0, config, pixels, regress)
     z, K = depth.contiguous().numpy(), _doubles(intrinsics)[0]
@@ -61,7 +66,10 @@ def regress_maps(
         if kernel is near_image:
             calls += [(z[b], K[b], *fields, *settings, out[b], features[b], i, shares) for i in range(shares)]
             continue
-        view = in_view(*fields, K[b], *z.shape[1:], *settings, z.dtype.type(0))
+        slots = np.flatnonzero(fields[2] > 0) if near is None else near[b][0]
+        view = in_view(
+            slots, len(slots) if near is None else near[b][1], *fields, K[b], *z.shape[1:], *settings, z.dtype.type(0)
+        )
         if pixels is None:
             calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
         else:

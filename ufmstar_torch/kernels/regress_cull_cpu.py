@@ -1,4 +1,23 @@
-"""Which components matter in a box of points, on the CPU (numba): ``regress_tiles_cpu`` derives the bounds."""
+"""Which components matter in a box of points, on the CPU (numba): culling in three levels, and its error.
+
+A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = pi_0 + sum_k w_k(x) of a point x.
+
+1. Image: w_k(x) exceeds a threshold in an ellipsoid only. Its silhouette has a bounding box of pixels.
+2. Block of 32 x 32 pixels: for the components whose silhouette meets the image, interval arithmetic over the bounding
+   box of the block's points gives l_k <= w_k(x) <= h_k.
+3. Tile of 8 x 8 pixels: the same, for the components that the block keeps.
+
+Each level leaves out the components with h_k <= (eps / 3n) max(max_j l_j, pi_0 / 1000), with n components at that level
+(level 1: max_j l_j = 0). max_j l_j and pi_0 are parts of the denominator, so that the components left out add up to
+d(x) <= eps max(max_j w_j(x), pi_0 / 1000) <= eps D(x). The error is d/D times the difference of two averages of m_k
+and mu_0:
+
+    |m_hat - m_hat_culled| <= eps max(m_k, mu_0),
+
+and eps / 1000 max(m_k, mu_0) at a point that no component explains (every w_j <= pi_0 / 1000). The factor 1000 keeps
+the *relative* error small there, where m_hat itself is small. What the arithmetic rounds off comes on top; the bounds
+contain their own rounding. tests/test_regress.py checks the bound.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +25,33 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf
+from ufmstar_torch.kernels.compile_cpu import kernel, leaf
 from ufmstar_torch.kernels.regress_points_cpu import prepare
+from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds
+from ufmstar_torch.kernels.vectors_cpu import LANES
 
 _PRIOR = 1e-3  # share of the prior in a threshold
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
-_TERMS = 9  # of a component, whatever the tile: whitening (6), log2 of the peak, m, last feature
 _LOG2_E = math.log2(math.e)
 
 
 @kernel
-def in_view(mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero):
+def in_view(
+    slots, occupied, mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero
+):
     """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
+
+    Args:
+        slots: [n] increasing, the only ones that are looked at.
+        occupied: how many components the mixture has, others than those included.
 
     Returns:
         Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n and more], the terms of the
-        sum [n, 9], and the settings (prior weight and mean, epsilon, log2 of the least threshold).
+        sum but their offsets [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold.
     """
-    index, whitening, log_peak = prepare(mean, covariance, weight)
-    least = math.log2(_PRIOR * prior_weight)
-    limit = _limit(epsilon, index.size) + least
-    fields, constants = np.empty((index.size, FIELDS)), np.empty((index.size, _TERMS), np.array(zero).dtype)
+    index, whitening, log_peak = prepare(slots.copy(), mean, covariance, weight)
+    least, limit = math.log2(_PRIOR * prior_weight), negligible(prior_weight, epsilon, occupied)
+    fields, constants = np.empty((index.size, FIELDS)), np.empty((index.size, TERMS), np.array(zero).dtype)
     n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
     packed = np.empty((FIELDS, _padded(n)), constants.dtype)
     for i in range(FIELDS):
@@ -34,6 +59,12 @@ def in_view(mean, covariance, weight, m, features, K, height, width, prior_weigh
             packed[i, k] = fields[k, i]
     pad(packed, n)
     return index[:n], fields, packed, constants, (prior_weight, prior_mean, epsilon, least)
+
+
+@leaf
+def negligible(prior_weight, epsilon, count):
+    """log2 of the density that one of ``count`` components must exceed somewhere in an image to be looked at."""
+    return _limit(epsilon, count) + math.log2(_PRIOR * prior_weight)
 
 
 @leaf
@@ -45,7 +76,7 @@ def _limit(epsilon, count):
 @leaf
 def _padded(n):
     """A multiple, not below n, of what a vector loop takes at a time: its remainder would take as long again."""
-    return (n + 15) // 16 * 16
+    return (n + LANES - 1) // LANES * LANES
 
 
 @leaf
@@ -112,59 +143,24 @@ def _meets(mean, covariance, k, square, K, height, width):
     return True
 
 
-@contracted
-def _bounds(packed, n, centre, half, slack, bounds):
-    """log2 of the lower and upper bounds [2, n] of n densities in the box centre +- half.
+@leaf
+def cull(packed, n, box, settings, work, kept):
+    """Write the packed components that matter in the box (low, high) to ``kept``; return how many.
 
-    ``slack`` times the coordinates bounds the rounding of the distances, and widens the box by it. Infinity and NaN,
-    from a far outlier, keep a component and bound nothing.
+    ``work`` is scratch for 8 numbers and one for each component.
     """
-    cx, cy, cz = centre
-    hx, hy, hz = half
-    zero, least = slack - slack, packed.dtype.type(-1e30)
-    for j in range(n):
-        dx, dy, dz = cx - packed[0, j], cy - packed[1, j], cz - packed[2, j]
-        wx, wy, wz = hx + slack * abs(packed[0, j]), hy + slack * abs(packed[1, j]), hz + slack * abs(packed[2, j])
-        a, b, c, d, e, f = packed[3, j], packed[4, j], packed[5, j], packed[6, j], packed[7, j], packed[8, j]
-        y0, r0 = abs(a * dx), a * wx
-        y1, r1 = abs(b * dx + c * dy), abs(b) * wx + c * wy
-        y2, r2 = abs(d * dx + e * dy + f * dz), abs(d) * wx + abs(e) * wy + f * wz
-        p0, p1, p2 = y0 + r0, y1 + r1, y2 + r2
-        low = packed[9, j] - (p0 * p0 + p1 * p1 + p2 * p2)
-        bounds[0, j] = low if low > least else least
-        q0, q1, q2 = y0 - r0, y1 - r1, y2 - r2
-        q0, q1, q2 = q0 if q0 > zero else zero, q1 if q1 > zero else zero, q2 if q2 > zero else zero
-        bounds[1, j] = packed[9, j] - (q0 * q0 + q1 * q1 + q2 * q2)
-
-
-@leaf
-def _greatest(bounds, n, start):
-    """The greatest of ``start`` and n lower bounds."""
-    a = b = c = start  # four chains of comparisons, which do not wait for each other
-    for j in range(0, n - 3, 4):
-        start = bounds[0, j] if bounds[0, j] > start else start
-        a = bounds[0, j + 1] if bounds[0, j + 1] > a else a
-        b = bounds[0, j + 2] if bounds[0, j + 2] > b else b
-        c = bounds[0, j + 3] if bounds[0, j + 3] > c else c
-    for j in range(n - n % 4, n):
-        start = bounds[0, j] if bounds[0, j] > start else start
-    return max(max(start, a), max(b, c))
-
-
-@leaf
-def cull(packed, n, box, settings, bounds, kept):
-    """Write the packed components that matter in the box to ``kept``; return how many."""
     real = packed.dtype.type
-    x_low, y_low, z_low, x_high, y_high, z_high = box
     _, _, epsilon, least = settings
-    slack = real(16 * np.finfo(packed.dtype).eps)
-    cx, cy, cz = 0.5 * (x_low + x_high), 0.5 * (y_low + y_high), 0.5 * (z_low + z_high)
-    hx, hy, hz = 0.5 * (x_high - x_low), 0.5 * (y_high - y_low), 0.5 * (z_high - z_low)
-    hx, hy, hz = hx + slack * (hx + abs(cx)), hy + slack * (hy + abs(cy)), hz + slack * (hz + abs(cz))
-    _bounds(packed, _padded(n), (real(cx), real(cy), real(cz)), (real(hx), real(hy), real(hz)), slack, bounds)
-    threshold = _greatest(bounds, n, real(least)) + _limit(epsilon, n)
+    slack = 16 * np.finfo(packed.dtype).eps
+    for i in range(3):
+        centre, half = 0.5 * (box[i] + box[3 + i]), 0.5 * (box[3 + i] - box[i])
+        work[i], work[3 + i] = centre, half + slack * (half + abs(centre))
+    work[6], work[7] = slack, least
+    upper = work[8:]
+    bounds(packed, packed.shape[1], _padded(n), work, upper)
+    threshold = work[7] + real(_limit(epsilon, n))
     count = 0
     for j in range(n):
         kept[count] = j
-        count += bounds[1, j] > threshold
+        count += upper[j] > threshold
     return count

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import kernel, part
-from ufmstar_torch.kernels.regress_points_cpu import prepare
+from ufmstar_torch.kernels.regress_points_cpu import prepare, slots_in_use
 
 
 @kernel
@@ -53,7 +53,7 @@ def near_points(points, mean, covariance, weight, m, features, prior_weight, pri
 @part
 def _components(mean, covariance, weight, sigmas):
     """Occupied components: index, log peak density, mean and whitening [K, 9], and half the sides of their boxes."""
-    index, whitening, log_peak = prepare(mean, covariance, weight)
+    index, whitening, log_peak = prepare(slots_in_use(weight), mean, covariance, weight)
     local, extent = np.empty((index.size, 9)), np.empty((index.size, 3))
     for k in range(index.size):
         for i in range(3):

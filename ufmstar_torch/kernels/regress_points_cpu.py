@@ -18,9 +18,8 @@ _HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 
 
 @part
-def prepare(mean, covariance, weight):
-    """Occupied components: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
-    index = _occupied(weight)
+def prepare(index, mean, covariance, weight):
+    """Of some occupied components [n]: index, inverse Cholesky factor (row by row, 6 numbers) and log peak density."""
     whitening = np.empty((index.size, 6))
     log_peak = np.empty(index.size)
     for i in range(index.size):
@@ -40,7 +39,7 @@ def prepare(mean, covariance, weight):
 
 
 @part
-def _occupied(weight):
+def slots_in_use(weight):
     """Indices of positive weights; ``np.flatnonzero`` takes longer to compile."""
     index, n = np.empty(weight.size, np.int64), 0
     for k in range(weight.size):
@@ -53,7 +52,7 @@ def _occupied(weight):
 def at_points(points, mean, covariance, weight, m, features, prior_weight, prior_mean, epsilon, out, out_f):
     """Regress m [K] and features [K, F] at points [P, 3] into out [P] and out_f [F, P]; NaN where a point is not
     finite."""
-    index, whitening, log_peak = prepare(mean, covariance, weight)
+    index, whitening, log_peak = prepare(slots_in_use(weight), mean, covariance, weight)
     limit = math.log(epsilon * prior_weight / max(index.size, 1))
     boxes = _boxes(mean, covariance, index, log_peak, limit)
     everyone = np.arange(points.shape[0])

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import kernel
+from ufmstar_torch.kernels.compile_cpu import part
 
 
-@kernel
+@part
 def relative(T_a, T_b):
     """[3, 4] the motion (R, t) that takes points of camera a into camera b (``camera.relative_pose``)."""
     motion = np.empty((3, 4))
@@ -23,7 +23,7 @@ def relative(T_a, T_b):
     return motion
 
 
-@kernel
+@part
 def move(motion, mean, covariance, weight, first, changed, mean_out, covariance_out):
     """Write the moved mean [K, 3] and covariance [K, 3, 3] of occupied slots, before slot ``first`` only where
     ``changed`` [K] is True. What is not written stays as it is."""

@@ -6,6 +6,7 @@ The rows of an image are segmented on all threads that torch may use, their segm
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -14,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ufmstar_torch.config import SPGFConfig
+from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.segment_image_cpu import join_rows, write_gaussians, write_labels
 from ufmstar_torch.kernels.segment_rows_cpu import SEGMENT, SEGMENT_INT, scan_rows
@@ -56,7 +59,9 @@ def segment(given: SegmentInput, *, before_pruning: bool = False) -> tuple[Gauss
     weight, count = np.zeros((b, k), dtype), np.zeros((b, k), np.int64)
     for i, (kept, gaussians, whole) in enumerate(fits):
         write_gaussians(kept, gaussians, whole, mean[i], covariance[i], weight[i], count[i])
-    features = feature_means(given, labels, weight)
+    features = np.empty((b, k, 0), dtype)
+    if given.features is not None:
+        features = feature_means(array(given.features), labels, weight)
     fields = (mean, covariance, weight, np.zeros((b, k), dtype), count, features)
     return GaussianMixture(*map(torch.from_numpy, fields)), labels()
 
@@ -66,28 +71,27 @@ def most_gaussians(fits: Sequence[Fit]) -> int:
     return max(1, *(kept.size for kept, _, _ in fits))
 
 
-def feature_means(given: SegmentInput, labels: Callable[[], Tensor], weight: np.ndarray) -> np.ndarray:
-    """Means [B, K, F] of the features over the pixels of each Gaussian, in the dtype of ``weight`` [B, K]."""
-    if given.features is None:
-        return np.empty((*weight.shape, 0), weight.dtype)
-    return _feature_means(_array(given.features), labels().numpy(), weight)
+def feature_means(features: np.ndarray, labels: Callable[[], Tensor], weight: np.ndarray) -> np.ndarray:
+    """Means [B, K, F] of the features [B, F, H, W] over the pixels of each Gaussian, in the dtype of ``weight``
+    [B, K]."""
+    return _feature_means(features, labels().numpy(), weight)
 
 
 def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit], Callable[[], Tensor]]:
     """The Gaussians of :func:`segment`, stream by stream, and a function that writes the labels."""
-    z = given.depth.contiguous().numpy()
+    z = array(given.depth)
     streams, height, width = z.shape
     absent = (streams, height, 0)  # rows of no pixels stand for "not given"
-    use = np.empty(absent, np.bool_) if given.valid is None else given.valid.contiguous().numpy()
-    spread = np.empty(absent, z.dtype) if given.variance is None else _array(given.variance)
-    limits = _limits(given, before_pruning)
+    use = np.empty(absent, np.bool_) if given.valid is None else array(given.valid)
+    spread = np.empty(absent, z.dtype) if given.variance is None else array(given.variance)
+    limits = _limits(given.config, given.depth_bins, before_pruning)
     room = height * given.segments_per_row
     spans, owner = np.empty((streams, height, 2), np.int64), np.empty(z.shape, np.int32)
     table, table_int = np.empty((streams, room, SEGMENT)), np.empty((streams, room, SEGMENT_INT), np.int64)
     shares = shares_of_stream(streams, height * width)
     rows = [height * i // shares for i in range(shares + 1)]
     scans, joins = [], []
-    for b, K in enumerate(given.intrinsics.tolist()):
+    for b, K in enumerate(array(given.intrinsics).tolist()):
         fx, fy, cx, cy = K[0][0], K[1][1], K[0][2], K[1][2]
         slope = given.config.slope(min(fx, fy))
         bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
@@ -110,15 +114,8 @@ def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit]
     return [(kept, gaussians, whole) for kept, gaussians, whole, _ in joined], labels
 
 
-def _array(value: Tensor) -> np.ndarray:
-    """A contiguous float32 or float64 view of a CPU tensor; half and bfloat16 are converted."""
-    if value.dtype not in (torch.float32, torch.float64):
-        value = value.to(torch.float32)
-    return value.contiguous().numpy()
-
-
-def _limits(given: SegmentInput, before_pruning: bool) -> _Limits:
-    c = given.config
+@functools.lru_cache(maxsize=16)
+def _limits(c: SPGFConfig, depth_bins: int, before_pruning: bool) -> _Limits:
     return _Limits(
         noise_floor=float(c.noise_floor),
         noise_thresh=float(c.noise_thresh),
@@ -127,7 +124,7 @@ def _limits(given: SegmentInput, before_pruning: bool) -> _Limits:
         max_depth=float(c.depth_limit),
         shortest_bin=float(c.min_gaussian_length),
         longest_bin=float(c.frame_max_scale * c.min_gaussian_length),
-        depth_bins=given.depth_bins,
+        depth_bins=depth_bins,
         occlusion_gap=c.occlusion_gap,
         n_check=c.n_check,
         max_open=c.max_open,
@@ -138,12 +135,11 @@ def _limits(given: SegmentInput, before_pruning: bool) -> _Limits:
     )
 
 
-@kernel
-def _depth_bins(s, limits):
+@functools.lru_cache(maxsize=16)  # a camera's focal length does not change
+def _depth_bins(s: float, limits: _Limits) -> tuple[np.ndarray, np.ndarray]:
     """Squared length and far edge of every depth bin [m^2, m]."""
     lengths2, edges = np.empty(limits.depth_bins), np.empty(limits.depth_bins)
-    length = limits.shortest_bin
-    edge = 0.0
+    length, edge = limits.shortest_bin, 0.0
     for k in range(limits.depth_bins):
         edge += length
         lengths2[k], edges[k] = length * length, edge

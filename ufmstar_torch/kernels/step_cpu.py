@@ -7,7 +7,7 @@ of threads changes a bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import fields
 from typing import Any, NamedTuple
@@ -24,7 +24,8 @@ from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
 from ufmstar_torch.kernels.anchors_cpu import learn
-from ufmstar_torch.kernels.regress_cpu import regress_maps
+from ufmstar_torch.kernels.arrays_cpu import array
+from ufmstar_torch.kernels.regress_cpu import EPSILON, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
 from ufmstar_torch.kernels.stream_cpu import describe, join, match
@@ -34,33 +35,17 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.regress import moving_average
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
-from ufmstar_torch.step import StepObserver, after_frame, after_regress, frame_statistics
+from ufmstar_torch.step import StepObserver, after_regress, frame_statistics
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))
-
-
-class _Slots(NamedTuple):
-    """The fields of a mixture [B, K, ...], or of one stream [K, ...], as arrays."""
-
-    mean: Floats
-    covariance: Floats
-    weight: Floats
-    disagreement: Floats
-    observations: NDArray[np.int64]
-    features: Floats
-
-    @classmethod
-    def of(cls, state: UfMStarState | GaussianMixture) -> _Slots:
-        return cls(*(getattr(state, name).detach().contiguous().numpy() for name in _NAMES))
-
-    def stream(self, b: int) -> tuple[NDArray[Any], ...]:
-        return tuple([value[b] for value in self])
+_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured")
+_COUNTS += ("anchors", "anchors_used")
 
 
 class _Pairs(NamedTuple):
     """The matched pairs [P] of one stream; which segments [C] are new; how many segments there are, how many of them
-    are matched, how many new, and how many components the mixture had."""
+    are matched, how many new, and how many components the mixture had; the slots within reach of the frame [n]."""
 
     c: NDArray[np.int64]
     k: NDArray[np.int64]
@@ -70,6 +55,7 @@ class _Pairs(NamedTuple):
     matched: int
     created: int
     occupied: int
+    near: NDArray[np.int64]
 
 
 def step(
@@ -84,63 +70,66 @@ def step(
 ) -> tuple[UfMStarState, StepOutput]:
     """As :func:`ufmstar_torch.step.step`, for CPU tensors."""
     stage, kernel = (observer.stage, observer.kernel) if observer is not None else (_unobserved, nullcontext)
-    present = frame.T_world_cam.contiguous().numpy()
-    starts = (frame.fault.numpy() == 0) & ~state.started.numpy()
-    first = np.where(starts[:, None, None], present, state.T_world_first.numpy())
+    streams = range(len(frame.depth))
+    camera = _, present, intrinsics = array(frame.fault), array(frame.T_world_cam), array(frame.intrinsics)
 
-    current_cam, labels = _segment(frame, config, state.covariance.dtype, kernel)
+    segments, labels = _segment(frame, intrinsics, config, state.covariance.dtype, kernel)
+    current_cam = GaussianMixture(*map(torch.from_numpy, segments))
     stage("segment")
 
-    old, segments, K = _Slots.of(state), _Slots.of(current_cam), frame.intrinsics.contiguous().numpy()
-    mean_cam, covariance_cam = np.zeros(old.mean.shape), np.zeros(old.covariance.shape)
+    slots = tuple(array(getattr(state, name)) for name in _NAMES)
+    before = tuple(array(value) for value in (state.T_world_first, state.started, state.frames, state.skipped))
+    after = first, started, frames, skipped = tuple(map(np.empty_like, before))
+    mean_cam, covariance_cam = np.empty(slots[0].shape), np.empty(slots[1].shape)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
+    # Anchors and the neighbourhood look at every component.
+    narrow = config.regression == "exact" and not config.anchored
+    ratio = float("inf") if config.occlusion_depth is None else config.occlusion_depth
+    reach, depth = (config.prior_weight, EPSILON[frame.depth.dtype] if narrow else 0.0, ratio), array(frame.depth)
+    given = (camera, before, after, slots[:3], segments[:3], depth, thresholds, reach, mean_cam, covariance_cam)
     with kernel("correspond"):
-        matching = [
-            (
-                first[b], present[b], *old.stream(b)[:3], *segments.stream(b)[:3], K[b], frame.size, thresholds,
-                mean_cam[b], covariance_cam[b],
-            )
-            for b in range(len(K))
-        ]  # fmt: skip
-        pairs = [_Pairs(*found) for found in each(match, matching)]
+        pairs = [_Pairs(*found) for found in each(match, [(b, *given) for b in streams])]
     stage("correspond")
 
     needed = max(pair.occupied + pair.created for pair in pairs)
-    capacity = _capacity(old.weight.shape[1], needed, config.max_components)
-    slots = _Slots(*(_grown(value, capacity) for value in old))
-    mean_cam, covariance_cam = _grown(mean_cam, capacity), _grown(covariance_cam, capacity)
-    epsilon = float(np.finfo(slots.covariance.dtype).eps)
+    capacity = _capacity(slots[0].shape[1], needed, config.max_components)
+    updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
+    regressed = (
+        _grown(mean_cam, capacity), _grown(covariance_cam, capacity), np.empty(updated[2].shape),
+        np.empty(updated[2].shape), np.empty((*updated[2].shape, config.features + 1)),
+    )  # fmt: skip
+    stated = config.prior_mean if config.unmeasured == "prior" else -1.0
+    settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps), stated
+    given = present, first, slots, updated, (*segments[:3], segments[5])
     with kernel("fuse"):
-        joining = []
-        for b, pair in enumerate(pairs):
-            mean, covariance, weight, _, _, features = segments.stream(b)
-            distance = np.empty(0)
-            if config.disagreement == "overlap":
-                both = (mean[pair.c], covariance[pair.c], mean_cam[b][pair.k], covariance_cam[b][pair.k])
-                distance = overlap_disagreement(*map(torch.from_numpy, both)).numpy()
-            joining.append(
-                (
-                    first[b], present[b], slots.stream(b), (mean, covariance, weight, features), tuple(pair[:3]),
-                    distance, pair.new, pair.occupied, config.overlap_weighted, epsilon, mean_cam[b],
-                    covariance_cam[b],
-                )
-            )  # fmt: skip
-        dropped = each(join, joining)
+        distances = [_distance(b, pair, segments, regressed, config) for b, pair in enumerate(pairs)]
+        joining = zip(streams, pairs, distances, strict=True)
+        joined = each(
+            join,
+            [
+                (b, *given, pair[:3], d, pair.new, pair.occupied, pair.near, settings, regressed)
+                for b, pair, d in joining
+            ],
+        )
     stage("fuse")
 
-    mixture = {name: torch.from_numpy(value) for name, value in zip(_NAMES, slots, strict=True)}
-    moved = GaussianMixture(
-        torch.from_numpy(mean_cam), torch.from_numpy(covariance_cam), mixture["weight"].double(),
-        mixture["disagreement"].double(), mixture["count"], mixture["features"].double(),
-    )  # fmt: skip
-    evidence, used, mixture_cam, stream = before_regression(
-        Evidence(state.evidence, state.overall_evidence), moved, frame, anchors, config, learn
-    )
-    mixture_cam = unmeasured.before_regression(mixture_cam, config)
+    mean, covariance, weight, disagreement, features = map(torch.from_numpy, regressed)
+    mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
+    mixture_cam = GaussianMixture(mean, covariance, weight, disagreement, mixture["count"], features)
+    evidence, stream = Evidence(state.evidence, state.overall_evidence), None
+    totals = np.zeros((len(_COUNTS), len(streams)), np.int64)
+    counts = dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))
+    if config.anchored:
+        mixture_cam, share = mixture_cam.replace(features=features[..., :-1]), features[..., -1:]
+        evidence, used, mixture_cam, stream = before_regression(evidence, mixture_cam, frame, anchors, config, learn)
+        mixture_cam = mixture_cam.replace(features=torch.cat([mixture_cam.features, share], -1))
+        counts["anchors_used"].copy_(used)
+    if anchors is not None:
+        counts["anchors"].copy_(anchors.valid.sum(1))
     stage("append")
 
     with kernel("regress_image"):
-        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels)
+        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, joined)
     result, residual, measured = after_regress(result, stream, frame, config, pixels)
     stage("regress")
 
@@ -149,14 +138,23 @@ def step(
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, smooth_maps
         )
-    counts = _counts(frame, pairs, dropped, measured)
-    counts |= {"anchors": torch.zeros_like(used) if anchors is None else anchors.valid.sum(1), "anchors_used": used}
-    updated = after_frame(state, frame, mixture, torch.from_numpy(first), smoothed, evidence)
+    _count(totals, frame, pairs, [components for _, components in joined], measured)
+    state_after = UfMStarState(
+        **mixture,
+        T_world_first=torch.from_numpy(first),
+        started=torch.from_numpy(started),
+        frames=torch.from_numpy(frames),
+        skipped=torch.from_numpy(skipped),
+        smoothed=smoothed,
+        evidence=evidence.component,
+        overall_evidence=evidence.overall,
+        posterior=state.posterior,
+    )
     out = StepOutput(
         disagreement, result.features, residual, measured, labels, current_cam, frame_statistics(frame, counts)
     )
     stage("average")
-    return updated, out
+    return state_after, out
 
 
 def _unobserved(name: str) -> None:
@@ -164,9 +162,14 @@ def _unobserved(name: str) -> None:
 
 
 def _segment(
-    frame: FrameInput, config: UfMStarConfig, stored: torch.dtype, kernel: Callable[[str], AbstractContextManager]
-) -> tuple[GaussianMixture, Callable[[], Tensor]]:
-    """Step 2: C_i in the camera frame, float64, its covariances lifted to the floor that the reference states."""
+    frame: FrameInput,
+    intrinsics: Floats,
+    config: UfMStarConfig,
+    stored: torch.dtype,
+    kernel: Callable[[str], AbstractContextManager],
+) -> tuple[tuple[NDArray[Any], ...], Callable[[], Tensor]]:
+    """Step 2: the fields of C_i in the camera frame, float64, its covariances lifted to the floor that the reference
+    states, and its labels."""
     given = SegmentInput.of_frame(frame, config)
     with kernel("spgf"):
         fits, labels = fit(given)
@@ -175,12 +178,24 @@ def _segment(
     mean, covariance, weight, zero = np.zeros((b, n, 3)), np.zeros((b, n, 3, 3)), np.zeros((b, n)), np.zeros((b, n))
     count, rounded = np.zeros((b, n), np.int64), np.empty(13 * n, rounding)
     scratch = rounded[: 3 * n].reshape(n, 3), rounded[3 * n : 12 * n].reshape(n, 3, 3), rounded[12 * n :]
-    epsilon = 8 * float(torch.finfo(stored).eps)
-    for i, K in enumerate(frame.intrinsics.tolist()):
+    epsilon = 8 * torch.finfo(stored).eps
+    for i, K in enumerate(intrinsics.tolist()):
         written = (mean[i], covariance[i], weight[i], count[i])
         describe(fits[i], scratch, config.near_plane, min(K[0][0], K[1][1]), PIXEL_VARIANCE, epsilon, *written)
-    features = feature_means(given, labels, weight.astype(rounding)).astype(np.float64)
-    return GaussianMixture(*map(torch.from_numpy, (mean, covariance, weight, zero, count, features))), labels
+    features = np.empty((b, n, 0))
+    if given.features is not None:
+        features = feature_means(array(given.features), labels, weight.astype(rounding)).astype(np.float64)
+    return (mean, covariance, weight, zero, count, features), labels
+
+
+def _distance(
+    b: int, pair: _Pairs, segments: Sequence[Floats], mixture_cam: Sequence[Floats], config: UfMStarConfig
+) -> NDArray[np.float64]:
+    """The disagreement [P] of the pairs of a stream where the step does not take W2^2, else [0]."""
+    if config.disagreement != "overlap":
+        return np.empty(0)
+    both = [value[b][at] for values, at in ((segments, pair.c), (mixture_cam, pair.k)) for value in values[:2]]
+    return overlap_disagreement(*map(torch.from_numpy, both)).numpy()
 
 
 def _capacity(present: int, needed: int, limit: int | None) -> int:
@@ -191,28 +206,28 @@ def _capacity(present: int, needed: int, limit: int | None) -> int:
     return capacity if limit is None else max(present, min(capacity, limit))
 
 
-def _grown(value: NDArray[Any], capacity: int) -> NDArray[Any]:
-    """A copy of [B, K, ...] with ``capacity`` slots, new ones zero."""
-    out = np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype)
-    out[:, : value.shape[1]], out[:, value.shape[1] :] = value, 0
-    return out
+def _grown(value: Floats, capacity: int) -> Floats:
+    """[B, K, ...] with ``capacity`` slots, new ones zero."""
+    missing = capacity - value.shape[1]
+    if missing <= 0:
+        return value
+    return np.concatenate([value, np.zeros((value.shape[0], missing, *value.shape[2:]))], axis=1)
 
 
-def _counts(frame: FrameInput, pairs: list[_Pairs], dropped: list[int], measured: Tensor) -> dict[str, Tensor]:
-    """The statistics [B] that the step counts itself."""
-    valid, unseen = frame.valid.numpy(), measured.numpy() < unmeasured.HALF
-    rows = [
-        (
-            pair.occupied + pair.created - lost,
+def _count(
+    totals: NDArray[np.int64], frame: FrameInput, pairs: list[_Pairs], components: list[int], measured: Tensor
+) -> None:
+    """Write the statistics [n, B] that the step counts itself, in the order of ``_COUNTS``."""
+    valid, shares = frame.valid.numpy(), measured.numpy()
+    for b, (pair, occupied) in enumerate(zip(pairs, components, strict=True)):
+        new = occupied - pair.occupied
+        totals[:8, b] = (
+            occupied,
             pair.found,
             pair.matched,
             pair.c.size,
-            pair.created - lost,
-            lost + pair.found - pair.matched - pair.created,  # without a slot, or too near
+            new,
+            pair.found - pair.matched - new,  # without a slot, or too near
             np.count_nonzero(valid[b]),
-            np.count_nonzero(unseen[b]),
+            np.count_nonzero(shares[b] < unmeasured.HALF),
         )
-        for b, (pair, lost) in enumerate(zip(pairs, dropped, strict=True))
-    ]
-    names = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured")
-    return dict(zip(names, torch.tensor(rows, dtype=torch.int64).unbind(1), strict=True))

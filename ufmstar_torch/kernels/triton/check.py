@@ -16,6 +16,7 @@ from ufmstar_torch.frame import (
     FrameInput,
     FrameMaps,
     intrinsics_fault,
+    of_streams,
     pose_fault,
 )
 from ufmstar_torch.kernels.triton.launch import launch
@@ -28,6 +29,7 @@ def check_values(
     depth = maps.depth.contiguous()
     b, height, width = depth.shape
     device = depth.device
+    pose, intrinsics = (of_streams(camera, b) for camera in (pose, intrinsics))
     known = None
     if pose.device.type == intrinsics.device.type == "cpu" != device.type:
         first = pose_fault(pose, rotation_deviation(pose[..., :3, :3]), rotation_tolerance)

@@ -1,6 +1,6 @@
 """Gaussian mixture regression on a GPU: the exact sum with culling in two levels.
 
-The bound is that of ``kernels.regress_tiles_cpu``: a component is left out where its density is at most
+The bound is that of ``kernels.regress_cull_cpu``: a component is left out where its density is at most
 (eps / 3n) max(max_j l_j, pi_0 / 1000), l_j a lower bound of the densities there. Here the levels are the image (a
 program per stream lists the components whose silhouette meets it) and a tile of 16 x 16 pixels (a program). Of chosen
 pixels, 256 in their order take the place of a tile.

@@ -1,0 +1,60 @@
+"""What a command will need of compiled kernels, compiled before its first frame (``ufmstar_torch.warm_up``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ufmstar_torch.anchors.dense import DenseEvidence
+from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.models import Preprocess
+from ufmstar_torch.ufmstar import UfMStar
+from ufmstar_torch.warm_up import warm_up
+
+_WALL, _FOCAL = (96, 128), 100.0  # [px] of the images of a wall
+_STEP, _FRAMES = 4, 8  # the wall moves by so many pixels a frame
+
+
+def warm_up_command(
+    config: UfMStarConfig,
+    device: torch.device,
+    progress: Callable[[int, int], object],
+    *,
+    images: bool = True,
+    dense: bool = False,
+) -> None:
+    """Compile UfM*, the metrics and what else is asked for, or load it from disk.
+
+    Args:
+        config, device: of UfM*.
+        progress: as ``UfMStar.warm_up`` takes it.
+        images: networks predict from images.
+        dense: anchors are :class:`DenseEvidence`.
+    """
+    also = [metrics, *([preprocessing] if images else []), *([dense_anchors] if dense else [])]
+    warm_up(UfMStar(config.replace(spill=None), device=device), (32, 32), 1, progress, also)
+
+
+def metrics() -> None:
+    """The metrics of single-precision maps."""
+    maps = torch.ones(1, 8, 8)
+    SequenceMetrics().update(maps, maps, maps)
+
+
+def preprocessing() -> None:
+    """The resizing of images."""
+    Preprocess(size=(8, 8)).apply_image(torch.zeros(1, 3, 16, 16, dtype=torch.uint8))
+
+
+def dense_anchors() -> None:
+    """The search of depths in images, of a textured wall along which the camera moves."""
+    height, width = _WALL
+    wall = np.random.default_rng(0).integers(0, 256, (height, width + _STEP * _FRAMES, 3), dtype=np.uint8)
+    evidence, K = DenseEvidence(), np.array([[_FOCAL, 0, width / 2], [0, _FOCAL, height / 2], [0, 0, 1]])
+    for frame in range(_FRAMES):
+        T_world_cam = np.eye(4)
+        T_world_cam[0, 3] = frame * _STEP / _FOCAL * evidence.config.start_depth
+        evidence.update(wall[:, frame * _STEP : frame * _STEP + width].copy(), T_world_cam, K)

@@ -1,0 +1,121 @@
+"""The inner loops of the regression over tiles, as vector instructions (``vectors_cpu``); compiled code calls them."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+from ufmstar_torch.kernels.vectors_cpu import Lanes, vectors
+
+TILE = 8  # pixels, the side of a tile
+PIXELS = TILE * TILE
+TERMS = 12  # of a component: whitening (6), log2 of the peak, m, last feature, whitened offset of the tile's origin (3)
+
+
+@vectors
+def place(code, z, grid, ray, points, hole, box):
+    """The points of a tile from its origin, the middle of the tile at the least depth.
+
+    Args:
+        z: [64] depths; where one is not positive, the pixel is a hole and gets the least depth.
+        grid: [2, 64] the pixels' rays less that through the middle.
+        ray: [2] that one, at z = 1.
+        points: [3, 64] x, y and z.
+        hole: [64] NaN where there is a hole, else 0.
+        box: [7] the least x, y and z, the greatest, and the least depth: infinite where all are holes.
+    """
+    rows, ray_x, ray_y = range(0, PIXELS, code.lanes), ray.one(0), ray.one(1)
+    depths = [z.load(row) for row in rows]
+    given = [(depth > 0.0).select(depth, math.inf) for depth in depths]
+    least = functools.reduce(Lanes.at_most, given).everywhere(Lanes.at_most)
+    columns: list[list[Lanes]] = [[], [], []]
+    for row, depth in zip(rows, depths, strict=True):
+        seen = depth > 0.0
+        hole.store(seen.select(depth - depth, math.nan), row)
+        full = seen.select(depth, least)
+        deeper = full - least
+        point = grid.load(row) * full + ray_x * deeper, grid.load(row, PIXELS) * full + ray_y * deeper, deeper
+        for axis, value in enumerate(point):
+            points.store(value, row, axis * PIXELS)
+            columns[axis].append(value)
+    for axis, values in enumerate(columns):
+        box.put(functools.reduce(Lanes.at_most, values).everywhere(Lanes.at_most), axis)
+        box.put(functools.reduce(Lanes.at_least, values).everywhere(Lanes.at_least), 3 + axis)
+    box.put(least, 6)
+
+
+@vectors
+def bounds(code, packed, stride, n, box, upper):
+    """log2 of upper bounds of densities in a box of points, and of the greatest lower bound.
+
+    Infinity and NaN, from a far outlier, keep a component and bound nothing.
+
+    Args:
+        packed: [10, stride] the components' fields: mean, whitening, log2 of the peak.
+        n: of them, a multiple of a vector's length.
+        box: [8] its centre, half its sides, what bounds the rounding of a distance as a share of the coordinates and
+            widens the box, and the least lower bound; in place of the latter the greatest is written.
+        upper: [n].
+    """
+    centre, half = [box.one(i) for i in range(3)], [box.one(3 + i) for i in range(3)]
+    slack, greatest = box.one(6), code.variable(box.one(7))
+    with code.loop(n, code.lanes) as j:
+        fields = [packed.load(code.plus(j, code.times(stride, i))) for i in range(10)]
+        mean, (a, b, c, d, e, f), peak = fields[:3], fields[3:9], fields[9]
+        x, y, z = (centre[i] - mean[i] for i in range(3))
+        u, v, w = (half[i] + slack * mean[i].size() for i in range(3))
+        middle = (a * x).size(), (b * x + c * y).size(), (d * x + (e * y + f * z)).size()
+        reach = a * u, b.size() * u + c * v, d.size() * u + (e.size() * v + f * w)
+        low = high = peak
+        for m, r in zip(middle, reach, strict=True):
+            far, near = m + r, (m - r).at_least(0.0)
+            low, high = low - far * far, high - near * near
+        greatest.value = low.at_least(greatest.value)
+        upper.store(high, j)
+    box.put(greatest.value.everywhere(Lanes.at_least), 7)
+
+
+@vectors
+def mix(code, terms, count, points, some, start, hole, sums, densities, keep):
+    """Averages over components at the points of a tile, weighted by their densities.
+
+    Args:
+        terms: [n, TERMS] of the components, of which the first ``count`` take part.
+        points: [3, 64] x, y and z from the tile's origin.
+        some: of the points are computed, from the first on; a multiple of a vector's length.
+        start: [3] what the prior adds to each sum.
+        hole: [64] NaN where there is a hole, else 0.
+        sums: [3, 64] the sum of the densities, the average of m, and that of the last feature; the averages are NaN
+            in a hole.
+        densities: [n, 64], written where ``keep`` is True.
+    """
+    with code.loop(some, code.lanes) as i:
+        x, y, z = (points.load(i, axis * PIXELS) for axis in range(3))
+        totals = [code.variable(start.one(row)) for row in range(3)]
+        with code.loop(count) as j:
+            at = code.times(j, TERMS)
+            a, b, c, d, e, f, peak, m, last, x0, y0, z0 = (terms.one(at, term) for term in range(TERMS))
+            p, q, r = a * x + x0, b * x + (c * y + y0), d * x + (e * y + (f * z + z0))
+            density = (((peak - p * p) - q * q) - r * r).exp2()
+            for total, part in zip(totals, (density, density * m, density * last), strict=True):
+                total.value = total.value + part
+            with code.when(keep):
+                densities.store(density, code.plus(code.times(j, PIXELS), i))
+        evidence, holes = totals[0].value, hole.load(i)
+        sums.store(evidence, i)
+        for row in (1, 2):
+            sums.store(totals[row].value.over(evidence) + holes, i, row * PIXELS)
+
+
+@vectors
+def read_tile(code, image, start, stride, tile):
+    """The values [64] of the tile of an image whose first pixel is ``start``; ``stride`` is the image's width."""
+    for row in range(0, PIXELS, code.lanes):
+        tile.store(image.load_rows(TILE, code.plus(start, code.times(stride, row // TILE)), stride), row)
+
+
+@vectors
+def write_tile(code, tile, image, start, stride):
+    """The other way round."""
+    for row in range(0, PIXELS, code.lanes):
+        image.store_rows(tile.load(row), TILE, code.plus(start, code.times(stride, row // TILE)), stride)

@@ -1,0 +1,243 @@
+"""Vector instructions stated one by one, for compiled code where loops in Python's syntax are not enough (numba, LLVM).
+
+LLVM keeps the sums of nested loops in memory, takes half of a vector where whole ones are as fast, and reduces one
+number after the other. Here vectors of 64 bytes are written down as expressions. A processor with shorter ones takes
+several for one.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+LANES = 16  # a multiple of the numbers in a vector, whatever their dtype
+_BYTES = 64  # of a vector
+_INDEX = ir.IntType(64)
+
+
+class Lanes:
+    """A vector of numbers, or of truth values, with the operators of its code.
+
+    A product and a sum become one instruction where the processor has it: one rounding less.
+    """
+
+    def __init__(self, builder: Any, value: Any) -> None:
+        self._builder, self.value = builder, value
+
+    def _other(self, other: Lanes | float) -> Any:
+        kind = self.value.type
+        return other.value if isinstance(other, Lanes) else ir.Constant(kind, [other] * kind.count)
+
+    def _new(self, value: Any) -> Lanes:
+        return Lanes(self._builder, value)
+
+    def __add__(self, other: Lanes | float) -> Lanes:
+        return self._new(self._builder.fadd(self.value, self._other(other), flags=("contract",)))
+
+    def __sub__(self, other: Lanes | float) -> Lanes:
+        return self._new(self._builder.fsub(self.value, self._other(other), flags=("contract",)))
+
+    def __mul__(self, other: Lanes | float) -> Lanes:
+        return self._new(self._builder.fmul(self.value, self._other(other), flags=("contract",)))
+
+    def __gt__(self, other: Lanes | float) -> Lanes:
+        return self._new(self._builder.fcmp_ordered(">", self.value, self._other(other)))
+
+    def select(self, yes: Lanes, no: Lanes | float) -> Lanes:
+        """Of truth values: ``yes`` where True."""
+        return self._new(self._builder.select(self.value, yes.value, yes._other(no)))
+
+    def at_least(self, other: Lanes | float) -> Lanes:
+        """The greater one; ``other`` for NaN."""
+        return (self > other).select(self, other)
+
+    def at_most(self, other: Lanes) -> Lanes:
+        """The less one; ``self`` for NaN."""
+        return (self > other).select(other, self)
+
+    def size(self) -> Lanes:
+        """Absolute values."""
+        return self.at_least(self * -1.0)
+
+    def over(self, by: Lanes) -> Lanes:
+        """The quotient."""
+        return self._new(self._builder.fdiv(self.value, by.value))
+
+    def everywhere(self, choose: Callable[[Lanes, Lanes], Lanes]) -> Lanes:
+        """The least or greatest number (``Lanes.at_most``, ``Lanes.at_least``) in all places."""
+        value, n = self, self.value.type.count
+        while (n := n // 2) > 0:
+            count = self.value.type.count
+            turned = ir.Constant(ir.VectorType(ir.IntType(32), count), [(i + n) % count for i in range(count)])
+            value = choose(value, self._new(self._builder.shuffle_vector(value.value, value.value, turned)))
+        return value
+
+    def exp2(self) -> Lanes:
+        """2^t for t < 127, and 2^-120 (doubles: 2^-1000) below: products with numbers too small for normal floats take
+        a hundred times as long.
+
+        2^n 2^r with |r| <= 1/2 and the polynomial that interpolates 2^r at Chebyshev's nodes, off by 3e-7 (3e-15) of it
+        with all rounding. Adding 1.5 2^23 (2^52) rounds to the integer n, in the last bits, from where a shift
+        brings it to the exponent.
+        """
+        double = isinstance(self.value.type.element, ir.DoubleType)
+        mantissa, degree, least = (52, 11, -1000.0) if double else (23, 5, -120.0)
+        whole = ir.VectorType(ir.IntType(64 if double else 32), self.value.type.count)
+        t, rounder = self.at_least(least), 1.5 * 2.0**mantissa
+        n = t + rounder
+        r = t - (n - rounder)
+        fit = np.polynomial.Chebyshev.interpolate(np.exp2, degree, domain=[-0.5, 0.5])
+        *lower, highest = fit.convert(kind=np.polynomial.Polynomial).coef.tolist()
+        power = r * highest + lower.pop()
+        while lower:
+            power = power * r + lower.pop()
+        b = self._builder
+        exponent = b.shl(b.bitcast(n.value, whole), ir.Constant(whole, [mantissa] * whole.count))
+        return self._new(b.bitcast(b.add(exponent, b.bitcast(power.value, whole)), self.value.type))
+
+
+class Memory:
+    """A contiguous array; places count from its first number."""
+
+    def __init__(self, builder: Any, data: Any) -> None:
+        real = data.type.pointee
+        self._builder, self._data, self._size = builder, data, 8 if isinstance(real, ir.DoubleType) else 4
+        self._vector = ir.VectorType(real, _BYTES // self._size)
+
+    def _at(self, place: Any, offset: int) -> Any:
+        place = _INDEX(place) if isinstance(place, int) else place
+        return self._builder.gep(self._data, [self._builder.add(place, _INDEX(offset)) if offset else place])
+
+    def load(self, place: Any, offset: int = 0) -> Lanes:
+        """The vector from ``place + offset`` on."""
+        value = self._builder.load(self._builder.bitcast(self._at(place, offset), self._vector.as_pointer()))
+        value.align = self._size
+        return Lanes(self._builder, value)
+
+    def store(self, value: Lanes, place: Any, offset: int = 0) -> None:
+        """Write a vector from ``place + offset`` on."""
+        at = self._builder.bitcast(self._at(place, offset), self._vector.as_pointer())
+        self._builder.store(value.value, at).align = self._size
+
+    def load_rows(self, width: int, place: Any, stride: Any) -> Lanes:
+        """A vector of rows of ``width`` numbers, from ``place`` on, ``stride`` numbers apart."""
+        row, count = ir.VectorType(self._vector.element, width), self._vector.count
+        parts = []
+        for at in self._rows(width, place, stride):
+            parts.append(self._builder.load(self._builder.bitcast(at, row.as_pointer())))
+            parts[-1].align = self._size
+        if len(parts) == 1:
+            return Lanes(self._builder, parts[0])
+        places = ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(count)))
+        return Lanes(self._builder, self._builder.shuffle_vector(*parts, places))
+
+    def store_rows(self, value: Lanes, width: int, place: Any, stride: Any) -> None:
+        """Write the rows that :meth:`load_rows` reads."""
+        row = ir.VectorType(self._vector.element, width)
+        for i, at in enumerate(self._rows(width, place, stride)):
+            places = ir.Constant(ir.VectorType(ir.IntType(32), width), list(range(i * width, (i + 1) * width)))
+            part = self._builder.shuffle_vector(value.value, value.value, places)
+            self._builder.store(part, self._builder.bitcast(at, row.as_pointer())).align = self._size
+
+    def _rows(self, width: int, place: Any, stride: Any) -> Iterator[Any]:
+        """Where the one row of a vector or its two start."""
+        for i in range(self._vector.count // width):
+            yield self._at(self._builder.add(place, self._builder.mul(stride, _INDEX(i))), 0)
+
+    def one(self, place: Any, offset: int = 0) -> Lanes:
+        """A single number, in all places of a vector."""
+        none, first = ir.Constant(self._vector, ir.Undefined), ir.IntType(32)(0)
+        filled = self._builder.insert_element(none, self._builder.load(self._at(place, offset)), first)
+        places = ir.Constant(ir.VectorType(ir.IntType(32), self._vector.count), [0] * self._vector.count)
+        return Lanes(self._builder, self._builder.shuffle_vector(filled, none, places))
+
+    def put(self, value: Lanes, place: Any, offset: int = 0) -> None:
+        """Write the first number of a vector."""
+        first = self._builder.extract_element(value.value, ir.IntType(32)(0))
+        self._builder.store(first, self._at(place, offset))
+
+
+class Code:
+    """What a function of vectors is written with.
+
+    Attributes:
+        lanes: numbers of a vector.
+    """
+
+    def __init__(self, builder: Any, lanes: int) -> None:
+        self._builder, self.lanes = builder, lanes
+
+    @contextmanager
+    def loop(self, end: Any, step: int = 1) -> Iterator[Any]:
+        """For i in range(0, end, step)."""
+        with cgutils.for_range_slice(self._builder, _INDEX(0), end, _INDEX(step), inc=True) as (i, _):
+            yield i
+
+    def times(self, place: Any, factor: int) -> Any:
+        """A product of integers."""
+        return self._builder.mul(place, _INDEX(factor)) if factor else _INDEX(0)
+
+    def plus(self, place: Any, more: Any) -> Any:
+        """A sum of integers."""
+        return self._builder.add(place, more)
+
+    def when(self, condition: Any) -> Any:
+        """A context whose code runs where the argument ``condition`` is True."""
+        return self._builder.if_then(condition)
+
+    def variable(self, value: Lanes) -> Variable:
+        """A vector that changes in a loop and stays in a register."""
+        return Variable(self._builder, value)
+
+
+class Variable:
+    """See :meth:`Code.variable`."""
+
+    def __init__(self, builder: Any, value: Lanes) -> None:
+        self._builder, self._place = builder, cgutils.alloca_once_value(builder, value.value)
+
+    @property
+    def value(self) -> Lanes:
+        return Lanes(self._builder, self._builder.load(self._place))
+
+    @value.setter
+    def value(self, value: Lanes) -> None:
+        self._builder.store(value.value, self._place)
+
+
+def vectors(function: Callable[..., None]) -> Any:
+    """Make a function of compiled code from one that writes vector instructions.
+
+    ``function(code, ...)`` gets a :class:`Code`, and a :class:`Memory` for each contiguous array of one floating dtype;
+    integers (int64) and truth values as LLVM's. It returns nothing.
+    """
+
+    def typed(typing: Any, *arguments: Any) -> Any:
+        real = next(kind.dtype for kind in arguments if isinstance(kind, types.Array))
+        lanes = _BYTES // (real.bitwidth // 8)
+
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            given = [
+                Memory(builder, context.make_array(kind)(context, builder, value).data)
+                if isinstance(kind, types.Array)
+                else value
+                for kind, value in zip(signature.args, values, strict=True)
+            ]
+            function(Code(builder, lanes), *given)
+            return context.get_dummy_value()
+
+        return types.void(*arguments), generate
+
+    names = list(inspect.signature(function).parameters)[1:]
+    parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("typing", *names)]
+    typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    typed.__name__, typed.__doc__ = function.__name__, function.__doc__
+    return intrinsic(typed)
