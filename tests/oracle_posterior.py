@@ -175,7 +175,7 @@ def update(state, depth, claimed, pixel, g, variance):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    quarter = 0.25 * np.nan_to_num(claimed)
+    quarter = 0.45 * np.nan_to_num(claimed)
     new |= discs(
         state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([quarter[r, c] for c, r in at]) / d**2
     )
@@ -189,12 +189,14 @@ def update(state, depth, claimed, pixel, g, variance):
     HX = design(X, np.arange(n), n)
     spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness
     spread = (
-        1.7 * local(logs.shape, node, residual**2 / total, noise) * spread
+        0.5 * local(logs.shape, node, residual**2 / total, noise) * spread
         + 0.0009
-        + away * (0.06 + ratio(state, "unseen"))
+        + away * (0.02 + ratio(state, "unseen"))
     )
-    offset = HX[:, 4:] @ mean[4:]
-    return after, *read(depth, quarter, logs, mean[:q], offset, spread, np.minimum(away / 0.6, 1))
+    offset, share = HX[:, 4:] @ mean[4:], np.minimum(away / 0.6, 1)
+    around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
+    spread += [tail(*each) for each in zip(share, offset, around, strict=True)]
+    return after, *read(depth, quarter, logs, mean[:q], offset, spread, share)
 
 
 def local(shape, node, z2, noise):
@@ -209,6 +211,29 @@ def local(shape, node, z2, noise):
                     above, below = above + weight * min(z2[k], 9), below + weight
             out[r, c] = above / below
     return out.ravel()
+
+
+def y_variance(shape, node, y, noise, used, centre):
+    """Of the used anchors around every node, each cell and certain anchor counted alike, weighted by a Gaussian of .12
+    of the image, and of one of variance .25 about ``centre``."""
+    out, count = np.empty(shape), np.bincount(node, minlength=shape[0] * shape[1])
+    for r in range(shape[0]):
+        for c in range(shape[1]):
+            weights, values = [1.0], [centre]
+            for k, i in enumerate(node):
+                if used[k]:
+                    far = ((i // shape[1] - r) / shape[0]) ** 2 + ((i % shape[1] - c) / shape[1]) ** 2
+                    weights.append(math.exp(-far / 0.12**2 / 2) / (1 + noise[k] / 0.04) / count[i])
+                    values.append(y[k])
+            middle = np.average(values, weights=weights)
+            out[r, c] = (np.average((np.array(values) - middle) ** 2, weights=weights)) + 0.25 / sum(weights)
+    return out.ravel()
+
+
+def tail(share, offset, around):
+    """(.03 + .08 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 4."""
+    a, q = 0.04 + 1.6 * around, min(math.exp(-offset), 4)
+    return (0.03 + 0.08 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
@@ -227,7 +252,10 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     square = np.minimum(error, 9 * total) / 0.995
     believed = np.where(held, 1 / (1 + noise / 0.04), 0.0)
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
-    final = 1.7 * var + noise + 0.0009 + away * (0.06 + ratio(state, "unseen")) + np.minimum(away / 0.6, 1) * claimed
+    share, around = np.minimum(away / 0.6, 1), y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
+    offset = H[:, GLOBALS:] @ mean[GLOBALS:]
+    final = 0.5 * var + noise + 0.0009 + away * (0.02 + ratio(state, "unseen")) + share * claimed
+    final += [tail(*each) for each in zip(share, offset, around, strict=True)]
     return {
         "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),
         "unseen": ((area * (np.minimum(error, 4) - total)).sum(), (area * away).sum()),

@@ -172,8 +172,10 @@ def _of_stream(
     mean, variance = at(field, node, x)
     b = field.coefficients[:GLOBALS]
     variance = MODEL.inflation * _local(scene, near) * (variance + running.ratios["roughness"])
-    variance, share = variance + MODEL.common + away * running.growth, np.minimum(away / MODEL.far, 1)
-    nodes = np.stack([grid.log_depth, mean - (x[:, :GLOBALS] * b).sum(1), variance, share], 1)
+    share, offset = np.minimum(away / MODEL.far, 1), mean - (x[:, :GLOBALS] * b).sum(1)
+    variance = variance + MODEL.common + away * running.growth
+    variance = variance + _tail(share, offset, _spread(scene, near, np.ones(len(near.noise), np.bool_), b[0]))
+    nodes = np.stack([grid.log_depth, offset, variance, share], 1)
     return kept, *read(depth, valid, logs, claimed, nodes, b, grid.mean, (rows, cols), MODEL)
 
 
@@ -235,6 +237,29 @@ def _local(scene: _Scene, near: _Near) -> Floats:
     return z2 / weight
 
 
+def _spread(scene: _Scene, near: _Near, used: NDArray[np.bool_], mean: float) -> Floats:
+    each = np.where(used, scene.believed(near) / scene.counted(np.ones(len(near.noise))), 0.0)
+    grid, y = scene.grid, scene.observed.value
+    sums = [np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in (each, each * y, each * y**2)]
+    nodes = np.stack(sums).reshape(3, grid.rows, grid.cols)
+    weight, first, second = (_window(grid.rows) @ nodes @ _window(grid.cols)).reshape(3, -1)
+    total = weight + MODEL.few
+    middle = (first + MODEL.few * mean) / total
+    moment = (second + MODEL.few * (mean**2 + MODEL.prior[0] ** 2)) / total
+    spread: Floats = np.maximum(moment - middle**2, 0)
+    return spread
+
+
+def _window(count: int) -> Floats:
+    at_ = np.arange(count) / count
+    return np.exp(-(((at_[:, None] - at_) / MODEL.window) ** 2) / 2)
+
+
+def _tail(share: Floats, offset: Floats, spread: Floats) -> Floats:
+    a, q = MODEL.least_spread + MODEL.spread * spread, np.exp(np.minimum(-offset, MODEL.most))
+    return (MODEL.wrong + MODEL.other * share) * (q * q * np.exp(2 * a) - 2 * q * np.exp(a / 2) + 1)
+
+
 def _away(scene: _Scene, evidence: NDArray[np.bool_]) -> Floats:
     grid = scene.grid
     source = np.zeros(len(grid.log_depth), np.bool_)
@@ -284,7 +309,10 @@ def _of_discs(
     believed = np.where(held, scene.believed(near), 0.0)
     area, claimed = (believed / np.maximum(scene.counted(believed), 1e-12))[held], claimed[held]
     final = MODEL.inflation * variance + noise + MODEL.common + away * running.growth
-    final = final + np.minimum(away / MODEL.far, 1) * claimed
+    share, b = np.minimum(away / MODEL.far, 1), field.coefficients[:GLOBALS]
+    offset = mean - (scene.observed.features[held, :GLOBALS] * b).sum(1)
+    spread = _spread(scene, near, rest, b[0])[scene.observed.node[held]]
+    final = final + share * claimed + _tail(share, offset, spread)
     sums = {
         "amplitude": (area * (square - noise) / tot, area * variance / tot / running.ratios["amplitude"]),
         "unseen": (area * (np.minimum(error, MODEL.square) - tot), area * away),

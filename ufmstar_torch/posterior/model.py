@@ -20,13 +20,18 @@ class Model(NamedTuple):
         hat: variance of a hat, times the amplitude.
         prior, drift: standard deviation of the coefficients of 1, log d, u and v before the first anchor, and of their
             change from frame to frame: those of the true error on tours.
-        inflation: by what factor the field's variance and the roughness are too small: anchors of one surface err
-            together.
+        inflation: factor of the field's variance and the roughness: what the outliers add is counted apart.
         common: variance of y that all nodes share: the scale of the poses.
         limit: largest distance from evidence that counts.
         growth: variance of y by distance from evidence, beyond what held-out anchors show: they lie where there is
             texture.
         claimed, far: share of the variance that UfM* claims, from this distance on; less in proportion nearer.
+        wrong, other: probability that the field's local correction does not hold at a node: on evidence, since that
+            may be wrong, and what is added to it from the distance ``far`` on, since another surface may begin.
+        spread, least_spread: variance of y where it does not hold, over that of the anchors' y around, and its least.
+        window: standard deviation of the Gaussian that weighs the anchors around a node.
+        few: weight of the prior variance of y in it, in certain anchors.
+        most: largest log factor between the depth without the local correction and the one with it.
         square: largest y^2 of a held-out anchor in what is learnt of the growth: a factor of e^2.
         near, alone: leave-one-out residuals count in a square of ``2 near + 1`` cells, together with this many anchors
             of z^2 = 1.
@@ -54,12 +59,19 @@ class Model(NamedTuple):
     hat: float = 0.1**2
     prior: tuple[float, float, float, float] = (0.5, 0.45, 0.2, 0.2)
     drift: tuple[float, float, float, float] = (0.06, 0.06, 0.04, 0.03)
-    inflation: float = 1.7
+    inflation: float = 0.5
     common: float = 0.03**2
     limit: float = 2.0
-    growth: float = 0.06
-    claimed: float = 0.25
+    growth: float = 0.02
+    claimed: float = 0.45
     far: float = 0.6
+    wrong: float = 0.03
+    other: float = 0.08
+    spread: float = 1.6
+    least_spread: float = 0.04
+    window: float = 0.12
+    few: float = 1.0
+    most: float = 1.3862943611198906
     square: float = 4.0
     near: int = 2
     alone: float = 2.0

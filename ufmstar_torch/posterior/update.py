@@ -18,7 +18,9 @@ outliers out.
 
 Variance of y at a node:
 
-    local 1.7 (the field's + roughness) + .03^2 + distance (.06 + unseen) + min(1, distance/.6) V/(4 d^2).
+    local/2 (the field's + roughness) + .03^2 + distance (.02 + unseen) + .45 share V/d^2 + (.03 + .08 share) tail
+
+with share = min(1, distance/.6).
 
 ``local`` is the mean z^2 of the leave-one-out residuals of the anchors in the cells around: the error is rougher on one
 surface than on another. The distance from evidence is geodesic, in widths of the image, and depth edges lengthen it: on
@@ -26,6 +28,15 @@ tours the variance of the error grows in proportion to it. All amplitudes are le
 discs that move over the image: the field is fitted without them, and they count by area and not by number, since
 corners cluster on what is well textured. ``unseen`` is what their squared error is beyond the rest, over their
 distance. V = M + A + E counts where evidence is far. .03^2 is the common scale of the poses.
+
+``tail`` is the second moment about the posterior depth if the local correction o, hats + f, does not hold, because the
+evidence is wrong or lies on another surface. Then y - b . x is normal with the variance a, and the depth log-normal:
+
+    tail = E[(e^(n - o) - 1)^2] = q^2 e^(2 a) - 2 q e^(a/2) + 1,      q = e^-o <= 4,      n ~ N(0, a).
+
+a is .04 and 1.6 times the variance of the anchors' y around, of a Gaussian window. So no pixel is more certain than
+contradictory evidence allows, and a depth that was pulled far below the global correction is less certain than one
+above it.
 
 A stream that is given anchors of which none was valid so far has that variance without evidence, about the network's
 depth: nothing was measured, and nothing reads as certain. A stream without anchors is UfM*'s.
@@ -164,6 +175,7 @@ def update(
     offset = mean - (features[..., :GLOBALS] * b[:, None, :GLOBALS]).sum(-1)
     variance = MODEL.inflation * _local(scene, near) * (variance + running.ratio("roughness")[:, None])
     variance = variance + MODEL.common + away * running.growth()[:, None]
+    variance = variance + _tail(share, offset, _spread(scene, near, anchors.valid, b[:, 0]))
     nodes = torch.stack([grid.log_depth, offset, variance, share], -1)
     depth, spread = read(frame.depth, frame.valid, claimed_share, nodes, b[:, :GLOBALS], grid.mean, grid.size)
     some = anchors.valid.any(1)
@@ -250,6 +262,33 @@ def _local(scene: _Scene, near: _Near) -> Tensor:
     return (around[0] + MODEL.alone) / (around[1] + MODEL.alone)
 
 
+def _spread(scene: _Scene, near: _Near, used: Tensor, mean: Tensor) -> Tensor:
+    """[B, n] variance of y among the anchors of the mask [B, N] around every node, with a prior about ``mean`` [B]."""
+    each = torch.where(used, scene.believed(near) / scene.counted(torch.ones_like(near.noise)).clamp_min(1), 0.0)
+    y, (rows, cols) = scene.observed.value, scene.grid.size
+    nodes = torch.zeros(3, *scene.grid.log_depth.shape, dtype=each.dtype, device=each.device)
+    values = torch.stack([each, each * y, each * y.square()])
+    nodes = nodes.scatter_add(2, scene.observed.node.expand(3, -1, -1), values).unflatten(2, (rows, cols))
+    around = (_window(rows, mean) @ nodes @ _window(cols, mean)).flatten(2)
+    centre, prior = mean[:, None], MODEL.prior[0] ** 2
+    total = around[0] + MODEL.few
+    middle = (around[1] + MODEL.few * centre) / total
+    return ((around[2] + MODEL.few * (centre.square() + prior)) / total - middle.square()).clamp_min(0)
+
+
+def _window(count: int, like: Tensor) -> Tensor:
+    """[count, count] weight of a row of nodes, or column, for another one."""
+    at = torch.arange(count, dtype=like.dtype, device=like.device) / count
+    return (-((at[:, None] - at) / MODEL.window).square() / 2).exp()
+
+
+def _tail(share: Tensor, offset: Tensor, spread: Tensor) -> Tensor:
+    """Variance over the squared depth by what the local correction ``offset`` may have wrong."""
+    a, q = MODEL.least_spread + MODEL.spread * spread, (-offset).clamp_max(MODEL.most).exp()
+    second = q.square() * (2 * a).exp() - 2 * q * (a / 2).exp() + 1
+    return (MODEL.wrong + MODEL.other * share) * second
+
+
 def _away(scene: _Scene, evidence: Tensor) -> Tensor:
     """[B, n] how far every node is from the anchors of the mask [B, N], in widths of the image."""
     grid = scene.grid
@@ -305,7 +344,10 @@ def _of_discs(
     believed = torch.where(held, scene.believed(near), 0.0)
     area = believed / scene.counted(believed).clamp_min(1e-12)
     final = MODEL.inflation * variance + near.noise + MODEL.common + away * running.growth()[:, None]
-    final = final + (away / MODEL.far).clamp_max(1) * claimed
+    b, share = field.coefficients, (away / MODEL.far).clamp_max(1)
+    offset = mean - (scene.observed.features[..., :GLOBALS] * b[:, None, :GLOBALS]).sum(-1)
+    spread = torch.gather(_spread(scene, near, rest, b[:, 0]), 1, scene.observed.node)
+    final = final + share * claimed + _tail(share, offset, spread)
     return {
         "amplitude": (
             total(area * (square - near.noise) / tot, 1),
