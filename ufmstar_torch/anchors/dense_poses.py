@@ -36,8 +36,8 @@ _ENOUGH = 10
 _MEDIAN_SQUARE = 0.4549
 # [px] Standard deviation of a position by errors of the poses before it is estimated, and the least one.
 _FIRST, _LEAST = 0.3, 0.003
-# A pixel's own variance over the one stated by its match is so many times the mean squared difference of its views, with
-# the running one as that of one more: views share the patch and its errors. Fitted on tours.
+# A pixel's own variance over the one stated by its match is so many times the mean squared difference of its views,
+# with the running one as that of one more: views share the patch and its errors. Fitted on tours.
 _PATCH = 2.0
 # Times that their effect is linearised.
 _LINEARISED = 2
