@@ -74,12 +74,10 @@ def measure_anchors(
     """Time the tracker and the anchored step with ``points`` corners, on one thread of torch, numba and OpenCV.
 
     Args:
-        source: of the step's depth maps.
-        config: of the step.
+        source, config, step_size: of the step and its depth maps [px].
         points: corners to follow on average, and anchors of a step.
         frames: timed.
         history, in_view: as :func:`~ufmstar_torch.eval.bench.step.build_up` takes them.
-        step_size: of the step's depth maps [px].
         tour: images of the tracker.
 
     Returns:

@@ -167,12 +167,8 @@ def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
 
 
 def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -> None:
-    """Draw delta calibration, quantile calibration and sparsification side by side and write the picture (PNG).
-
-    Args:
-        path: the file; its folder must exist.
-        curves: ``SequenceMetrics.curves()`` by the name that the legend shows.
-        title: over the picture.
+    """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name that
+    the legend shows) side by side under a title, and write the picture (PNG).
 
     Raises:
         ValueError: there are no curves, or more than have a look of their own.

@@ -35,15 +35,8 @@ QUALITY = (NLL, ECE_DELTA, ECE_Q)
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """A row against another one in one figure, in pairs on the same sequences.
-
-    Attributes:
-        row: judged.
-        reference: beside which.
-        quantity: the figure.
-        mine: mean of the row over the sequences that both have.
-        theirs: that of the reference.
-        difference: mine - theirs, with its interval.
+    """A row against another one in one figure, in pairs on the same sequences: means over the sequences that both have,
+    and the mean of mine - theirs with its interval.
     """
 
     row: Row

@@ -158,12 +158,8 @@ def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: 
 
 
 def panel(name: str, note: str, result: FrameResult) -> FramePanel:
-    """One row of the demo's sheet: depth, sigma and true error, of UfM* and of the posterior.
-
-    Args:
-        name: of the frame.
-        note: the kind of room.
-        result: the frame through the demo's rows, with an image and ground truth.
+    """One row of the demo's sheet: depth, sigma and true error, of UfM* and of the posterior, for a frame (with an
+    image and ground truth) through the demo's rows; ``note`` is the kind of room.
     """
     star: Any = result.rows[UFM_STAR]
     maps: dict[str, Any] = {}
@@ -184,10 +180,10 @@ def write_pictures(
     ufm_star: UfMStar,
     title: str,
 ) -> dict[str, str | None]:
-    """Write all of :data:`DEMO_FILES`.
+    """Write all of :data:`DEMO_FILES` into an existing folder.
 
     Args:
-        out: an existing folder.
+        out: the folder.
         panels: rows of the contact sheet.
         metrics: by the name that the legend shows.
         ufm_star: at the end of the tour.
@@ -195,9 +191,6 @@ def write_pictures(
 
     Returns:
         By file: None if it was written, else why not (an optional package is missing).
-
-    Raises:
-        OSError: a full disk, say.
     """
     from ufmstar_torch.eval.report.figures_calibration import write_curves
 

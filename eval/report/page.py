@@ -81,9 +81,6 @@ def write_page(
         undrawn: reasons by figure, of those that could not be drawn.
         most_bytes: of all pictures together; those that do not fit are named instead.
 
-    Returns:
-        The file.
-
     Raises:
         ValueError: a picture cannot be read.
         ImportError: Pillow or Jinja2 is missing.

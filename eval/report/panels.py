@@ -33,13 +33,8 @@ _GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One picture.
-
-    Attributes:
-        rgb: [h, w, 3] uint8; None leaves a place with the words ``absent``.
-        caption: above it.
-        box: outlined in it.
-        absent: why there is no picture.
+    """One picture [h, w, 3] uint8 with a caption above and a box outlined in it; None leaves a place with the words
+    ``absent``.
     """
 
     rgb: NDArray[np.uint8] | None
