@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ufmstar_torch.eval.check.data_check import DataReport
+from ufmstar_torch.eval.report.names import count
 
 
 def page(report: DataReport) -> str:
@@ -13,7 +14,7 @@ def page(report: DataReport) -> str:
         return "\n".join([f"{report.name}: {report.path}", *_problems(report), _end(report)])
     lines = [
         f"{report.name}: layout {report.layout}, {report.frames} of {report.on_disk} frames usable",
-        *(f"  skipped       {count} x {reason}" for reason, count in report.skipped.items()),
+        *(f"  skipped       {n} x {reason}" for reason, n in report.skipped.items()),
         f"  images        {_size(report.image_size)}, {_camera(report.intrinsics)}",
         f"  depth         {_depth(report)}",
         f"  poses         {f'path of {report.walked:.1f} m' if report.posed else 'none: single images'}",
@@ -21,7 +22,7 @@ def page(report: DataReport) -> str:
     if report.checked and report.posed:
         pairs, gap, error = (report.checked[key] for key in ("pairs", "gap", "error"))
         fit = f"off by {error:.1%}" if error < float("inf") else "does not overlap"
-        lines.append(f"  geometry      depth warped {_count(gap, 'frame')} on {fit} ({_count(pairs, 'pair')})")
+        lines.append(f"  geometry      depth warped {count(gap, 'frame')} on {fit} ({count(pairs, 'pair')})")
     lies = report.checked.get("registration")
     if lies is not None:
         lines.append(f"  registration  {lies['quality']:.2f} of 1: how well depth edges meet image edges as they are")
@@ -49,7 +50,7 @@ def _problems(report: DataReport) -> list[str]:
 
 
 def _end(report: DataReport) -> str:
-    return "fine" if report.ok else _count(len(report.problems), "problem")
+    return "fine" if report.ok else count(len(report.problems), "problem")
 
 
 def _size(size: tuple[int, int] | None) -> str:
@@ -66,9 +67,5 @@ def _depth(report: DataReport) -> str:
     low, high = report.depth_range
     maps = f"{_size(report.depth_size)}, {low:.2f} to {high:.2f} m, {report.filled:.0%} of the pixels"
     camera = "" if report.depth_intrinsics is None else f", a camera of its own: {_camera(report.depth_intrinsics)}"
-    missing = f", {_count(report.without_depth, 'frame')} without" if report.without_depth else ""
+    missing = f", {count(report.without_depth, 'frame')} without" if report.without_depth else ""
     return maps + camera + missing
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

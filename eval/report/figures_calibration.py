@@ -13,9 +13,9 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.colours import FAINT
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import value_of
+from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.style import (
     Style,
-    counted,
     finish,
     hidden_panels,
     label_ends,
@@ -42,7 +42,7 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
     }
     if not panels:
         return None
-    title = f"Calibration on {dataset}, all pixels of {counted(len(results.sequences(dataset)))}"
+    title = f"Calibration on {dataset}, all pixels of {count(len(results.sequences(dataset)), 'sequence')}"
     return _draw_columns(title, list(panels.values()), PER_LINE, (0.5, 3.4, 0.4, 6.0), ends=True)
 
 

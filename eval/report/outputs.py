@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.metrics import SequenceMetrics
@@ -140,9 +142,7 @@ def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
     """
     f = max(K[0, 0], K[1, 1])
     new = (round(size[0] * f / K[1, 1]), round(size[1] * f / K[0, 0]))
-    sx, sy = new[1] / size[1], new[0] / size[0]
-    cx, cy = (K[0, 2] + 0.5) * sx - 0.5, (K[1, 2] + 0.5) * sy - 0.5
-    return pinhole(K[0, 0] * sx, K[1, 1] * sy, cx, cy), new
+    return resize_intrinsics(torch.from_numpy(K), size, new).numpy(), new
 
 
 def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) -> NDArray[np.uint8]:
