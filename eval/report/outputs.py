@@ -23,7 +23,7 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.report.panels import FramePanel, MapColumn, contact_sheet, map_columns
-from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
+from ufmstar_torch.eval.report.video import preview_frame, write_video
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
@@ -118,9 +118,9 @@ def draw_sheet(finished: Finished, columns: Sequence[MapColumn], title: str) -> 
 
 def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int]:
     """Write preview.mp4 frame by frame; yields how many are done, so that the caller can report and stop."""
-    with VideoWriter(finished.out / "preview.mp4", finished.fps()) as video:
+    with write_video(finished.out / "preview.mp4", finished.fps()) as add:
         for number in range(len(finished.records)):
-            video.add(preview_frame(finished.panel(number), columns))
+            add(preview_frame(finished.panel(number), columns))
             yield number + 1
 
 

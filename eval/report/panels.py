@@ -100,11 +100,8 @@ def draw_grid(
         dpi: pixels per inch.
 
     Raises:
-        ValueError: there is no row.
         ImportError: matplotlib is missing.
     """
-    if not rows:
-        raise ValueError("rows must hold at least one row of pictures")
     names = [break_name(row.title, max(8, int(12 * words))) for row in rows]
     named = [0.16 * (name.count("\n") + 1) + 0.05 for name in names]
     heads = [_CAPTION if any(panel.caption for panel in row.panels) else 0.0 for row in rows]

@@ -275,13 +275,8 @@ def largest_difference(difference: NDArray[Any], share: float) -> Box:
     the top left.
 
     Returns:
-        (left, top, width, height) [px]; its side by that of the map is ``share``.
-
-    Raises:
-        ValueError: share is not in (0, 1].
+        (left, top, width, height) [px]; its side by that of the map is ``share``, in (0, 1].
     """
-    if not 0 < share <= 1:
-        raise ValueError(f"share must lie in (0, 1], got {share}")
     h, w = difference.shape
     height, width = max(1, round(share * h)), max(1, round(share * w))
     size = np.where(np.isfinite(difference), np.abs(difference), 0).astype(np.float64)
