@@ -112,7 +112,7 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[NDArray[np.u
     # ffmpeg goes by the ending, so it comes last here.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.mp4")
     # yuv420p is what browsers and slide programs play.
-    how = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 7}
+    how: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 7}
     writer: Any = None
     size: tuple[int, ...] = ()
 
