@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ufmstar_torch.eval.check.data_check import DataReport
-from ufmstar_torch.eval.report.names import count
 
 
 def page(report: DataReport) -> str:
@@ -22,7 +21,7 @@ def page(report: DataReport) -> str:
     if report.checked and report.posed:
         pairs, gap, error = (report.checked[key] for key in ("pairs", "gap", "error"))
         fit = f"off by {error:.1%}" if error < float("inf") else "does not overlap"
-        lines.append(f"  geometry      depth warped {count(gap, 'frame')} on {fit} ({count(pairs, 'pair')})")
+        lines.append(f"  geometry      depth warped {_count(gap, 'frame')} on {fit} ({_count(pairs, 'pair')})")
     lies = report.checked.get("registration")
     if lies is not None:
         lines.append(f"  registration  {lies['quality']:.2f} of 1: how well depth edges meet image edges as they are")
@@ -50,7 +49,7 @@ def _problems(report: DataReport) -> list[str]:
 
 
 def _end(report: DataReport) -> str:
-    return "fine" if report.ok else count(len(report.problems), "problem")
+    return "fine" if report.ok else _count(len(report.problems), "problem")
 
 
 def _size(size: tuple[int, int] | None) -> str:
@@ -67,5 +66,9 @@ def _depth(report: DataReport) -> str:
     low, high = report.depth_range
     maps = f"{_size(report.depth_size)}, {low:.2f} to {high:.2f} m, {report.filled:.0%} of the pixels"
     camera = "" if report.depth_intrinsics is None else f", a camera of its own: {_camera(report.depth_intrinsics)}"
-    missing = f", {count(report.without_depth, 'frame')} without" if report.without_depth else ""
+    missing = f", {_count(report.without_depth, 'frame')} without" if report.without_depth else ""
     return maps + camera + missing
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
