@@ -181,3 +181,8 @@ def shared_words(rows: Iterable[Row]) -> str:
     """How images were prepared for all rows, "" where their networks' weights decide or rows differ."""
     prepared = {row.setting.preprocess for row in rows}
     return _WORDS.get(("preprocess", prepared.pop()), "") if len(prepared) == 1 else ""
+
+
+def count(n: int, noun: str) -> str:
+    """ "1 row", "2 rows"."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"
