@@ -46,22 +46,21 @@ STRIDE = 4  # judged are every fourth pixel of every fourth row
 CUBE, FACTOR = 1.7, 0.35  # of the wrong network [m], and the standard deviation of its log factors
 CHANGES: tuple[Mapping[str, Any], ...] = (
     {},
-    *({"growth": value} for value in (0.0, 0.05, 0.15)),
-    *({"limit": value} for value in (0.6, 1.0, 3.0)),
-    *({"inflation": value} for value in (1.0, 2.5)),
-    *({"alone": value} for value in (0.5, 8.0, 1e9)),
-    *({"near": value} for value in (1, 4)),
-    *({"square": value} for value in (0.25, 1.0)),
+    {"wrong": 0.0, "other": 0.0},
+    *({"wrong": value} for value in (0.0, 0.01, 0.06)),
+    *({"other": value} for value in (0.0, 0.2)),
+    *({"spread": value} for value in (0.8, 3.0)),
+    *({"window": value} for value in (0.06, 0.25)),
+    *({"most": value} for value in (0.0, 3.0)),
+    *({"growth": value} for value in (0.0, 0.06)),
+    *({"inflation": value} for value in (0.25, 1.0, 1.7)),
     *({"claimed": value} for value in (0.0, 1.0)),
-    *({"climb": value} for value in (0.5, 1.0)),
+    *({"alone": value} for value in (0.5, 1e9)),
+    {"square": 1.0},
+    {"climb": 1.0},
     *({"kappa": value} for value in (0.1, 2.0)),
     {"drift": (0.12, 0.12, 0.08, 0.06)},
-    {"drift": (0.03, 0.03, 0.02, 0.015)},
-    {"prior": (1.0, 0.9, 0.4, 0.4)},
-    *({"flat": value} for value in (0.002, 0.008)),
-    *({"edge": value} for value in (1.0, 4.0)),
     *({"hat": value} for value in (1e-6, 0.04)),
-    *({"rounds": value} for value in (1, 3)),
 )
 
 

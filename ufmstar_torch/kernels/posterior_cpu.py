@@ -5,6 +5,7 @@ What takes time is compiled (``field_cpu``, ``cells_cpu``); what is left are a f
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -250,6 +251,7 @@ def _spread(scene: _Scene, near: _Near, used: NDArray[np.bool_], mean: float) ->
     return spread
 
 
+@functools.lru_cache(maxsize=4)  # the sizes of the grid hardly change
 def _window(count: int) -> Floats:
     at_ = np.arange(count) / count
     return np.exp(-(((at_[:, None] - at_) / MODEL.window) ** 2) / 2)
