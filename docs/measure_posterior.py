@@ -46,7 +46,7 @@ STRIDE = 4  # judged are every fourth pixel of every fourth row
 CUBE, FACTOR = 1.7, 0.35  # of the wrong network [m], and the standard deviation of its log factors
 CHANGES: tuple[Mapping[str, Any], ...] = (
     {},
-    {"wrong": 0.0, "other": 0.0},
+    {"wrong": 0.0, "other": 0.0, "inflation": 1.7, "growth": 0.06, "claimed": 0.25},
     *({"wrong": value} for value in (0.0, 0.01, 0.06)),
     *({"other": value} for value in (0.0, 0.2)),
     *({"spread": value} for value in (0.8, 3.0)),
