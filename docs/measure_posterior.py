@@ -5,7 +5,8 @@
 prints a row for each change of ``ufmstar_torch.posterior.model``, means over tours, networks and evidence: FastDepth,
 the demo's first network and one that is made of the truth, off by a factor of its own in every cube of space; dense
 evidence, tracked corners, and of the dense evidence only what is nearer than 40 % of the image. ``--clips`` names
-recordings, for report: FastDepth, from the first anchor on, and the NLL of the best constant variance.
+recordings, for report: FastDepth, from the first anchor on, the NLL of the best constant variance, and the network's
+depth times the frame's median g/d at the anchors.
 """
 
 from __future__ import annotations
@@ -137,6 +138,16 @@ def figures(taken: list[Taken], kind: str, change: Mapping[str, Any]) -> dict[st
     return metrics.compute()
 
 
+def scaled(taken: list[Taken], kind: str) -> dict[str, float]:
+    """Of the network's depth times the frame's median g/d at the anchors."""
+    metrics = SequenceMetrics(with_variance=False)
+    for one in taken:
+        anchors = one.anchors[kind]
+        factor = (anchors.depth / anchors.predicted)[anchors.valid].median().nan_to_num(1.0)
+        metrics.update((one.frame.depth[0] * factor)[::STRIDE, ::STRIDE], None, one.truth[::STRIDE, ::STRIDE])
+    return metrics.compute()
+
+
 def recordings(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Taken]]]:
     """Every tour with every network, with its name."""
     with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
@@ -167,15 +178,17 @@ def main() -> None:
         means = (np.mean([row[name] for row in of]) for of in columns for name in SHOWN)
         line(", ".join(f"{k} {v}" for k, v in change.items()) or "as it is", *map(shown, means))
     if arguments.clips:
-        line("sequence", "evidence", *SHOWN, "constant")
-        line(*["---"] * (3 + len(SHOWN)))
+        line("sequence", "evidence", *SHOWN, "constant", "median: delta1", "median: rmse")
+        line(*["---"] * (5 + len(SHOWN)))
     for source in arguments.clips:
         taken = record(source, load_network("fastdepth", arguments.weights).eval(), (DENSE, CORNERS))
         for kind in (DENSE, CORNERS):
             first = next(i for i, one in enumerate(taken) if bool(one.anchors[kind].valid.any()))
             row = figures(taken[first:], kind, {})
             constant = 0.5 * (np.log(2 * np.pi * row["rmse"] ** 2) + 1)
-            line(Path(source).name, kind, *(shown(row[name]) for name in SHOWN), shown(constant))
+            median = scaled(taken[first:], kind)
+            after = (constant, median["delta1"], median["rmse"])
+            line(Path(source).name, kind, *(shown(row[name]) for name in SHOWN), *map(shown, after))
 
 
 if __name__ == "__main__":
