@@ -20,7 +20,7 @@ class Model(NamedTuple):
         hat: variance of a hat, times the amplitude.
         prior, drift: standard deviation of the coefficients of 1, log d, u and v before the first anchor, and of their
             change from frame to frame: those of the true error on tours.
-        inflation: factor of the field's variance and the roughness: what the outliers add is counted apart.
+        inflation: factor of the field's variance and the roughness; what outliers add is counted apart.
         common: variance of y that all nodes share: the scale of the poses.
         limit: largest distance from evidence that counts.
         growth: variance of y by distance from evidence, beyond what held-out anchors show: they lie where there is
@@ -59,13 +59,13 @@ class Model(NamedTuple):
     hat: float = 0.1**2
     prior: tuple[float, float, float, float] = (0.5, 0.45, 0.2, 0.2)
     drift: tuple[float, float, float, float] = (0.06, 0.06, 0.04, 0.03)
-    inflation: float = 0.5
+    inflation: float = 1.0
     common: float = 0.03**2
     limit: float = 2.0
     growth: float = 0.02
-    claimed: float = 0.45
+    claimed: float = 0.3
     far: float = 0.6
-    wrong: float = 0.03
+    wrong: float = 0.01
     other: float = 0.08
     spread: float = 1.6
     least_spread: float = 0.04
