@@ -175,7 +175,7 @@ def update(state, depth, claimed, pixel, g, variance):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    counted = 0.3 * np.nan_to_num(claimed)
+    counted = 0.45 * np.nan_to_num(claimed)
     new |= discs(
         state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([counted[r, c] for c, r in at]) / d**2
     )
@@ -189,7 +189,9 @@ def update(state, depth, claimed, pixel, g, variance):
     HX = design(X, np.arange(n), n)
     spread = np.einsum("ij,jk,ik->i", HX, C, HX) + roughness
     spread = (
-        local(logs.shape, node, residual**2 / total, noise) * spread + 0.0009 + away * (0.02 + ratio(state, "unseen"))
+        0.5 * local(logs.shape, node, residual**2 / total, noise) * spread
+        + 0.0009
+        + away * (0.02 + ratio(state, "unseen"))
     )
     offset, share = HX[:, 4:] @ mean[4:], np.minimum(away / 0.6, 1)
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
@@ -229,9 +231,9 @@ def y_variance(shape, node, y, noise, used, centre):
 
 
 def tail(share, offset, around):
-    """(.01 + .08 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 4."""
+    """(.03 + .08 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 4."""
     a, q = 0.04 + 1.6 * around, min(math.exp(-offset), 4)
-    return (0.01 + 0.08 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
+    return (0.03 + 0.08 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
@@ -252,7 +254,7 @@ def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):
     area = believed / np.maximum(np.bincount(node, believed, minlength=logs.size)[node], 1e-12)
     share, around = np.minimum(away / 0.6, 1), y_variance(logs.shape, node, y, noise, rest, mean[0])[node]
     offset = H[:, GLOBALS:] @ mean[GLOBALS:]
-    final = var + noise + 0.0009 + away * (0.02 + ratio(state, "unseen")) + share * claimed
+    final = 0.5 * var + noise + 0.0009 + away * (0.02 + ratio(state, "unseen")) + share * claimed
     final += [tail(*each) for each in zip(share, offset, around, strict=True)]
     return {
         "amplitude": ((area * (square - noise) / total).sum(), (area * var / total).sum() / ratio(state, "amplitude")),

@@ -59,13 +59,13 @@ class Model(NamedTuple):
     hat: float = 0.1**2
     prior: tuple[float, float, float, float] = (0.5, 0.45, 0.2, 0.2)
     drift: tuple[float, float, float, float] = (0.06, 0.06, 0.04, 0.03)
-    inflation: float = 1.0
+    inflation: float = 0.5
     common: float = 0.03**2
     limit: float = 2.0
     growth: float = 0.02
-    claimed: float = 0.3
+    claimed: float = 0.45
     far: float = 0.6
-    wrong: float = 0.01
+    wrong: float = 0.03
     other: float = 0.08
     spread: float = 1.6
     least_spread: float = 0.04

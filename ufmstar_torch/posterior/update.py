@@ -18,7 +18,7 @@ outliers out.
 
 Variance of y at a node:
 
-    local (the field's + roughness) + .03^2 + distance (.02 + unseen) + .3 share V/d^2 + (.01 + .08 share) tail
+    local/2 (the field's + roughness) + .03^2 + distance (.02 + unseen) + .45 share V/d^2 + (.03 + .08 share) tail
 
 with share = min(1, distance/.6).
 
