@@ -243,7 +243,7 @@ def _spread(scene: _Scene, near: _Near, used: NDArray[np.bool_], mean: float) ->
     grid, y = scene.grid, scene.observed.value
     sums = [np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in (each, each * y, each * y**2)]
     nodes = np.stack(sums).reshape(3, grid.rows, grid.cols)
-    weight, first, second = (_window(grid.rows) @ nodes @ _window(grid.cols)).reshape(3, -1)
+    weight, first, second = (_window(grid.rows, MODEL.window) @ nodes @ _window(grid.cols, MODEL.window)).reshape(3, -1)
     total = weight + MODEL.few
     middle = (first + MODEL.few * mean) / total
     moment = (second + MODEL.few * (mean**2 + MODEL.prior[0] ** 2)) / total
@@ -252,9 +252,9 @@ def _spread(scene: _Scene, near: _Near, used: NDArray[np.bool_], mean: float) ->
 
 
 @functools.lru_cache(maxsize=4)  # the sizes of the grid hardly change
-def _window(count: int) -> Floats:
+def _window(count: int, width: float) -> Floats:
     at_ = np.arange(count) / count
-    return np.exp(-(((at_[:, None] - at_) / MODEL.window) ** 2) / 2)
+    return np.exp(-(((at_[:, None] - at_) / width) ** 2) / 2)
 
 
 def _tail(share: Floats, offset: Floats, spread: Floats) -> Floats:
