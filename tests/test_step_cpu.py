@@ -152,7 +152,7 @@ def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
     near, occupied = reach_cpu.reached(motion, *slots, camera, SIZE, 1.0, 1e-6, 0)
     u, v = (camera[i, i] * mean[:, i] / mean[:, 2] + camera[i, 2] for i in range(2))
     inside = (u >= -0.5) & (u < SIZE[1] - 0.5) & (v >= -0.5) & (v < SIZE[0] - 0.5) & (mean[:, 2] > 0.05)
-    args = (mean, covariance, weight, weight, np.zeros((400, 0)), camera, *SIZE, 1.0, 0.0, 1e-6, np.float64(0))
+    args = (mean, covariance, weight, weight, np.zeros((400, 0)), camera, np.full(SIZE, 1e4), 1.0, 0.0, 1e-6)
     summed = in_view(everyone, 400, *args)[0]
     assert occupied == 400
     assert set(everyone[inside]) | set(summed) <= set(near)
