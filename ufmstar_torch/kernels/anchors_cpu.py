@@ -35,9 +35,13 @@ from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.regress_cpu import EPSILON
 from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
+from ufmstar_torch.kernels.regress_vectors_cpu import add_shares
 from ufmstar_torch.kernels.threads_cpu import each
+from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
+
+_LOG2_E = math.log2(math.e)
 
 # Anchors of a cell, on average, where neighbours are searched and where components are.
 _FEW, _SOME = 3, 32
@@ -98,14 +102,15 @@ def learn(
     config: UfMStarConfig,
     near: Sequence[tuple[NDArray[np.int64], int]] | None = None,
 ) -> Learnt:
-    """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors; with the exact sum, shares are right to twice the
-    error of the regression's in the dtype of the evidence.
+    """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors, of evidence that may have less room than the
+    mixture; with the exact sum, shares are right to twice the error of the regression's in the dtype of the evidence.
 
     ``near`` are the slots of each stream that can matter, in increasing order, and how many are occupied; None = all.
     """
     if config.regression != "exact":
-        return learn_reference(evidence, mixture_cam, frame, anchors, config, distribute, inliers)
-    b, capacity, _ = evidence.component.shape
+        padded = evidence.padded(mixture_cam.capacity)
+        return learn_reference(padded, mixture_cam, frame, anchors, config, distribute, inliers)
+    b, capacity = mixture_cam.weight.shape
     dtype = evidence.overall.dtype
     if near is None:
         near = [(slots, slots.size) for slots in map(np.flatnonzero, array(mixture_cam.weight) > 0)]
@@ -151,7 +156,8 @@ def _learn(
         stream[c] = overall[c + 1] / (overall[0] + shrinkage)
     for k in range(component.shape[0]):
         for c in range(3):
-            component[k, c] = _rounded(fade * before[k, c] + sums[k, c], single)
+            old = before[k, c] if k < before.shape[0] else 0.0
+            component[k, c] = _rounded(fade * old + sums[k, c], single)
         for c in range(2):
             beyond[k, c] = (component[k, c + 1] - component[k, 0] * stream[c]) / (component[k, 0] + shrinkage)
 
@@ -353,7 +359,7 @@ def _nearest(ordered, u_a, v_a, a, low, side, columns, rows, start, order, dista
 def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight, epsilon, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
-    Left out is what adds less than eps/K of the prior or of the largest component to the denominator.
+    Left out is what adds less than eps/K of the prior to the denominator.
     """
     slots, count, mean, covariance, weight = mixture
     points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
@@ -366,46 +372,28 @@ def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight,
     boxes = _boxes(mean, covariance, occupied, log_peak, share + math.log(prior_weight))
     start, order = _grid(pixel, chosen, _SOME)[4:]
     near = _touched(points, order, np.arange(occupied.size), boxes)
-    fields, exponent, counted = np.empty((10, near.size)), np.empty(near.size), np.empty(near.size, np.int64)
+    room = (near.size + LANES - 1) // LANES * LANES
+    fields, density, added = np.empty((10, room)), np.empty(room), np.empty((3, room))
+    point, row, scale = np.empty(3), np.empty(4), math.sqrt(0.5 * _LOG2_E)
+    row[3] = prior_weight
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:
             continue
         kept = _touched(points, order[start[cell] : start[cell + 1]], near, boxes)
-        for i in range(kept.size):
+        n = (kept.size + LANES - 1) // LANES * LANES
+        for i in range(n):
+            k = kept[i] if i < kept.size else -1
             for axis in range(3):
-                fields[axis, i] = mean[occupied[kept[i]], axis]
+                fields[axis, i] = mean[occupied[k], axis] if k >= 0 else 0.0
+                added[axis, i] = 0.0
             for entry in range(6):
-                fields[3 + entry, i] = whitening[kept[i], entry]
-            fields[9, i] = log_peak[kept[i]]
+                fields[3 + entry, i] = whitening[k, entry] * scale if k >= 0 else 0.0
+            fields[9, i] = log_peak[k] * _LOG2_E if k >= 0 else -np.inf
         for place in range(start[cell], start[cell + 1]):
             p = order[place]
-            _exponents(fields, kept.size, points[p, 0], points[p, 1], points[p, 2], exponent)
-            limit = math.log(prior_weight)
-            for i in range(kept.size):
-                limit = exponent[i] if exponent[i] > limit else limit
-            limit += share
-            n, evidence = 0, prior_weight
-            for i in range(kept.size):
-                counted[n] = i
-                n += exponent[i] >= limit
-            for j in range(n):
-                i = counted[j]
-                exponent[i] = math.exp(exponent[i])
-                evidence += exponent[i]
-            r0, r1, r2 = rows[p, 0] / evidence, rows[p, 1] / evidence, rows[p, 2] / evidence
-            for j in range(n):
-                i = counted[j]
-                k, density = occupied[kept[i]], exponent[i]
-                sums[k, 0] += density * r0
-                sums[k, 1] += density * r1
-                sums[k, 2] += density * r2
-
-
-@part
-def _exponents(fields, n, x, y, z, out):
-    """log of the densities of n components at a point."""
-    for i in range(n):
-        dx, dy, dz = x - fields[0, i], y - fields[1, i], z - fields[2, i]
-        y0, y1 = fields[3, i] * dx, fields[4, i] * dx + fields[5, i] * dy
-        y2 = fields[6, i] * dx + fields[7, i] * dy + fields[8, i] * dz
-        out[i] = fields[9, i] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
+            for axis in range(3):
+                point[axis], row[axis] = points[p, axis], rows[p, axis]
+            add_shares(fields, room, n, point, row, density, added)
+        for i in range(kept.size):
+            for axis in range(3):
+                sums[occupied[kept[i]], axis] += added[axis, i]

@@ -140,6 +140,35 @@ def mix_more(code, values, count, densities, sums, hole, averages):
 
 
 @vectors
+def add_shares(code, fields, stride, n, point, row, density, added):
+    """Add the row of a point, in shares by which components explain it, to the rows of the components.
+
+    Args:
+        fields: [10, stride] of the components: mean, whitening, log2 of the peak.
+        n: of them, a multiple of a vector's length.
+        point: [3].
+        row: [4], of which the last is the prior's weight.
+        density: [n] scratch.
+        added: [3, stride] the components' rows.
+    """
+    at = [point.one(axis) for axis in range(3)]
+    total = code.variable(at[0] * 0.0)
+    with code.loop(n, code.lanes) as j:
+        given = [fields.load(code.plus(j, code.times(stride, i))) for i in range(10)]
+        (x, y, z), (a, b, c, d, e, f) = (one - mean for one, mean in zip(at, given[:3], strict=True)), given[3:9]
+        p, q, r = a * x, b * x + c * y, d * x + (e * y + f * z)
+        value = (((given[9] - p * p) - q * q) - r * r).exp2()
+        density.store(value, j)
+        total.value = total.value + value
+    evidence = total.value.everywhere(Lanes.__add__) + row.one(3)
+    shares = [row.one(axis).over(evidence) for axis in range(3)]
+    with code.loop(n, code.lanes) as j:
+        for axis, share in enumerate(shares):
+            place = code.plus(j, code.times(stride, axis))
+            added.store(added.load(place) + density.load(j) * share, place)
+
+
+@vectors
 def read_tile(code, image, start, stride, tile):
     """The values [64] of the tile of an image whose first pixel is ``start``; ``stride`` is the image's width."""
     for row in range(0, PIXELS, code.lanes):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,7 +119,7 @@ def step(
     totals = np.zeros((len(_COUNTS), len(streams)), np.int64)
     counts = dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))
     if config.anchored:
-        learnt = learn(evidence.padded(capacity), mixture_cam, frame, anchors, config, joined)
+        learnt = learn(evidence, mixture_cam, frame, anchors, config, joined)
         features[..., -3:-1] = learnt.beyond  # before the share that was measured, as `before_regression` has them
         evidence, stream = learnt.evidence, learnt.stream
         counts["anchors_used"].copy_(learnt.used)
@@ -129,7 +129,12 @@ def step(
 
     with kernel("regress_image"):
         result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, joined)
-    result, residual, measured = after_regress(result, stream, frame, config, pixels)
+    if stream is not None:
+        result.features[..., -3:-1] += stream.to(frame.depth.dtype).view(-1, *[1] * (result.features.dim() - 2), 2)
+    result, _, measured = after_regress(result, None, frame, config, pixels)
+    residual = None
+    if stream is not None:
+        residual, result = result.features[..., -2:], replace(result, features=result.features[..., :-2])
     stage("regress")
 
     disagreement, smoothed = result.disagreement, state.smoothed
