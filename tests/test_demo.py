@@ -161,11 +161,12 @@ class Collected(FrameSink):
         self.results.append(result)
 
 
-def walked(networks, frames, indices=None, sinks=()):
+def walked(networks, frames, indices=None, sinks=(), keys=METHODS):
     """The frames through the demo's rows: their results."""
     source = NetworkSource(NetworksInTurn(networks, preprocess=networks[0].preprocess), CPU, {}, seeding=None)
     collected = Collected()
-    FrameStream(frames, indices or range(FRAMES), demo_rows(source, CPU)).drive([collected, *sinks])
+    rows = [row for row in demo_rows(source, CPU) if row.key in keys]
+    FrameStream(frames, indices or range(FRAMES), rows).drive([collected, *sinks])
     return collected.results
 
 
@@ -427,6 +428,7 @@ def test_the_calibration_picture_needs_something_to_draw(tmp_path):
 # ---- what the package brings ----
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHIPPED.is_file(), reason="the checkpoint has not been trained yet")
 def test_the_shipped_networks_are_small_and_several():
     from ufmstar_torch.models.trained import load_trained, read_info
@@ -438,8 +440,9 @@ def test_the_shipped_networks_are_small_and_several():
     frames = tour_sequence(DemoOptions().seed, frames=40, size=info.spec.size, style="mixed")
     tour = make_tour(DemoOptions().seed, "mixed")
     kinds = ("familiar", "unfamiliar")
-    regions = RegionMetrics(METHODS, kinds, lambda result, _: torch.from_numpy(surface_kinds(tour, result.frame)))
-    walked(load_trained(SHIPPED), frames, range(0, 40, 2), [regions])
+    shown = (NETWORK, UFM_STAR)
+    regions = RegionMetrics(shown, kinds, lambda result, _: torch.from_numpy(surface_kinds(tour, result.frame)))
+    walked(load_trained(SHIPPED), frames, range(0, 40, 2), [regions], shown)
     outcome = regions.by_region()
     assert outcome["familiar"][UFM_STAR]["delta1"] > 0.6
     assert outcome["unfamiliar"][UFM_STAR]["rms_sigma"] > outcome["familiar"][UFM_STAR]["rms_sigma"]

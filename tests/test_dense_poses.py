@@ -103,12 +103,29 @@ def known(frames=1, seed=0, noise=0.05, **wrong):
 
 def test_wrong_poses_are_corrected_and_what_remains_is_stated():
     better, normalised = [], []
-    for seed in range(5):
+    for seed in range(10):
         _, found, fit, rho = known(8, seed, turned=0.002, moved=0.004)
         better.append(np.median(np.abs(fit.rho - rho)) / np.median(np.abs(found.rho - rho)))
         normalised.append(np.median(np.abs(fit.rho - rho) / np.sqrt(fit.variance)) / 0.674)
     assert np.median(better) < 0.6
-    assert 0.5 < np.median(normalised) < 2
+    assert 0.5 < np.median(normalised) < 2.2, "of a few frames, which must also show how wrong poses usually are"
+
+
+def test_what_remains_of_wrong_poses_is_stated_beyond_first_order():
+    """The usual errors are known here, and the camera: 8 mm of some 10 cm between the nearest views."""
+    sizes = []
+    for seed in range(40):
+        rng, errors, error = np.random.default_rng(seed), PoseErrors(3, 0.8), np.zeros((3, 10))
+        pixel, rho, views = scene(seed)
+        draws = np.sqrt(0.5) * (rng.normal(size=6) + rng.normal(size=(3, 6)))
+        error[:, :6] = draws * np.repeat([0.002, 0.008], 3)
+        errors.positions(K, 320, 2.0)
+        errors._variance[:], errors._left[:] = np.square([0.002, 0.008]), 0
+        errors._covariance *= 1e-4
+        fit = errors.corrected(pixel, measured(pixel, rho, views, error, 0.02, rng), SHARES, views, K, 2.0)
+        sizes.append(np.abs(fit.rho - rho) / np.sqrt(fit.variance))
+    assert 0.65 < np.median(sizes) / 0.674 < 1.3
+    assert np.quantile(sizes, 0.9) / 1.645 < 1.5
 
 
 def test_exact_poses_stay_nearly_exact():
@@ -167,18 +184,17 @@ def test_an_anchor_on_an_edge_moves_to_its_own_surface(rho_here, to):
     image, pixel, rho, middle = around(2.0, rho_here)
     surface, alone = beside(image, pixel, rho, np.full(len(rho), 1e-4), 10)
     np.testing.assert_allclose(surface[middle], [to, 65], atol=1e-6)
-    assert (alone == 0).all()
+    assert alone[middle] < 0.1 * (2.0 - 1.0) ** 2
     flat = np.abs(pixel[:, 0] - 60) > 20
     np.testing.assert_array_equal(surface[flat], pixel[flat])
 
 
-def test_an_anchor_that_stands_alone_gets_the_variance_of_the_oracle():
+def test_an_anchor_that_differs_from_those_around_it_is_as_uncertain_as_the_oracle_states():
     rng = np.random.default_rng(0)
     image, pixel, rho, middle = around(1.0, 3.0)
     rho = rho * rng.uniform(0.9, 1.1, len(rho))
     variance = rng.uniform(1e-4, 1e-3, len(rho))
     _, alone = beside(image, pixel, rho, variance, 10)
-    expected = [oracle_dense.alone(pixel, rho, variance, 10, n) for n in range(len(rho))]
-    np.testing.assert_allclose(alone, expected, rtol=1e-12)
+    np.testing.assert_allclose(alone, oracle_dense.alone(pixel, rho, variance, 10), rtol=1e-12)
     assert alone[middle] > 0.5
-    assert (alone > 0).sum() == 1
+    assert np.delete(alone, middle).max() < 0.1 * alone[middle]

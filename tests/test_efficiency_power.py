@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -73,13 +74,6 @@ def test_a_counter_that_wraps_once_loses_nothing(wraps_at, start, share, watts):
     before = start * wraps_at
     result = consumed(Rail("cpu", CPU, wraps_at), before, (before + used) % wraps_at, used / watts)
     assert result == pytest.approx(used, rel=1e-6, abs=1e-9 * wraps_at)
-
-
-def test_the_meter_counts_across_a_wrap():
-    machine = Machine(watts=50.0, wraps_at=65536.0, start=65500.0)
-    window = machine.meter().measure(lambda: machine.run(2.0))
-    assert machine.read()["cpu package 0"] < 100
-    assert window.joules["cpu package 0"] == pytest.approx(100.0)
 
 
 @pytest.mark.parametrize(
@@ -233,19 +227,15 @@ def bare(monkeypatch):
     from zeus.device.gpu.common import ZeusGPUInitError
     from zeus.device.soc.common import ZeusSoCInitError
 
-    def refuse(error):
-        def call(*_):
-            raise error
-
-        return call
-
-    monkeypatch.setattr("zeus.device.get_gpus", refuse(ZeusGPUInitError("NVML unavailable.")))
-    monkeypatch.setattr("zeus.device.get_cpus", refuse(ZeusCPUInitError("RAPL unavailable.")))
-    monkeypatch.setattr("zeus.device.get_soc", refuse(ZeusSoCInitError("no SoC.")))
+    monkeypatch.setattr("zeus.device.get_gpus", Mock(side_effect=ZeusGPUInitError("NVML unavailable.")))
+    monkeypatch.setattr("zeus.device.get_cpus", Mock(side_effect=ZeusCPUInitError("RAPL unavailable.")))
+    monkeypatch.setattr("zeus.device.get_soc", Mock(side_effect=ZeusSoCInitError("no SoC.")))
     return monkeypatch
 
 
 def test_no_sensor_has_a_reason_for_everything(bare):
+    from zeus.device.cpu.common import ZeusCPUNoPermissionError
+
     meter = PowerMeter.open(gpu=0)
     assert meter.rails == ()
     assert set(meter.missing) == {GPU, CPU, DRAM}
@@ -253,15 +243,8 @@ def test_no_sensor_has_a_reason_for_everything(bare):
     assert "RAPL unavailable" in meter.missing[CPU]
     assert PowerMeter.open().missing[GPU] == "nothing runs on a GPU"
     json.dumps(meter.missing)
-
-
-def test_without_permission_the_reason_says_so(bare):
-    from zeus.device.cpu.common import ZeusCPUNoPermissionError
-
-    def refuse():
-        raise ZeusCPUNoPermissionError("Can't read file due to permission error; RAPL requires root privileges.")
-
-    bare.setattr("zeus.device.get_cpus", refuse)
+    refused = ZeusCPUNoPermissionError("Can't read file due to permission error; RAPL requires root privileges.")
+    bare.setattr("zeus.device.get_cpus", Mock(side_effect=refused))
     assert "requires root" in PowerMeter.open().missing[CPU]
 
 
@@ -313,12 +296,7 @@ def test_packages_and_their_memory_are_read_from_the_counters(powercap):
     window = meter.measure(work)
     expected = {"cpu package 0": 12.32885, "dram of package 0": 2.5, "cpu package 1": 3.0}
     assert window.joules == pytest.approx(expected)
-
-
-def test_no_process_is_started_to_look_out_for_wrapping(powercap):
-    meter = PowerMeter.open()
-    meter.measure(lambda: None)
-    assert multiprocessing.active_children() == []
+    assert multiprocessing.active_children() == [], "none looks out for wrapping"
 
 
 def test_a_counter_that_may_no_longer_be_read_is_named(powercap):

@@ -102,6 +102,8 @@ def test_kernels_import_back_only_plain_types():
         "regress",
         "distribute",
         "regress_pixels",
+        "random_order",
+        "SampleMean",
         "Correspondence",
         "PIXEL_VARIANCE",
         "UfMStarConfig",

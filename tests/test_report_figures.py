@@ -18,7 +18,6 @@ from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
-from ufmstar_torch.eval.report.figures import write_figures
 from ufmstar_torch.eval.report.figures_calibration import (
     MOST_SEQUENCES,
     chosen_sequences,
@@ -315,4 +314,4 @@ def test_the_files_say_what_they_are(tmp_path):
     assert {f"figures/{kind}.png" for kind in kinds} <= names
     assert all((out / name).stat().st_size > 1000 for name in names if name.endswith(".png"))
     with pytest.raises(ValueError, match="figures must be svg or png, got 'jpg'"):
-        write_figures(in_memory({}), "jpg", {})
+        write_report(out, pictures="jpg")

@@ -21,7 +21,7 @@ from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
 from ufmstar_torch.eval.report import pictures as pictures_module
 from ufmstar_torch.eval.report.colours import INVALID_GREY
-from ufmstar_torch.eval.report.data import Results, load_results
+from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
 from ufmstar_torch.eval.report.panels import break_name, draw_grid
 from ufmstar_torch.eval.report.pictures import (
@@ -40,8 +40,8 @@ from ufmstar_torch.eval.report.pictures import (
     fit_strip_scales,
     largest_difference,
     mean_nll,
+    pictures_of,
     strip_rows,
-    write_pictures,
 )
 from ufmstar_torch.eval.report.rooms import (
     SIGMAS,
@@ -55,6 +55,7 @@ from ufmstar_torch.eval.report.rooms import (
     project,
     views_of,
 )
+from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import WorkItem
 
@@ -366,10 +367,10 @@ class TestWritePictures:
 
         monkeypatch.setattr(pictures_module, "draw_breakdown", broken)
         out = shutil.copytree(evaluation, tmp_path / "o")
-        undrawn: dict[str, str] = {}
-        assert [p.kind for p in write_pictures(load_results(out), undrawn)] == [STRIP, COMPARE, ROOM]
-        assert undrawn == {f"{KITCHEN[1]}, frame 7: breakdown": "broken"}
+        assert write_report(out).undrawn == {f"{KITCHEN[1]}, frame 7: breakdown": "broken"}
+        index = json.loads((out / "figures" / "pictures.json").read_text())
+        assert [p["kind"] for p in index["pictures"]] == [STRIP, COMPARE, ROOM]
 
     def test_nothing_kept_nothing_drawn(self, tmp_path: Path) -> None:
         results = Results(tmp_path, {"suite": "s"}, (Record("s", "d", "q", "N", "Ensemble"),))
-        assert write_pictures(results, {}) == []
+        assert list(pictures_of(results, tmp_path)) == []

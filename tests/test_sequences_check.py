@@ -7,7 +7,6 @@ import dataclasses
 import layouts
 import numpy as np
 import pytest
-from layouts import truncate
 
 from scenes import look
 from ufmstar_torch.eval.check.check import check_sequence
@@ -37,30 +36,6 @@ def walk(tmp_path_factory):
     return path
 
 
-def test_a_good_sequence_has_no_problem(walk):
-    result = check_sequence(open_sequence(walk))
-    assert result.ok
-    assert result.problems == ()
-    assert result.error < 0.01
-    assert (result.pairs, result.gap, result.scale) == (8, 5, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "wording"),
-    [
-        (np.linalg.inv, "world-to-camera"),
-        (lambda T: T @ np.linalg.inv(layouts.NED_FROM_CAMERA), "NED axes"),
-        (lambda T: T @ np.diag([1.0, -1, -1, 1]), "OpenGL axes"),
-    ],
-)
-def test_pose_conventions_are_recognised(walk, spoil, wording):
-    result = check_sequence(with_poses(open_sequence(walk), spoil))
-    assert len(result.problems) == 1
-    assert wording in result.reading
-    assert f"the poses look {result.reading}" in result.problems[0]
-    assert result.best_error < 0.01 < result.error
-
-
 @pytest.mark.parametrize("factor", [0.2, 0.5, 5.0, 1000.0])
 def test_a_wrong_depth_scale_is_recognised(walk, factor):
     result = check_sequence(open_sequence(walk, depth_scale=min(1.0, 1e-3 * factor)))
@@ -74,6 +49,7 @@ def test_both_at_once(walk):
     assert len(result.problems) == 2
     assert "inverted" in result.reading
     assert result.scale == pytest.approx(0.5, rel=0.05)
+    assert result.best_error < 0.01 < result.error
 
 
 def test_nonsense_poses_fit_no_reading(walk):
@@ -96,25 +72,6 @@ def test_a_camera_that_stands_still_leaves_it_undecided(walk):
     assert any("does not tell the poses from world-to-camera" in text for text in result.undecided)
 
 
-def test_unreadable_frames_are_told_and_left_out(tmp_path):
-    path, _ = layouts.write_generic(tmp_path, frames=12)
-    truncate(path / "images" / "7.png")
-    result = check_sequence(open_sequence(path))
-    assert result.ok
-    assert len(result.unreadable) == 1
-    assert "7.png" in result.unreadable[0]
-
-
-def test_what_cannot_be_checked_is_refused(tmp_path):
-    path, _ = layouts.write_generic(tmp_path)
-    with pytest.raises(ValueError, match="pairs must be at least 1"):
-        check_sequence(open_sequence(path), pairs=0)
-    for file in (path / "depth").iterdir():
-        file.unlink()
-    with pytest.raises(ValueError, match="no two readable frames with depth"):
-        check_sequence(open_sequence(path))
-
-
 @pytest.mark.parametrize("writer", ["write_tum", "write_seven_scenes", "write_scannet", "write_tartanair"])
 def test_every_generated_layout_is_consistent(tmp_path, writer):
     path = getattr(layouts, writer)(tmp_path, frames=8)[0]
@@ -122,13 +79,10 @@ def test_every_generated_layout_is_consistent(tmp_path, writer):
     assert result.ok
     assert result.error < 0.02
     assert "camera-to-world, x right" in result.reading
-
-
-def test_seven_scenes_unregistered_depth_is_consistent_with_its_own_camera(tmp_path):
-    path = layouts.write_seven_scenes(tmp_path, frames=8)[0]
-    result = check_sequence(open_sequence(path, register=False))
-    assert result.ok
-    assert result.registration is None  # the sequence does not claim that depth lies on the images
+    if writer == "write_seven_scenes":
+        own = check_sequence(open_sequence(path, register=False))
+        assert own.ok
+        assert own.registration is None  # the sequence does not claim that depth lies on the images
 
 
 def test_depth_edges_lie_on_the_near_side_and_planes_have_none():

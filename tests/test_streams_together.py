@@ -8,7 +8,7 @@ import pytest
 import torch
 from runs import Brightness, networks
 from suite_runs import NAMES, go, job_on, kept, write_rooms
-from tiny_suite import CPU, base_network, evaluate_all, row, same, write_network
+from tiny_suite import CPU, base_network, evaluate_all, in_memory, row, same, write_network
 
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import Gaussians
@@ -47,20 +47,13 @@ class Watched(Brightness):
         return super().forward(image)
 
 
-def in_memory(name, length, number):
-    rendered = open_tour(name)
-    frames = [rendered[i] for i in range(length)]
-    entries = tuple(
-        replace(entry, load_image=lambda f=f: f.image, load_depth=lambda f=f: f.depth)
-        for entry, f in zip(rendered.entries, frames, strict=False)
-    )
-    return replace(rendered, name=f"tour {number}", entries=entries)
-
-
 @pytest.fixture(scope="module")
 def tours():
-    """Rendered frames in memory, sequences of different lengths."""
-    return [in_memory(f"tour:{5 + n}?frames={m}&size=72x96", m, n) for n, m in enumerate(LENGTHS)]
+    """Rendered frames in memory, sequences of different lengths: parts of one walk."""
+    walk = open_tour(f"tour:5?frames={sum(LENGTHS)}&size=72x96")
+    starts = [sum(LENGTHS[:n]) for n in range(len(LENGTHS))]
+    parts = [in_memory(walk, slice(start, start + m)) for start, m in zip(starts, LENGTHS, strict=True)]
+    return [replace(part, name=f"tour {n}") for n, part in enumerate(parts)]
 
 
 def ensemble():

@@ -265,7 +265,7 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
     pixels, on_cpu = flat.shape[1], valid.device.type == "cpu"
     requested = 2 * count if on_cpu else pixels  # elsewhere a look at how many were valid would wait for the device
     while True:
-        order = _random_order(pixels, seed)[:requested].to(valid.device, non_blocking=not on_cpu)
+        order = random_order(pixels, seed)[:requested].to(valid.device, non_blocking=not on_cpu)
         usable = flat[:, order]
         if requested >= pixels or bool((usable.sum(1) >= count).all()):
             break
@@ -276,7 +276,55 @@ def sample_pixels(valid: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]
     return index, torch.gather(flat, 1, index)
 
 
+@dataclass(frozen=True)
+class SampleMean:
+    """The average of each image's sample, [B].
+
+    Attributes:
+        mean: of the variance [m^2]; NaN without a pixel.
+        error: its standard error [m^2]; NaN with fewer than two pixels, 0 where all valid pixels were taken.
+        count: pixels averaged: those without a variance are not.
+        measured: share of the sample that was measured; NaN without a valid pixel.
+    """
+
+    mean: Tensor
+    error: Tensor
+    count: Tensor
+    measured: Tensor
+
+
+def sample_mean(variance: Tensor, measured: Tensor, used: Tensor, valid_pixels: Tensor) -> SampleMean:
+    """The average over a sample of pixels as an estimate of the mean over all valid ones.
+
+    Args:
+        variance: [B, n] [m^2], NaN where there is none.
+        measured: [B, n] whether a pixel counts as measured (``unmeasured``).
+        used: [B, n] from :func:`sample_pixels`.
+        valid_pixels: [B] in the whole image.
+    """
+    sampled = used.sum(1)
+    share = (measured & used).sum(1) / sampled
+    used = used & ~variance.isnan()  # not measured, with config.unmeasured = "nan"
+    count = used.sum(1)
+    mean = total(torch.where(used, variance, 0), 1) / count  # 0/0 = NaN where no pixel is valid
+    squares = total(torch.where(used, (variance - mean[:, None]) ** 2, 0), 1)
+    left = 1 - sampled / valid_pixels.clamp_min(1)  # without replacement: all pixels, no error
+    error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
+    return SampleMean(mean, torch.where(count > 1, error, torch.nan), count, share)
+
+
+@dataclass(frozen=True)
+class SampleKernels:
+    """The replaceable parts of an image average: :func:`sample_pixels` and :func:`sample_mean`."""
+
+    pixels: Callable[[Tensor, int, int], tuple[Tensor, Tensor]]
+    mean: Callable[[Tensor, Tensor, Tensor, Tensor], SampleMean]
+
+
+SAMPLE_REFERENCE = SampleKernels(sample_pixels, sample_mean)
+
+
 @functools.lru_cache(maxsize=4)  # the draw costs more than a sample
-def _random_order(pixels: int, seed: int) -> Tensor:
+def random_order(pixels: int, seed: int) -> Tensor:
     """A permutation of the numbers below ``pixels``; not to be modified."""
     return torch.randperm(pixels, generator=torch.Generator().manual_seed(seed))

@@ -290,7 +290,9 @@ def after_regress(
         The regression of M and the caller's features; the residual and the share that was measured, as in
         :class:`~ufmstar_torch.output.StepOutput`.
     """
-    depth = frame.depth if pixels is None else torch.gather(frame.depth.flatten(1), 1, pixels)
+    depth = frame.depth
+    if pixels is not None and config.unmeasured == "relative":  # nothing else reads it
+        depth = torch.gather(depth.flatten(1), 1, pixels)
     result, measured = unmeasured.after_regression(result, depth, config)
     result, residual = after_regression(result, stream)
     return result, residual, measured

@@ -15,7 +15,7 @@ from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, chec
 from ufmstar_torch.arguments import require_float
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
-from ufmstar_torch.fixed_order import apply, total
+from ufmstar_torch.fixed_order import apply
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import (
     LateStep,
@@ -23,6 +23,7 @@ from ufmstar_torch.kernels.select import (
     select_check,
     select_merge,
     select_posterior,
+    select_sample,
     select_step,
 )
 from ufmstar_torch.merge import merged
@@ -32,7 +33,7 @@ from ufmstar_torch.output import StepOutput
 from ufmstar_torch.output import UfMStarOutput as UfMStarOutput
 from ufmstar_torch.posterior.update import Posterior
 from ufmstar_torch.recalibrate import Recalibration
-from ufmstar_torch.regress import Regression, regress, sample_pixels
+from ufmstar_torch.regress import Regression, regress
 from ufmstar_torch.spill import Spill, Spilled
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
@@ -203,19 +204,11 @@ class UfMStar(StatefulModule):
             ValueError: both ``pixels`` and ``fraction``, or one out of range; and as :meth:`forward`.
         """
         frame = self._checked(depth, pose, intrinsics, aleatoric, epistemic, valid, features)
-        index, used = sample_pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
+        kernels = select_sample(self.config.backend, frame.depth.device.type)
+        index, used = kernels.pixels(frame.valid, _sample_size(frame, pixels, fraction), seed)
         out, variance, _, _ = self._observe(frame, anchors, index, average=average)
-        sampled = used.sum(1)
-        measured = ((out.measured >= unmeasured.HALF) & used).sum(1) / sampled
-        used = used & ~variance.isnan()  # not measured, with config.unmeasured = "nan"
-        count = used.sum(1)
-        value = torch.where(used, variance, torch.zeros_like(variance))
-        mean = total(value, 1) / count  # 0/0 = NaN where no pixel is valid
-        squares = total(torch.where(used, (variance - mean[:, None]) ** 2, torch.zeros_like(variance)), 1)
-        # Without replacement: all pixels, no error.
-        left = 1 - sampled / out.statistics.valid_pixels.clamp_min(1)
-        error = (squares / (count - 1).clamp_min(0) / count * left).sqrt()
-        return MeanUncertainty(mean, torch.where(count > 1, error, torch.nan), count, measured, out.statistics)
+        sample = kernels.mean(variance, out.measured >= unmeasured.HALF, used, out.statistics.valid_pixels)
+        return MeanUncertainty(sample.mean, sample.error, sample.count, sample.measured, out.statistics)
 
     def warm_up(
         self,

@@ -211,7 +211,7 @@ def _spread(times: CallTimes, name: str) -> dict[str, float | int]:
     """Median, 90th percentile, mean and minimum of wall-clock and processor times [ms], and their count."""
     figures: dict[str, float | int] = {"count": len(times.wall[name])}
     for prefix, values in (("", times.wall[name]), ("cpu_", times.cpu[name])):
-        of = {
+        of: dict[str, Any] = {
             "median": np.median(values),
             "p90": np.percentile(values, 90),
             "mean": np.mean(values),

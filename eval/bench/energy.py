@@ -251,13 +251,16 @@ def run_windows(
                 reasons[key] = value
             else:
                 results[key].append(value)
-    return {
-        key: PartEnergy(reason=reasons[key]) if key in reasons else PartEnergy(*zip(*values, strict=True))
-        for key, values in results.items()
-    }
+    energies = {key: PartEnergy(reason=reason) for key, reason in reasons.items()}
+    for key in work.keys() - reasons.keys():
+        joules, net, times = zip(*results[key], strict=True)
+        energies[key] = PartEnergy(joules, net, times)
+    return energies
 
 
-def _one(meter: PowerMeter, unit: str, repeat: Work, idle: Mapping[str, float], seconds: float) -> tuple | str:
+def _one(
+    meter: PowerMeter, unit: str, repeat: Work, idle: Mapping[str, float], seconds: float
+) -> tuple[float, ...] | str:
     """Joules, net joules and seconds per frame of one window, or why there are none."""
     frames: list[int] = []
     window = meter.measure(lambda: frames.append(repeat(seconds)))

@@ -265,7 +265,7 @@ def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict
 
 def _state_bytes(row: RowRunner) -> int:
     """What the next frame depends on, but for the map kept for smoothing."""
-    evidence = {} if row.anchors is None else row.anchors.state()
+    evidence = {} if row.anchors is None or row.anchors.tracks is None else row.anchors.tracks.state()
     return int(row.estimator.memory().get("bytes", 0)) + sum(value.nbytes for value in evidence.values())
 
 

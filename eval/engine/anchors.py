@@ -119,20 +119,6 @@ class AnchorSource:
         anchors = landmarks.anchors(frame.intrinsics, prediction.intrinsics).to(device)
         return FrameAnchors(anchors, landmarks.tracked, len(landmarks.depth), ms, landmarks.none)
 
-    def undo(self) -> None:
-        """Forget the last frame (:meth:`Tracks.undo`)."""
-        if self.tracks is not None:
-            self.tracks.undo()
-
-    def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame's anchors depend."""
-        return {} if self.tracks is None else self.tracks.state()
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Continue where ``state`` was taken (:meth:`Tracks.load_state`)."""
-        if self.tracks is not None:
-            self.tracks.load_state(state)
-
     def _sampled(self, truth: NDArray[np.float32], index: int) -> Anchors:
         v, u = np.nonzero(truth > 0)
         count = TRUTH_COUNT if self._setting.anchor_count is None else self._setting.anchor_count

@@ -123,14 +123,14 @@ def evaluate_sequences(
     Raises:
         Stopped: ``stop`` returned True; nothing of the sequences in hand counts.
     """
-    estimators = _Estimators(judge.device, judge.streams)
+    shared: dict[Row, Gaussians] = {}  # of a row of UfM*, the streams of one module
     running: dict[FrameStream, _Evaluation] = {}
 
     def begun() -> Iterator[tuple[FrameStream, Sequence[FrameSink]]]:
         for task in tasks:
             slot = min(set(range(judge.streams)) - {one.slot for one in running.values()})
             try:
-                evaluation = _Evaluation(task, judge, estimators, slot)
+                evaluation = _Evaluation(task, judge, shared, slot)
             except BROKEN as error:
                 done(task, error)
                 continue
@@ -143,29 +143,6 @@ def evaluate_sequences(
             done(evaluation.task, error or evaluation.outcome())
 
 
-class _Estimators:
-    """The estimators of sequences that are judged at the same time: those of a row of UfM* are streams of one module.
-
-    Args:
-        device: where they run.
-        streams: number of sequences.
-    """
-
-    def __init__(self, device: torch.device, streams: int) -> None:
-        self._device, self._streams = device, streams
-        self._shared: dict[Row, Gaussians] = {}
-
-    def of(self, row: Row, max_depth: float | None, slot: int) -> Estimator:
-        """The estimator of a row for stream ``slot``, in its initial state; errors as :func:`make_estimator`."""
-        shared = self._shared.get(row)
-        if shared is None:
-            estimator = make_estimator(row, self._device, max_depth, streams=self._streams)
-            if not isinstance(estimator, Gaussians) or estimator.streams == 1:
-                return estimator
-            shared = self._shared[row] = estimator
-        return shared.stream(slot)
-
-
 class _Evaluation:
     """A sequence while it is judged.
 
@@ -173,7 +150,7 @@ class _Evaluation:
         SequenceError, ValueError: as :func:`evaluate_sequences` states.
     """
 
-    def __init__(self, task: SequenceTask, judge: Judge, estimators: _Estimators, slot: int) -> None:
+    def __init__(self, task: SequenceTask, judge: Judge, shared: dict[Row, Gaussians], slot: int) -> None:
         self.task, self.slot = task, slot
         sequence, rows = task.sequence, task.rows
         _check_rows(rows, judge.networks)
@@ -188,7 +165,12 @@ class _Evaluation:
         runners = []
         for row in rows:
             source = sources[row.method.base, row.setting.preprocess]
-            estimator = estimators.of(row, source.max_depth, slot)
+            estimator: Estimator | None = shared.get(row)
+            if estimator is None:
+                estimator = make_estimator(row, judge.device, source.max_depth, streams=judge.streams)
+            if isinstance(estimator, Gaussians) and estimator.streams > 1:
+                shared[row] = estimator
+                estimator = estimator.stream(slot)
             how: dict[str, Any] = {"every": row.method.every_member, "setting": row.setting}
             runners.append(RowRunner(row.slug, source, estimator, **how, anchors=anchors.get(row), device=judge.device))
         tracked = any(row.setting.anchors in (TRACKED, DENSE) for row in rows)

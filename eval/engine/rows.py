@@ -87,6 +87,7 @@ class RowRunner:
     ) -> None:
         self.key, self.source, self.estimator, self.every, self.setting = key, source, estimator, every, setting
         self.anchors, self._skips_faults = anchors, skips_faults
+        self._tracks = None if anchors is None else anchors.tracks
         self.images = 0
         self.device = device or torch.device("cpu")
         self._drift = Drift(setting)
@@ -121,8 +122,8 @@ class RowRunner:
             raise estimate
         self.images += 1
         if self._skips_faults and estimate.statistics is not None and int(estimate.statistics.fault[0]):
-            if self.anchors is not None:
-                self.anchors.undo()
+            if self._tracks is not None:
+                self._tracks.undo()
             raise FrameError(frame.name, FRAME_FAULTS[int(estimate.statistics.fault[0])])
         tracking = None if update.anchors is None else update.anchors.ms
         times = {"uncertainty": update.ms, "network": update.prediction.ms, "anchors": tracking}
@@ -132,7 +133,7 @@ class RowRunner:
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""
-        anchors = {} if self.anchors is None else self.anchors.state()
+        anchors = {} if self._tracks is None else self._tracks.state()
         parts = ((_ESTIMATOR, self.estimator.state()), (_TRACKER, anchors), (_DRIFT, self._drift.state()))
         kept = {prefix + name: value for prefix, state in parts for name, value in state.items()}
         return {_IMAGES: torch.tensor(self.images), **kept}
@@ -145,6 +146,6 @@ class RowRunner:
 
         self.images = int(state[_IMAGES])
         self.estimator.load_state(part(_ESTIMATOR))
-        if self.anchors is not None:
-            self.anchors.load_state(part(_TRACKER))
+        if self._tracks is not None:
+            self._tracks.load_state(part(_TRACKER))
         self._drift.load_state(part(_DRIFT))

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ufmstar_torch.eval.engine.judge import BY_ERROR, METRICS
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
 from ufmstar_torch.eval.methods.setting import Setting
@@ -21,9 +22,8 @@ from ufmstar_torch.eval.results.record import Record
 
 FORMAT = 1
 FAILED = "failed.json"
-METRICS, BY_ERROR = "metrics", "nll_by_error:"
 # The keys of ``Setting.to_dict()`` that are fields of Setting; all others are overrides of the config.
-SETTING_FIELDS = tuple(f.name for f in fields(Setting) if f.name != "overrides")
+_SETTING_FIELDS = {f.name for f in fields(Setting)} - {"overrides"}
 Sums = dict[str, dict[str, Tensor]]
 
 
@@ -148,7 +148,12 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
     about = _about(out)
     by_path = {path: _record(path) for path in sorted((out / "records").rglob("*.json")) if path.name != FAILED}
     order = {row: number for number, row in enumerate(listed_rows(about))}
-    paths = sorted(by_path, key=lambda path: _sort_key(by_path[path], order))
+
+    def place(path: Path) -> tuple[str, str, int, str]:
+        record, row = by_path[path], row_of(by_path[path])
+        return record.dataset, record.sequence, order.get(row, len(order)), row.slug
+
+    paths = sorted(by_path, key=place)
     records = [by_path[path] for path in paths]
     _check(out, about, paths, records)
     failed = _failed(out)
@@ -172,7 +177,7 @@ def row_of(record: Record) -> Row:
 
 def setting_of(values: Mapping[str, Any]) -> Setting:
     """The inverse of ``Setting.to_dict()``."""
-    own = {name: values[name] for name in SETTING_FIELDS if name in values}
+    own = {name: value for name, value in values.items() if name in _SETTING_FIELDS}
     return Setting(overrides={name: value for name, value in values.items() if name not in own}, **own)
 
 
@@ -217,11 +222,6 @@ def _record(path: Path) -> Record:
         text = str(error)
         raise ResultsError(text if str(path) in text else f"{path}: {text}") from error
     return record
-
-
-def _sort_key(record: Record, order: Mapping[Row, int]) -> tuple[str, str, int, str]:
-    row = row_of(record)
-    return record.dataset, record.sequence, order.get(row, len(order)), row.slug
 
 
 def _check(out: Path, about: Mapping[str, Any], paths: Sequence[Path], records: Sequence[Record]) -> None:
@@ -281,22 +281,16 @@ def _merged(paths: Sequence[Path], records: Sequence[Record]) -> tuple[dict[tupl
         gone = [path for path in files if not path.is_file()]
         if gone:
             notes.append(f"{dataset}, {row.label}: no curve over all sequences, {gone[0]} is not there")
-        else:
-            merged[dataset, row] = _merge_sums(files)
+            continue
+        total: Sums = {}  # added in the order of the files, which decides the last bits
+        for path in files:
+            for name, states in read_sums(path).items():
+                mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
+                if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
+                    raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
+                total[name] = {key: mine[key] + value for key, value in states.items()}
+        merged[dataset, row] = _compute(total, files)
     return merged, notes
-
-
-def _merge_sums(paths: Sequence[Path]) -> Merged:
-    """Add sums in the order given, which decides the last bits, and compute figures and curves from them."""
-    total: Sums = {}
-    for path in paths:
-        for name, states in read_sums(path).items():
-            mine = total.setdefault(name, {key: torch.zeros_like(value) for key, value in states.items()})
-            if {key: value.shape for key, value in mine.items()} != {k: v.shape for k, v in states.items()}:
-                raise ResultsError(f"{path} holds sums of other metrics than the sequences before it ({name})")
-            for key, value in states.items():
-                mine[key] = mine[key] + value
-    return _compute(total, paths)
 
 
 def read_sums(path: Path) -> Sums:
@@ -319,7 +313,7 @@ def _compute(total: Sums, paths: Sequence[Path]) -> Merged:
     many = "NLL" in kinds and states["metrics.ECEDelta.pixels"].numel() == 100
     bins = "authors" if many else "ours"
     metrics = SequenceMetrics(with_variance="NLL" in kinds, ranking="Sparsification" in kinds, bins=bins)
-    by_error = {name: NLLByError() for name in total if name.startswith(BY_ERROR)}
+    by_error = {name: NLLByError() for name in total if name.startswith(f"{BY_ERROR}:")}
     try:
         metrics.load_state_dict(dict(states))
         for name, metric in by_error.items():
@@ -329,6 +323,6 @@ def _compute(total: Sums, paths: Sequence[Path]) -> Merged:
         raise ResultsError(f"{paths[0]} holds sums of other metrics: {text}") from error
     curves = metrics.curves()
     for name, metric in by_error.items():
-        reference = name.removeprefix(BY_ERROR)
+        reference = name.removeprefix(f"{BY_ERROR}:")
         curves |= {f"{curve}:{reference}": value.tolist() for curve, value in metric.compute().items()}
     return Merged(metrics.compute(), curves, len(paths))

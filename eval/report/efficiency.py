@@ -27,10 +27,17 @@ UNITS = {GPU: "GPU", CPU: "CPU"}
 _SMALLEST = 0.01  # less prints as "<0.01"
 
 
-def efficiency_table(
-    measured: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, relative: bool = False, net: bool = False
-) -> tuple[str, str]:
-    """The tables as Markdown and as LaTeX.
+Measured = Mapping[str, Any] | Sequence[Mapping[str, Any]]
+
+
+def efficiency_table(measured: Measured, **how: bool) -> tuple[str, str]:
+    """:func:`efficiency_tables` as Markdown and as LaTeX."""
+    tables = efficiency_tables(measured, **how)
+    return "\n".join(map(markdown, tables)), "\n".join(map(latex, tables))
+
+
+def efficiency_tables(measured: Measured, *, relative: bool = False, net: bool = False) -> list[Table]:
+    """One table per architecture.
 
     Args:
         measured: what ``measure`` returned, once or several times (for several architectures).
@@ -38,14 +45,6 @@ def efficiency_table(
             does other work. Where all runs on the CPU, these are processor times, which such work does not stretch.
         net: power and energy less those of the idle machine.
     """
-    tables = efficiency_tables(measured, relative=relative, net=net)
-    return "\n".join(map(markdown, tables)), "\n".join(map(latex, tables))
-
-
-def efficiency_tables(
-    measured: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, relative: bool = False, net: bool = False
-) -> list[Table]:
-    """The same as values, one table per architecture."""
     runs = [measured] if isinstance(measured, Mapping) else list(measured)
     return [
         _table(run, label, relative, "net" if net else "gross")
@@ -65,16 +64,18 @@ def paper_efficiency_tables(networks: Iterable[str]) -> list[Table]:
 def _table(run: Mapping[str, Any], label: str, relative: bool, kind: str) -> Table:
     rows = [row for row in run["rows"] if row["network"] == label]
     bases = list(dict.fromkeys(row["base"] for row in rows))  # a block per base, as in the paper
-    units = run["devices"]["units"]
-    clock = _clock(units) if relative else None
-    labels = _labels(rows)
+    units, network = run["devices"]["units"], run["networks"][bases[0]]
+    labels = {row["row"]: row["row"] for row in rows}
+    if all("setting" in row for row in rows):
+        known = {row["row"]: Row(Method.parse(row["method"]), setting_of(row["setting"])) for row in rows}
+        shown = row_labels(known.values())
+        labels = {name: shown[row] for name, row in known.items()}
     lines = [
-        _line(row, block, units, clock, kind)._replace(label=labels[row["row"]])
-        for block, b in enumerate(bases)
+        Line(block, labels[row["row"]], False, _cells(row, units, _clock(units) if relative else None, kind))
+        for block, base in enumerate(bases)
         for row in rows
-        if row["base"] == b
+        if row["base"] == base
     ]
-    network = run["networks"][bases[0]]
     return Table(
         f"efficiency-{''.join(c if c.isalnum() else '-' for c in label.lower())}",
         f"Efficiency of uncertainty, {label}",
@@ -83,15 +84,6 @@ def _table(run: Mapping[str, Any], label: str, relative: bool, kind: str) -> Tab
         lines,
         (_about_depth(network, units[DEPTH], relative), *_notes(run, rows, relative, kind)),
     )
-
-
-def _labels(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """The rows' labels in a table by their names; of measurements that do not state a row's setting, the names."""
-    if not all("setting" in row for row in rows):
-        return {row["row"]: row["row"] for row in rows}
-    known = {row["row"]: Row(Method.parse(row["method"]), setting_of(row["setting"])) for row in rows}
-    shown = row_labels(known.values())
-    return {name: shown[row] for name, row in known.items()}
 
 
 def _paper_table(quoted: PaperTable) -> Table:
@@ -124,12 +116,23 @@ def _clock(units: Mapping[str, str]) -> str:
     return PROCESSOR if set(units.values()) == {CPU} else WALL
 
 
-def _line(row: Mapping[str, Any], block: int, units: Mapping[str, str], clock: str | None, kind: str) -> Line:
+def _cells(row: Mapping[str, Any], units: Mapping[str, str], clock: str | None, kind: str) -> tuple[Cell, ...]:
     cells: list[str] = []
     for unit in UNITS:
         parts = [part for part in (NETWORK, MULTIVIEW) if _counts(row, part) and units[part] == unit]
         cells += [_latency(row, parts, clock), *_power_and_energy(row, parts, kind)]
-    return Line(block, row["row"], False, tuple(map(Cell, (*cells, _energy_overhead(row, kind), *_memory(row)))))
+    overhead, memory = row["energy_overhead_percent"], row["memory"]
+    if overhead is not None and kind in overhead:
+        cells.append(_percent(overhead[kind]))
+    else:
+        whole = any("not_separable" in part for part in row["energy"].values())
+        cells.append(NOT_SEPARABLE if whole else NOT_MEASURABLE)
+    state = "" if memory["multiview"] is None else megabytes(memory["multiview"]["bytes_end"])
+    if "not_measurable" in memory:
+        cells += [NOT_MEASURABLE, state, NOT_MEASURABLE]
+    else:
+        cells += [megabytes(memory["network_uncertainty_bytes"]), state, _percent(memory["overhead_percent"])]
+    return tuple(map(Cell, cells))
 
 
 def _counts(row: Mapping[str, Any], part: str) -> bool:
@@ -137,28 +140,21 @@ def _counts(row: Mapping[str, Any], part: str) -> bool:
     return part in row["latency"] and "none" not in row["latency"][part]
 
 
-# ---- time and energy ----
-
-
 def _latency(row: Mapping[str, Any], parts: Sequence[str], clock: str | None) -> str:
-    """The sum over parts of the medians; "<" the upper quartile where the lower one is not above 0."""
+    """The sum over parts of the medians, in ms or as multiples of depth by a clock; "<" the upper quartile where the
+    lower one is not above 0."""
     if not parts:
         return ""
     if any("not_separable" in row["latency"][part] for part in parts):
         return NOT_SEPARABLE
-    decimals = 1 if clock is None else 2
-    spreads = [_spread(row, part, clock) for part in parts]
+    if clock is None:
+        decimals, names, of = 1, ("q1_ms", "median_ms", "q3_ms"), [row["latency"][part] for part in parts]
+    else:
+        decimals, names, of = 2, ("q1", "median", "q3"), [row["ratios_to_depth"][part][clock] for part in parts]
+    spreads = [[times[name] for name in names] for times in of]
     if len(spreads) == 1 and spreads[0][0] <= 0:
         return f"<{_digits(max(spreads[0][2], _SMALLEST), decimals)}"
     return _digits(sum(max(0.0, middle) for _, middle, _ in spreads), decimals)
-
-
-def _spread(row: Mapping[str, Any], part: str, clock: str | None) -> tuple[float, float, float]:
-    """Lower quartile, median and upper quartile, in ms or as multiples of depth by a clock."""
-    times = row["latency"][part] if clock is None else row["ratios_to_depth"][part][clock]
-    names = ("q1_ms", "median_ms", "q3_ms") if clock is None else ("q1", "median", "q3")
-    low, middle, high = (times[name] for name in names)
-    return low, middle, high
 
 
 def _power_and_energy(row: Mapping[str, Any], parts: Sequence[str], kind: str) -> tuple[str, str]:
@@ -175,26 +171,6 @@ def _power_and_energy(row: Mapping[str, Any], parts: Sequence[str], kind: str) -
     energy = sum(max(0.0, one[kind]["millijoules"]) for one in spent)
     seconds = sum(one[kind]["seconds"] for one in spent)
     return _digits(1e-3 * energy / seconds, 1) if seconds > 0 else "", _digits(energy, 1)
-
-
-def _energy_overhead(row: Mapping[str, Any], kind: str) -> str:
-    overhead = row["energy_overhead_percent"]
-    if overhead is not None and kind in overhead:
-        return _percent(overhead[kind])
-    if any("not_separable" in part for part in row["energy"].values()):
-        return NOT_SEPARABLE
-    return NOT_MEASURABLE
-
-
-# ---- memory ----
-
-
-def _memory(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    memory = row["memory"]
-    state = "" if memory["multiview"] is None else megabytes(memory["multiview"]["bytes_end"])
-    if "not_measurable" in memory:
-        return NOT_MEASURABLE, state, NOT_MEASURABLE
-    return megabytes(memory["network_uncertainty_bytes"]), state, _percent(memory["overhead_percent"])
 
 
 def megabytes(count: float) -> str:

@@ -1,11 +1,9 @@
-"""Which figures a report has, and their files; a file's first word is its kind."""
+"""Which figures a report has; the first word of a name is the figure's kind."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.report.data import Results
@@ -13,44 +11,7 @@ from ufmstar_torch.eval.report.figures_calibration import draw_calibration, draw
 from ufmstar_torch.eval.report.figures_cost import draw_latency, draw_stages, draw_tradeoff
 from ufmstar_torch.eval.report.figures_error import draw_entropy, draw_error
 from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
-from ufmstar_torch.eval.report.pictures import DRAWING_ERRORS
-from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.sweeps import sweeps
-
-SVG, PNG = "svg", "png"
-
-
-def write_figures(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:
-    """Draw every figure for which there are results into ``figures/``.
-
-    Args:
-        results: of an evaluation, with the sums over sequences.
-        kind: "svg" or "png".
-        undrawn: gets the reason of each figure that cannot be drawn, by its name.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: another kind.
-        ImportError: matplotlib is missing.
-        OSError: a file cannot be written.
-    """
-    if kind not in (SVG, PNG):
-        raise ValueError(f"figures must be {SVG} or {PNG}, got {kind!r}")
-    folder = results.out / "figures"
-    folder.mkdir(exist_ok=True)
-    written = []
-    for name, draw in figures_of(results):
-        path = folder / f"{re.sub(r'[^A-Za-z0-9.-]+', '-', name.replace('/', '_'))}.{kind}"
-        try:
-            figure = draw()
-            if figure is not None:
-                save_figure(figure, path)
-                written.append(path)
-        except DRAWING_ERRORS as error:
-            undrawn[name] = " ".join(str(error).split()) or type(error).__name__
-    return written
 
 
 def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
@@ -58,10 +19,8 @@ def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
     for dataset in results.datasets:
         yield f"calibration {dataset}", partial(draw_calibration, results, dataset)
         for base in results.bases:
-            yield (
-                f"calibration sequences {dataset} {base}",
-                partial(draw_sequence_calibration, results, dataset, base),
-            )
+            name = f"calibration sequences {dataset} {base}"
+            yield name, partial(draw_sequence_calibration, results, dataset, base)
         yield f"error {dataset}", partial(draw_error, results, dataset)
     for base in results.bases:
         yield f"entropy {base}", partial(draw_entropy, results, base)

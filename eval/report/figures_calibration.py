@@ -36,37 +36,28 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
     """Both curves over all pixels of a data set, a column per network; None where no row has a variance."""
     merged = {row: results.merged.get((dataset, row)) for row in results.default_rows()}
     curves = {row: sums.curves for row, sums in merged.items() if sums is not None and _has_curves(sums.curves)}
-    bases = list(dict.fromkeys(row.method.base for row in curves))
-    if not bases:
+    panels = {
+        base: ((BASES[base][0], ""), {row: values for row, values in curves.items() if row.method.base == base})
+        for base in dict.fromkeys(row.method.base for row in curves)
+    }
+    if not panels:
         return None
-    columns = min(len(bases), PER_LINE)
-    lines = -(-len(bases) // columns)
     title = f"Calibration on {dataset}, all pixels of {counted(len(results.sequences(dataset)))}"
-    axes = hidden_panels(new_figure(0.5 + 3.4 * columns, 0.4 + 6.0 * lines, title), 2 * lines, columns)
-    for number, base in enumerate(bases):
-        line, column = divmod(number, columns)
-        of_base = {row: values for row, values in curves.items() if row.method.base == base}
-        _draw_calibration(axes[2 * line : 2 * line + 2, column], of_base, (BASES[base][0], ""), ends=True)
-    return axes[0][0].figure
+    return _draw_columns(title, list(panels.values()), PER_LINE, (0.5, 3.4, 0.4, 6.0), ends=True)
 
 
 def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any | None:
     """Both curves of single sequences, from the one on which UfM* is best to that on which it is worst."""
-    names = chosen_sequences(results, dataset, base)
-    if not names:
-        return None
-    columns = min(len(names), 4)
-    lines = -(-len(names) // columns)
-    title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}; errors alone → UfM*, from best to worst"
-    figure = new_figure(0.4 + 2.45 * columns, 0.7 + 4.9 * lines, title)
-    axes = hidden_panels(figure, 2 * lines, columns)
-    for number, name in enumerate(names):
-        line, column = divmod(number, columns)
+    panels = []
+    for name in chosen_sequences(results, dataset, base):
         of = {row: [r for r in results.of(row, dataset) if r.sequence == name] for row in results.default_rows(base)}
         shown = {row: records[0] for row, records in of.items() if records and _has_curves(records[0].curves)}
-        curves = {row: record.curves for row, record in shown.items()}
         titles = (f"{name}\n{_errors(shown, 'ece_delta', 'δ')}", _errors(shown, "ece_q", "q"))
-        _draw_calibration(axes[2 * line : 2 * line + 2, column], curves, titles, named=column == 0)
+        panels.append((titles, {row: record.curves for row, record in shown.items()}))
+    if not panels:
+        return None
+    title = f"Calibration on single sequences of {dataset}, {BASES[base][0]}; errors alone → UfM*, from best to worst"
+    figure = _draw_columns(title, panels, 4, (0.4, 2.45, 0.7, 4.9), ends=False)
     from matplotlib.lines import Line2D
 
     rows = {short_name(row.method): row for row in results.default_rows(base)}
@@ -89,27 +80,35 @@ def chosen_sequences(results: Results, dataset: str, base: str) -> list[str]:
     return [names[i] for i in np.linspace(0, len(names) - 1, MOST_SEQUENCES).round().astype(int)]
 
 
-def _draw_calibration(
-    axes: Sequence[Any],
-    curves: Mapping[Row, Curves],
-    titles: tuple[str, str],
+def _draw_columns(
+    title: str,
+    panels: Sequence[tuple[tuple[str, str], Mapping[Row, Curves]]],
+    most: int,
+    size: tuple[float, float, float, float],
     *,
-    named: bool = True,
-    ends: bool = False,
-) -> None:
-    """Both curves of some rows of one base, UfM* last and so on top.
+    ends: bool,
+) -> Any:
+    """Delta calibration above quantile calibration for some rows of one base, UfM* last and so on top.
 
     Args:
-        axes: two panels: delta and quantile calibration.
-        curves: by row.
-        titles: of the panels.
-        named: with words at the y axes.
-        ends: with the rows' names at the right.
+        title: of the figure.
+        panels: titles of both panels, and curves by row.
+        most: columns side by side.
+        size: width of the margin and of a column, height of the margin and of a line [in].
+        ends: with the rows' names at the right of every panel; else only the first column has words at the y axes.
     """
-    ordered = sorted(curves.items(), key=lambda item: (item[0].method.fusion == UFM_STAR, item[0].method.full))
-    lines = {short_name(row.method): (style_of(row.method), values) for row, values in ordered}
-    draw_delta(axes[0], lines, titles[0], "true share" if named else "", ends)
-    draw_quantiles(axes[1], lines, titles[1], "share of truth below" if named else "", ends)
+    columns = min(len(panels), most)
+    lines = -(-len(panels) // columns)
+    figure = new_figure(size[0] + size[1] * columns, size[2] + size[3] * lines, title)
+    axes = hidden_panels(figure, 2 * lines, columns)
+    for number, (titles, curves) in enumerate(panels):
+        line, column = divmod(number, columns)
+        ordered = sorted(curves.items(), key=lambda item: (item[0].method.fusion == UFM_STAR, item[0].method.full))
+        drawn = {short_name(row.method): (style_of(row.method), values) for row, values in ordered}
+        named = ends or column == 0
+        draw_delta(axes[2 * line, column], drawn, titles[0], "true share" if named else "", ends)
+        draw_quantiles(axes[2 * line + 1, column], drawn, titles[1], "share of truth below" if named else "", ends)
+    return figure
 
 
 def draw_delta(

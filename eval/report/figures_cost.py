@@ -94,17 +94,17 @@ def _draw_stages(axes: Any, y: int, times: Mapping[str, float]) -> None:
     axes.text(101, y, f"{total:.1f} ms", size=TICK, color=INK, va="center")
 
 
-def draw_tradeoff(results: Results, dataset: str | None = None) -> Any | None:
+def draw_tradeoff(results: Results) -> Any | None:
     """ECE_delta against the bytes that are kept between frames, and against the time per frame; None without points."""
-    points = {row: mean_of(results.of(row, dataset), ECE_DELTA) for row in results.default_rows()}
+    points = {row: mean_of(results.of(row), ECE_DELTA) for row in results.default_rows()}
     points = {row: mean for row, mean in points.items() if mean.sequences}
-    kept = {row: mean_of(results.of(row, dataset), STATE).value for row in points}
+    kept = {row: mean_of(results.of(row), STATE).value for row in points}
     kept = {row: 0.0 if math.isnan(x) else x for row, x in kept.items()}  # a method alone keeps nothing
-    took = {row: mean_of(results.of(row, dataset), TOTAL_MS).value for row in points}
+    took = {row: mean_of(results.of(row), TOTAL_MS).value for row in points}
     took = {row: x for row, x in took.items() if not math.isnan(x)}
     if not any(kept.values()):
         return None
-    figure = new_figure(11.0, 4.8, f"Calibration against cost on {dataset or 'all sequences'}")
+    figure = new_figure(11.0, 4.8, "Calibration against cost on all sequences")
     words = ("kept between frames [MB]", "time per frame [ms]")
     for axes, panel, word in zip(figure.subplots(1, 2, sharey=True), (kept, took), words, strict=True):
         for row, x in panel.items():

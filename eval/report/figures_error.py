@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.engine.judge import BY_ERROR
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.colours import FAINT, INK
-from ufmstar_torch.eval.report.data import BY_ERROR, Merged, Results
+from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.style import (
     LABEL,
     TICK,
@@ -30,32 +31,27 @@ _DECADES = (0.001, 0.01, 0.1, 1.0, 10.0, 100.0)
 
 
 def draw_error(results: Results, dataset: str) -> Any | None:
-    """A line of panels per network, a panel per reference; None where no row was judged so."""
+    """The mean NLL of each tenth of the pixels, from a row's smallest errors to its largest: a line of panels per
+    network, a panel per reference; None where no row was judged so."""
     panels = {base: of_base for base in results.bases if (of_base := _error_curves(results, dataset, base))}
     if not panels:
         return None
     columns = max(map(len, panels.values()))
-    title = f"NLL by size of the error on {dataset}"
-    figure = new_figure(0.6 + 4.3 * columns, 0.5 + 3.1 * len(panels), title)
+    figure = new_figure(0.6 + 4.3 * columns, 0.5 + 3.1 * len(panels), f"NLL by size of the error on {dataset}")
     for line, (base, by_reference) in zip(hidden_panels(figure, len(panels), columns), panels.items(), strict=True):
         for axes, (reference, curves) in zip(line, by_reference.items(), strict=False):
+            axes.set_visible(True)
+            for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
+                x = (np.arange(len(values)) + 0.5) * 100 / len(values)
+                axes.plot(x, np.array(values, float), label=row.method.name, **style_of(row.method).line)
+            axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
             method = Method.parse(reference)
-            judge = "it" if method.fusion == ALONE else short_name(method)
-            _draw_error(axes, f"{BASES[base][0]}: where {judge} is confident", curves)
+            title = f"{BASES[base][0]}: where {'it' if method.fusion == ALONE else short_name(method)} is confident"
+            finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
+            # At the last group that had a pixel.
+            ends = {row: next(value for value in reversed(values) if value == value) for row, values in curves.items()}
+            label_ends(axes, [(y, short_name(row.method), style_of(row.method).colour) for row, y in ends.items()])
     return figure
-
-
-def _draw_error(axes: Any, title: str, curves: Mapping[Row, Sequence[float]]) -> None:
-    """The mean NLL of each tenth of the pixels, from the smallest errors to the largest."""
-    axes.set_visible(True)
-    for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
-        x = (np.arange(len(values)) + 0.5) * 100 / len(values)
-        axes.plot(x, np.array(values, float), label=row.method.name, **style_of(row.method).line)
-    axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
-    finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
-    # At the last group that had a pixel.
-    ends = {row: next(value for value in reversed(values) if value == value) for row, values in curves.items()}
-    label_ends(axes, [(y, short_name(row.method), style_of(row.method).colour) for row, y in ends.items()])
 
 
 def _error_curves(results: Results, dataset: str, base: str) -> dict[str, dict[Row, Sequence[float]]]:
@@ -64,7 +60,7 @@ def _error_curves(results: Results, dataset: str, base: str) -> dict[str, dict[R
     for row in results.default_rows(base):
         merged = results.merged.get((dataset, row))
         for name, values in (merged.curves if merged else {}).items():
-            reference = name.removeprefix(BY_ERROR)
+            reference = name.removeprefix(f"{BY_ERROR}:")
             if reference != name and np.isfinite(values).any() and Method.parse(reference).base == base:
                 curves.setdefault(reference, {})[row] = values
     return dict(sorted(curves.items(), key=lambda item: (item[0].startswith("UfM"), item[0])))

@@ -29,6 +29,7 @@ SIGMA_FLOOR = 1e-6
 # The constant spherical harmonic: viewers show the colour 1/2 + SH_DC f_dc.
 SH_DC = 0.5 / np.sqrt(np.pi)
 OPACITY = 0.8
+RADIUS, SUBDIVISIONS = 2.0, 2  # of the ellipsoids, of the icosahedron: 320 triangles each
 _TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
 
@@ -68,45 +69,23 @@ def write_mixture_ply(
 
 
 def write_ellipsoids_ply(
-    path: str | Path,
-    mixture: GaussianMixture,
-    *,
-    stream: int = 0,
-    T_world_first: Tensor | None = None,
-    radius: float = 2.0,
-    subdivisions: int = 2,
+    path: str | Path, mixture: GaussianMixture, *, stream: int = 0, T_world_first: Tensor | None = None
 ) -> int:
-    """Write the occupied components as a triangle mesh of ellipsoids, atomically.
+    """Write the occupied components as a triangle mesh of ellipsoids of ``RADIUS`` standard deviations, atomically.
 
     Opens in MeshLab, Blender and the like. Vertices carry x y z [m], outward normals, red green blue of
-    sqrt(disagreement) as in ``write_mixture_ply``, disagreement [m^2] and the component's number.
-
-    Args:
-        path: the file; its folder must exist.
-        mixture: B streams of K slots.
-        stream: which of the B.
-        T_world_first: [4, 4] or [1, 4, 4] rigid, from the mixture's frame to the world; None = stay there.
-        radius: of the ellipsoids in standard deviations.
-        subdivisions: of the icosahedron; 2 gives 320 triangles each.
-
-    Returns:
-        The number of components written.
-
-    Raises:
-        ValueError: there is no such stream, a shape is wrong, or radius is not positive.
-        OSError: see ``write_atomic``.
+    sqrt(disagreement), disagreement [m^2] and the component's number. Arguments, result and errors as
+    :func:`write_mixture_ply`.
     """
-    if not radius > 0 or subdivisions < 0:
-        raise ValueError(f"radius must be positive and subdivisions >= 0, got {radius} and {subdivisions}")
     parts = _Components(mixture, stream, T_world_first)
-    sphere, triangles = icosphere(subdivisions)
+    sphere, triangles = icosphere(SUBDIVISIONS)
     k, n = len(parts.mean), len(sphere)
     # Sigma^(1/2) u: symmetric with a positive determinant, so triangles keep facing outwards.
     root = np.einsum("kij,kj,klj->kil", parts.axes, parts.sigma, parts.axes)
     inverse = np.einsum("kij,kj,klj->kil", parts.axes, 1 / parts.sigma, parts.axes)
     normal = np.einsum("kij,nj->kni", inverse, sphere)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    position = (parts.mean[:, None] + radius * np.einsum("kij,nj->kni", root, sphere)).reshape(-1, 3)
+    position = (parts.mean[:, None] + RADIUS * np.einsum("kij,nj->kni", root, sphere)).reshape(-1, 3)
     kinds = dict.fromkeys(("x", "y", "z", "nx", "ny", "nz"), "<f4")
     kinds |= dict.fromkeys(("red", "green", "blue"), "|u1") | {"disagreement": "<f4", "component": "<i4"}
     of_component = (parts.colour, parts.disagreement, np.arange(k))
@@ -114,7 +93,7 @@ def write_ellipsoids_ply(
     faces = np.zeros(k * len(triangles), dtype=[("sides", "|u1"), ("vertex_indices", "<i4", (3,))])
     faces["sides"] = 3
     faces["vertex_indices"] = (triangles + n * np.arange(k)[:, None, None]).reshape(-1, 3)
-    legend = [parts.legend, f"ellipsoids of {radius:g} standard deviations"]
+    legend = [parts.legend, f"ellipsoids of {RADIUS:g} standard deviations"]
     _write_ply(Path(path), {"vertex": vertices, "face": faces}, legend)
     return k
 

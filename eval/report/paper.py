@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 
@@ -30,29 +30,21 @@ class PaperTable:
     measured_on: str
     columns: tuple[str, ...]
     rows: Mapping[str, Mapping[str, Cell]]
-    suite: str
-    alone: Mapping[str, str]
+    suite: str = ""
+    alone: Mapping[str, str] = field(default_factory=dict)
 
 
 @cache
 def paper_tables() -> tuple[PaperTable, ...]:
     """All tables, in the order of the file; table 2 once for each of its networks."""
     listed = tomllib.loads((files("ufmstar_torch.eval.report") / "paper.toml").read_text(encoding="utf-8"))["table"]
-    return tuple(
-        PaperTable(
-            entry["number"],
-            entry["network"],
-            entry["measured_on"],
-            tuple(entry["columns"]),
-            {
-                method: {c: Cell(*v.split(" ± ")) for c, v in zip(entry["columns"], values, strict=True) if v != "-"}
-                for method, values in entry["rows"].items()
-            },
-            entry.get("suite", ""),
-            entry.get("alone", {}),
-        )
-        for entry in listed
-    )
+    tables = []
+    for entry in listed:
+        columns = tuple(entry.pop("columns"))
+        printed = {name: zip(columns, values, strict=True) for name, values in entry.pop("rows").items()}
+        rows = {name: {c: Cell(*v.split(" ± ")) for c, v in cells if v != "-"} for name, cells in printed.items()}
+        tables.append(PaperTable(columns=columns, rows=rows, **entry))
+    return tuple(tables)
 
 
 def paper_table_of(suite: str) -> PaperTable | None:

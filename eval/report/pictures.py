@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from itertools import groupby
@@ -22,16 +22,12 @@ from ufmstar_torch.eval.report.examples import Example, Map, RowMaps, deviation,
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
-from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.worklist import WorkItem
 
-INDEX = "pictures.json"
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
 # So that a report of a hundred sequences stays one that can be read, and mailed.
 MOST_FRAMES, MOST_ROOMS = 4, 3
 _BREAKDOWN_BASES = ("ensemble", "aleatoric")
-# Errors of drawing, after which a report goes on without the picture.
-DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
 # [nats] The same in all strips, so that they can be compared. 6 is an error of some 3.5 sigma (of sigma = .3 m): beyond
 # it a row is simply wrong there, and how much more so would only flatten the rest of the map. Its map is neither
 # depth's nor that of lengths, and has no grey.
@@ -60,30 +56,16 @@ class Picture:
     alt: str
 
 
-def write_pictures(results: Results, undrawn: dict[str, str]) -> list[Picture]:
-    """Draw strips, breakdowns, comparisons and rooms of the example frames into ``OUT/figures``, with an index.
-
-    Args:
-        results: of the evaluation.
-        undrawn: gets the reason of each picture that cannot be drawn, by its name.
+def pictures_of(results: Results, folder: Path) -> Iterator[tuple[str, Callable[[], Picture]]]:
+    """Name and function of strips, breakdowns, comparisons and rooms of the example frames; the function writes the
+    picture into ``folder``.
 
     Raises:
         ValueError: an example cannot be read; the message names the file.
-        ImportError: matplotlib is missing.
-        OSError: a file cannot be written.
     """
-    folder = results.out / "figures"
-    folder.mkdir(parents=True, exist_ok=True)
     rows = {row.slug: row for row in results.rows}
-    pictures = []
-    for name, draw in [*_of_frames(results, folder, rows), *_of_rooms(results, folder, rows)]:
-        try:
-            pictures.append(draw())
-        except DRAWING_ERRORS as error:
-            undrawn[name] = " ".join(str(error).split()) or type(error).__name__
-    if pictures:
-        write_json_atomic(folder / INDEX, {"pictures": [asdict(picture) for picture in pictures]})
-    return pictures
+    yield from _of_frames(results, folder, rows)
+    yield from _of_rooms(results, folder, rows)
 
 
 def file_name(*parts: str) -> str:

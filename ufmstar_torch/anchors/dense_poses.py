@@ -36,6 +36,11 @@ _ENOUGH = 10
 _MEDIAN_SQUARE = 0.4549
 # [px] Standard deviation of a position by errors of the poses before it is estimated, and the least one.
 _FIRST, _LEAST = 0.3, 0.003
+# A pixel's own variance over the one stated by the match: _PATCH, which all views share, and _VIEWS times the mean
+# squared difference of its views, estimated with _BEFORE views' worth of the running one. Fitted on tours.
+_PATCH, _VIEWS, _BEFORE = 0.08, 1.5, 0.15
+# Times that their effect is linearised.
+_LINEARISED = 2
 # [px] What errors of the poses leave of it.
 _FIRST_LEFT = 0.1
 # Correlation of the errors of two keyframes: half of each error is that of the present view.
@@ -131,25 +136,25 @@ class PoseErrors:
         shows = used & np.isfinite(measured.across)
         speed, slope = (np.where(used, x, 1.0) for x in (measured.speed, measured.slope))
         along = np.where(used[..., None], measured.along, 0.0)
-        on_line, across_change = linearised(pixel, measured.rho, along, slope, views, K)
         left = self._left[shares]
         own = np.where(used, (measured.noise + left * (1 + slope**2)) / speed**2, np.inf)
-        shown = Shown(
-            on_line / speed[..., None],
-            np.where(used, measured.value - measured.rho[:, None], 0.0),
-            own,
-            across_change,
-            np.where(shows, measured.across, 0.0),
-            np.where(shows, measured.across_noise + left, np.inf),
-        )
-        solution = solved(shown, *self._before(shares))
+        value = np.where(used, measured.value - measured.rho[:, None], 0.0)
+        across = np.where(shows, measured.across, 0.0)
+        across_variance = np.where(shows, measured.across_noise + left, np.inf)
+        before, rho = self._before(shares), measured.rho
+        for _ in range(_LINEARISED):  # errors of poses move the depths at which they are linearised
+            on_line, across_change = linearised(pixel, rho, along, slope, views, K)
+            shown = Shown(on_line / speed[..., None], value, own, across_change, across, across_variance)
+            solution = solved(shown, *before)
+            rho = measured.rho + solution.rho
         self._learn_poses(solution, shares, K, depth)
         if trusted:
             self._learn_camera(solution, views.image.shape[2])
         self._learn_noise(solution.residual[used], solution.beside, measured.across_noise, shows, shares)
-        factor = max(self._disagreement, (1 + self._disagreement) / 2)  # half is the patch's, which all views share
-        variance = factor * own.min(1, initial=np.inf) + solution.common
-        return Fit(measured.rho + solution.rho, variance)
+        views_agree = np.maximum(measured.agreed - 1, 0)
+        apart = (_BEFORE * self._disagreement + solution.residual.sum(1)) / (_BEFORE + views_agree)
+        variance = (_PATCH + _VIEWS * apart) * own.min(1, initial=np.inf) + solution.common
+        return Fit(rho, variance)
 
     def _before(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Precision [S, S] and mean [S] of the errors of some keyframes and of the camera, S = 6 V + 4."""

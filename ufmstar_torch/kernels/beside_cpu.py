@@ -13,12 +13,12 @@ from ufmstar_torch.kernels.compile_cpu import reordered
 
 # Two anchors are alike within so many standard deviations of their difference, or this share of the inverse depth.
 _SIGMAS, _SHARE = 3.0, 0.05
-# An anchor with _SOME others around it, of which fewer than _FEW are alike, stands alone. On tours, _WRONG of those
-# have another depth: their squared error is that share of the squared difference from those around them.
-_SOME, _FEW, _WRONG = 4, 2, 0.25
+# Share of wrong anchors in a frame; they are those that differ from most of the anchors around them: each one's part of
+# that share goes with the fourth power of the share of others around it, counted with one more that is alike.
+_WRONG, _POWER = 0.026, 4
 # A side is that of the surface where the mean directions of those alike and of the others differ by this much along the
-# gradient (2 = opposite); the pixel then moves to it by so many pixels.
-_APART, _INTO = 0.5, 2.0
+# gradient (2 = opposite); the pixel then moves to it by 1 px, or by 2 px where they differ by _FAR.
+_APART, _FAR = 0.25, 1.0
 # Half width of the window of the gradient [px]; cells around an anchor's own that are asked.
 _HALF, _CELLS = 2, 2
 
@@ -40,7 +40,8 @@ def beside(
         cell: side of a cell [px]; of two anchors in a cell, the second one counts for others.
 
     Returns:
-        [N, 2] pixels on the surface, and [N] the variance of ``rho`` to add [1/m^2]: 0 where it does not stand alone.
+        [N, 2] pixels on the surface, and [N] the square of the error of ``rho`` to expect [1/m^2]: the probability that
+        the anchor is wrong times the root mean squared difference from the others around it; 0 without others.
     """
     shape = (image.shape[0] // cell + 1, image.shape[1] // cell + 1)
     moved, alone, lies_in = pixel.copy(), np.zeros(len(pixel)), np.full(shape, -1, np.int64)
@@ -50,13 +51,13 @@ def beside(
 
 @reordered
 def _beside(image, pixel, rho, variance, cell, lies_in, moved, alone):
+    differs = np.zeros(len(pixel))
     for n in range(len(pixel)):
         lies_in[int(pixel[n, 1]) // cell, int(pixel[n, 0]) // cell] = n
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
         alike, other = np.zeros(2), np.zeros(2)
         count_alike = count_other = 0
-        square = 0.0
         row, column = int(v) // cell, int(u) // cell
         for j in range(max(row - _CELLS, 0), min(row + _CELLS + 1, lies_in.shape[0])):
             for i in range(max(column - _CELLS, 0), min(column + _CELLS + 1, lies_in.shape[1])):
@@ -73,16 +74,22 @@ def _beside(image, pixel, rho, variance, cell, lies_in, moved, alone):
                     count_other += 1
                     other[0] += du * over
                     other[1] += dv * over
-                    square += difference
-        if count_alike + count_other >= _SOME and count_alike < _FEW:
-            alone[n] = _WRONG * square / count_other
-        if count_alike == 0 or count_other == 0:
+                    alone[n] += difference
+        if count_other == 0:
+            continue
+        alone[n] /= count_other
+        differs[n] = (count_other / (count_alike + count_other + 1)) ** _POWER
+        if count_alike == 0:
             continue
         eu, ev = _gradient(image, int(u + 0.5), int(v + 0.5))
         apart = (alike[0] * eu + alike[1] * ev) / count_alike - (other[0] * eu + other[1] * ev) / count_other
         if abs(apart) >= _APART:
-            moved[n, 0] += np.sign(apart) * _INTO * eu
-            moved[n, 1] += np.sign(apart) * _INTO * ev
+            into = np.sign(apart) * (2.0 if abs(apart) >= _FAR else 1.0)
+            moved[n, 0] += into * eu
+            moved[n, 1] += into * ev
+    usual = max(differs.sum() / max(len(differs), 1), _WRONG)
+    for n in range(len(pixel)):
+        alone[n] *= (_WRONG * differs[n] / usual) ** 2
 
 
 @reordered

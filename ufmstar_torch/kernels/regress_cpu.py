@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.regress_cull_cpu import in_view
 from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
@@ -55,7 +56,7 @@ def regress_maps(
     """
     if pixels is not None and config.regression != "exact":
         return regress_pixels(mixture_cam, depth, intrinsics, depth > 0, config, pixels, regress)
-    z, K = depth.contiguous().numpy(), _doubles(intrinsics)[0]
+    z, K = array(depth), _doubles(intrinsics)[0]
     shape = z.shape if pixels is None else tuple(pixels.shape)
     out, features = np.empty(shape, z.dtype), np.empty((len(z), mixture_cam.features.shape[2], *shape[1:]), z.dtype)
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
@@ -94,10 +95,10 @@ def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> 
 
 def smooth(previous: Tensor, current: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
     """As :func:`ufmstar_torch.regress.smooth`, for CPU tensors, in one pass."""
-    memory, shown = torch.empty_like(previous), torch.empty_like(current)
-    given = (value.detach().contiguous().view(-1).numpy() for value in (previous, current))
-    _smooth(*given, alpha, memory.view(-1).numpy(), shown.view(-1).numpy())
-    return memory, shown
+    given = array(previous), array(current)
+    memory, shown = map(np.empty_like, given)
+    _smooth(*(value.reshape(-1) for value in given), alpha, memory.reshape(-1), shown.reshape(-1))
+    return torch.from_numpy(memory), torch.from_numpy(shown)
 
 
 @kernel
@@ -117,7 +118,7 @@ def _settings(config: UfMStarConfig, dtype: torch.dtype) -> tuple[float, ...]:
 
 
 def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:
-    return [value.detach().double().contiguous().numpy() for value in values]
+    return [np.asarray(array(value), np.float64) for value in values]
 
 
 def _fields(m: GaussianMixture) -> list[NDArray[np.float64]]:
@@ -125,4 +126,5 @@ def _fields(m: GaussianMixture) -> list[NDArray[np.float64]]:
 
 
 def _regression(out: NDArray[Any], features: NDArray[Any]) -> Regression:
-    return Regression(torch.from_numpy(out), torch.from_numpy(features).movedim(1, -1))
+    last = features.transpose(0, *range(2, features.ndim), 1)
+    return Regression(torch.from_numpy(out), torch.from_numpy(last))

@@ -86,7 +86,7 @@ def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit]
     spread = np.empty(absent, z.dtype) if given.variance is None else array(given.variance)
     limits = _limits(given.config, given.depth_bins, before_pruning)
     room = height * given.segments_per_row
-    spans, owner = np.empty((streams, height, 2), np.int64), np.empty(z.shape, np.int32)
+    spans, runs = np.empty((streams, height, 4), np.int64), np.empty((streams, height * width, 2), np.int32)
     table, table_int = np.empty((streams, room, SEGMENT)), np.empty((streams, room, SEGMENT_INT), np.int64)
     shares = shares_of_stream(streams, height * width)
     rows = [height * i // shares for i in range(shares + 1)]
@@ -97,18 +97,16 @@ def fit(given: SegmentInput, *, before_pruning: bool = False) -> tuple[list[Fit]
         bins = _depth_bins(0.5 * min(width / fx, height / fy), limits)
         tables = spans[b], table[b], table_int[b]
         for first, last in itertools.pairwise(rows):
-            scans.append(
-                (z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, owner[b])
-            )
+            scans.append((z[b], use[b], spread[b], fx, fy, cx, cy, slope, *bins, limits, first, last, *tables, runs[b]))
         joins.append((width, fy, cy, slope, bins[0], limits, *tables))
     each(scan_rows, scans)
     joined = each(join_rows, joins)
     slots = [slot for *_, slot in joined]
 
     def labels() -> Tensor:
-        out = np.empty(owner.shape, np.int64)
+        out = np.empty(z.shape, np.int64)
         for b, slot in enumerate(slots):
-            write_labels(owner[b], slot, out[b])
+            write_labels(spans[b], runs[b], slot, out[b])
         return torch.from_numpy(out)
 
     return [(kept, gaussians, whole) for kept, gaussians, whole, _ in joined], labels

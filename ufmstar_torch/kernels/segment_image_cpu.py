@@ -38,7 +38,7 @@ def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
     """Fuse the segments of all rows of an image, from the first row to the last.
 
     Returns which Gaussians are kept, in emission order, all their values, and the slot among those kept of the segment
-    that ``owner`` names (see :func:`scan_rows`), -1 for none.
+    that ``runs`` name (see :func:`scan_rows`), -1 for none.
     """
     height, most = spans.shape[0], segments_of_row(width, limits)
     member = np.empty(table.shape[0], np.int64)  # segment -> Gaussian
@@ -63,11 +63,12 @@ def join_rows(width, fy, cy, slope, lengths2, limits, spans, table, table_int):
 
 
 @kernel
-def write_labels(owner, slot, labels):
+def write_labels(spans, runs, slot, labels):
     """The slot of every pixel's segment, or -1."""
     for v in range(labels.shape[0]):
-        for u in range(labels.shape[1]):
-            labels[v, u] = slot[owner[v, u]]
+        for i in range(spans[v, 2], spans[v, 3]):
+            for u in range(runs[i, 0], runs[i + 1, 0] if i + 1 < spans[v, 3] else labels.shape[1]):
+                labels[v, u] = slot[runs[i, 1]]
 
 
 @part

@@ -44,31 +44,31 @@ class _Open(NamedTuple):
 
 @kernel
 def scan_rows(
-    z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, owner
+    z, use, spread, fx, fy, cx, cy, slope, lengths2, edges, limits, first, last, spans, table, table_int, runs
 ):
     """Scanline segmentation of the rows from ``first`` to ``last``, each on its own.
 
     Finished segments go to ``table`` and ``table_int``, from row ``first * most`` on, with at most ``most`` of an image
-    row. ``spans`` [H, 2] receives where a row's segments begin and end, ``owner`` [H, W] 1 + the place of the segment
-    that a pixel belongs to, or 0.
+    row. Pixels go to ``runs``, from row ``first * W`` on: where a run of pixels of one segment begins in the image row,
+    and 1 + the place of the segment or 0. ``spans`` [H, 4] receives where a row's segments begin and end, and likewise
+    its runs.
     """
     width = z.shape[1]
-    row = np.empty(width), np.empty(width), np.empty(width), np.zeros(width, np.bool_), np.zeros(width)
-    rx, spare = np.empty(width), np.empty(width)
+    row, rx = (np.empty(width), np.empty(width), np.empty(width), np.zeros(width)), np.empty(width)
     for u in range(width):
         rx[u] = (u - cx) / fx
     place = np.empty(width + 1, np.int32)  # what the row started, from 1 on -> 1 + finished segment; 0 = too sparse
     older, older_int = np.empty((limits.max_open, 10)), np.empty((limits.max_open, 5), np.int64)
-    end = first * segments_of_row(width, limits)
+    end, pixels = first * segments_of_row(width, limits), first * width
     for v in range(first, last):
-        spans[v, 0] = end
-        _usable(z, use, spread, v, limits.max_depth, row[0], row[4])
-        _thresholds(row[0], rx, slope, limits, row[1], row[2], spare, row[3])
-        end = _scanline(
+        spans[v, 0], spans[v, 2] = end, pixels
+        _usable(z, use, spread, v, limits.max_depth, row[0], row[3])
+        _thresholds(row[0], rx, slope, limits, row[1], row[2])
+        end, pixels = _scanline(
             row, rx, (v - cy) / fy, slope, lengths2, edges, limits, spread.size > 0, older, older_int, table,
-            table_int, end, place, owner, v,
+            table_int, end, place, runs, pixels,
         )  # fmt: skip
-        spans[v, 1] = end
+        spans[v, 1], spans[v, 3] = end, pixels
 
 
 @leaf
@@ -91,46 +91,48 @@ def _usable(z, use, spread, v, max_depth, depth, s2):
 
 
 @leaf
-def _thresholds(depth, rx, slope, limits, x, tau_z, tau_x, near):
-    """Of a row: x, tau_z (-1 for a pixel that takes no part), tau_x, and which pixels are near the one before."""
+def _thresholds(depth, rx, slope, limits, x, tau_z):
+    """Of a row: x, and tau_z (-1 for a pixel that takes no part)."""
     for u in range(depth.size):
         x[u] = rx[u] * depth[u]
-    low, high, highest = limits.noise_floor, limits.noise_thresh, limits.line_thresh
+    low, high = limits.noise_floor, limits.noise_thresh
     for u in range(depth.size):
         t = 6.0 * (slope * depth[u] * depth[u])
         t = t if t > low else low
         t = t if t < high else high
         tau_z[u] = t if depth[u] > 0 else -1.0
-    for u in range(depth.size):
-        t = slope * depth[u] * depth[u]
-        t = t if t > low else low
-        tau_x[u] = t if t < highest else highest
-    for u in range(1, depth.size):
-        near[u] = (abs(depth[u] - depth[u - 1]) < tau_z[u]) & (abs(x[u] - x[u - 1]) < tau_x[u])
+
+
+@leaf
+def _near(x, z, last_x, last_z, tau_z, slope, limits):
+    """Whether a point is near the one before: within tau_z and tau_x."""
+    tau_x = min(max(slope * z * z, limits.noise_floor), limits.line_thresh)
+    return (abs(z - last_z) < tau_z) & (abs(x - last_x) < tau_x)
 
 
 @leaf
 def _scanline(
     row, rx, ry, slope, lengths2, edges, limits, spread, older, older_int, segments, segments_int, done,
-    place, owner, v,
+    place, runs, run,
 ):  # fmt: skip
-    """Scanline segmentation of row v.
+    """Scanline segmentation of a row.
 
-    ``row`` are depth, x, tau_z, which pixels are near the one before, and variances, which are 0 without ``spread``.
-    Writes the finished segments from ``done`` on and, to row v of ``owner``, 1 + the place of a pixel's segment or 0;
-    returns the end of the finished segments. The newest open segment lives in registers, the others in a ring of
-    max_open - 1 places, ``front`` being the newest of them. ``place`` is scratch.
+    ``row`` are depth, x, tau_z and variances, which are 0 without ``spread``.
+    Writes the finished segments from ``done`` on and the runs from ``run`` on; returns the end of both. The newest open
+    segment lives in registers, the others in a ring of max_open - 1 places, ``front`` being the newest of them.
+    ``place`` is scratch.
     """
-    depth, x_of, tau_z, near, s2 = row
+    depth, x_of, tau_z, s2 = row
     y_factor = 1.0 + ry * ry
     room = limits.max_open - 1
     front = waiting = started = n = right = left = nearest = u = k = ZERO
     x0 = z0 = w2 = dx = dz = dxx = dxz = dzz = 0.0
     low, high, length2 = 0.0, edges[0], lengths2[0]  # of depth bin k
+    first_run = run
     while u < depth.size:
         z, x = depth[u], x_of[u]
         if z == 0.0:
-            owner[v, u] = 0
+            run = _begun(runs, first_run, run, u, 0)
             u += 1
             continue
         if not (z > low and z <= high):
@@ -144,15 +146,13 @@ def _scanline(
         if fits and n > limits.n_check:
             fits = dx != 0 and abs(z0 + dz * (x - x0) / dx - z) < tau_z[u]
         elif fits:
-            fits = abs(z - depth[right]) < tau_z[u] and abs(x - x_of[right]) < min(
-                max(slope * z * z, limits.noise_floor), limits.line_thresh
-            )
+            fits = _near(x, z, x_of[right], depth[right], tau_z[u], slope, limits)
         if not fits:
             q = _waiting_match(older, older_int, front, waiting, room, x, z, u, slope, tau_z[u], length2, limits)
             if q >= 0:
                 match = _extended(_load(older, older_int, q), x, z, u, k, y_factor, rx[u], s2[u])
                 _store(older, older_int, q, match)
-                owner[v, u] = match.born
+                run = _begun(runs, first_run, run, u, match.born)
                 u += 1
                 continue
             if n > 0:
@@ -175,15 +175,16 @@ def _scanline(
         u += 1
         # What follows without a gap in the same depth bin, by the same rules: until n_check, then by the line.
         short = u if spread else min(depth.size, max(u, begin + limits.n_check - n + 1))
-        while u < short:
+        while 0 <= u < short:  # the index is not negative: no wrap-around to compile
             ex, ez = x_of[u] - x0, depth[u] - z0
-            if not (near[u] & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
+            near = _near(x_of[u], depth[u], x_of[u - 1], depth[u - 1], tau_z[u], slope, limits)
+            if not (near & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
                 break
             w2 = ex * ex + y_factor * (ez * ez)
             dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
             u += 1
         stop = depth.size if u == short and not spread else u
-        while u < stop:
+        while 0 <= u < stop:
             ex, ez = x_of[u] - x0, depth[u] - z0
             off = abs(z0 + dz * ex / dx - depth[u])
             if not ((off < tau_z[u]) & (depth[u] > low) & (depth[u] <= high) & (w2 < length2)):
@@ -191,8 +192,7 @@ def _scanline(
             w2 = ex * ex + y_factor * (ez * ez)
             dx, dz, dxx, dxz, dzz = dx + ex, dz + ez, dxx + ex * ex, dxz + ex * ez, dzz + ez * ez
             u += 1
-        for i in range(begin, u):
-            owner[v, i] = started
+        run = _begun(runs, first_run, run, begin, started)
         n, right = n + u - begin, u - 1
     if n > 0:
         newest = _Open(n, left, right, nearest, started, x0, z0, x_of[right], depth[right], w2, dx, dz, dxx, dxz, dzz)
@@ -201,9 +201,18 @@ def _scanline(
         q = front - i if front >= i else front - i + room
         done = _finish(_load(older, older_int, q), limits.sparse, segments, segments_int, done, place)
     place[0] = 0
-    for u in range(depth.size):
-        owner[v, u] = place[owner[v, u]]
-    return done
+    for i in range(first_run, run):
+        runs[i, 1] = place[runs[i, 1]]
+    return done, run
+
+
+@leaf
+def _begun(runs, first, run, u, owner):
+    """The end of the runs after pixel u of ``owner``, which begins one unless the run before is the owner's."""
+    if run > first and runs[run - 1, 1] == owner:
+        return run
+    runs[run, 0], runs[run, 1] = u, owner
+    return run + 1
 
 
 @leaf
@@ -227,8 +236,7 @@ def _fits(o, x, z, u, slope, tau_z, length2, limits):
     if u - o.u_right > limits.occlusion_gap or not o.w2 < length2:
         return False
     if o.n <= limits.n_check:
-        tau_x = min(max(slope * z * z, limits.noise_floor), limits.line_thresh)
-        return abs(z - o.z_right) < tau_z and abs(x - o.x_right) < tau_x
+        return _near(x, z, o.x_right, o.z_right, tau_z, slope, limits)
     return o.dx != 0 and abs(o.z_left + o.dz * (x - o.x_left) / o.dx - z) < tau_z
 
 

@@ -21,6 +21,7 @@ from ufmstar_torch.merge import MergeKernels
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.posterior.update import PosteriorUpdate
 from ufmstar_torch.posterior.update import update as update_posterior
+from ufmstar_torch.regress import SAMPLE_REFERENCE, SampleKernels
 from ufmstar_torch.segment_input import SegmentInput
 from ufmstar_torch.state import UfMStarState
 from ufmstar_torch.step import REFERENCE, Kernels, SegmentKernel, Step, step
@@ -94,6 +95,15 @@ def select_merge(name: str, device_type: str) -> MergeKernels:
 
         return MergeKernels(merge_cpu.partition, merge_cpu.own_shares)
     return MERGE_REFERENCE
+
+
+def select_sample(name: str, device_type: str) -> SampleKernels:
+    """The parts of an image average; arguments and errors as :func:`select_step`."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import sample_cpu
+
+        return SampleKernels(sample_cpu.sample_pixels, sample_cpu.sample_mean)
+    return SAMPLE_REFERENCE
 
 
 def select_kernels(name: str, device_type: str) -> Kernels:

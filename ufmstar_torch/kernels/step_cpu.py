@@ -28,7 +28,7 @@ from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.regress_cpu import EPSILON, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
-from ufmstar_torch.kernels.stream_cpu import describe, join, match
+from ufmstar_torch.kernels.stream_cpu import describe, join, match, tally
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.output import StepOutput
@@ -222,7 +222,7 @@ def _count(
     totals: NDArray[np.int64], frame: FrameInput, pairs: list[_Pairs], components: list[int], measured: Tensor
 ) -> None:
     """Write the statistics [n, B] that the step counts itself, in the order of ``_COUNTS``."""
-    valid, shares = frame.valid.numpy(), measured.numpy()
+    valid, shares = array(frame.valid), array(measured)
     for b, (pair, occupied) in enumerate(zip(pairs, components, strict=True)):
         new = occupied - pair.occupied
         totals[:8, b] = (
@@ -232,6 +232,5 @@ def _count(
             pair.c.size,
             new,
             pair.found - pair.matched - new,  # without a slot, or too near
-            np.count_nonzero(valid[b]),
-            np.count_nonzero(shares[b] < unmeasured.HALF),
+            *tally(valid[b].reshape(-1), shares[b].reshape(-1), unmeasured.HALF),
         )

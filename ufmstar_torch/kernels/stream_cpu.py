@@ -149,3 +149,14 @@ def _extend(before, after):
     for k in range(after.shape[0]):
         for i in range(after.shape[1]):
             after[k, i] = before[k, i] if k < before.shape[0] else 0
+
+
+@kernel
+def tally(valid, measured, half):
+    """How many pixels are valid, and how many shares of what was measured are below one half."""
+    pixels = below = 0
+    for i in range(valid.size):
+        pixels += valid[i]
+    for i in range(measured.size):
+        below += measured[i] < half
+    return pixels, below
