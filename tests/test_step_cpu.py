@@ -100,7 +100,7 @@ def test_agrees_with_the_reference(name, dtype, tolerance):
 
 @pytest.mark.parametrize("name", ["default", "full", "anchored"])
 def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(name, monkeypatch):
-    monkeypatch.setattr(threads_cpu, "_SHARE", 16 * 64)  # pixels; up to three parts of a stream
+    monkeypatch.setattr(threads_cpu, "_SHARE", 4 * 64)  # pixels; up to three parts of a stream
     config = CONFIGS[name].replace(on_bad_frame="skip")
     together = [UfMStar(config) for _ in range(3)]
     alone = [UfMStar(config) for _ in range(3)]
