@@ -117,14 +117,14 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
                 _blank(v, u, out, out_f)
         if not some:
             continue
-        count = cull(everyone, view[0].size, _union(boxes, seen), view[4], work, in_block)
+        count = cull(everyone, view[0].size, view[4][4], _union(boxes, seen), view[4], work, in_block)
         for i in range(FIELDS):
             for j in range(count):
                 near[i, j] = everyone[i, in_block[j]]
         pad(near, count)
         for tile in range(_TILES):
             if seen[tile]:
-                chosen = cull(near, count, _box(boxes, tile), view[4], work, in_tile)
+                chosen = cull(near, count, count, _box(boxes, tile), view[4], work, in_tile)
                 for j in range(chosen):
                     in_tile[j] = in_block[in_tile[j]]
                 _average(PIXELS, tiles, tile, in_tile, chosen, view, features, sums)
@@ -170,7 +170,7 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
                 z[i] = depth[v, u]
             some = _place((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0)
             if some:
-                count = cull(view[2], view[0].size, _box(tiles[3], 0), view[4], lists[1], kept)
+                count = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], kept)
                 filled = (high - low + LANES - 1) // LANES * LANES
                 _average(filled, tiles, 0, kept, count, view, features, sums)
             for i in range(high - low):

@@ -39,8 +39,8 @@ from ufmstar_torch.step import StepObserver, after_regress, frame_statistics
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))
-_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured")
-_COUNTS += ("anchors", "anchors_used")
+_COUNTS: tuple[str, ...] = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
+_COUNTS += ("unmeasured", "anchors", "anchors_used")
 
 
 class _Pairs(NamedTuple):
@@ -99,14 +99,14 @@ def step(
     )  # fmt: skip
     stated = config.prior_mean if config.unmeasured == "prior" else -1.0
     settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps), stated
-    given = present, first, slots, updated, (*segments[:3], segments[5])
+    fused = present, first, slots, updated, (*segments[:3], segments[5])
     with kernel("fuse"):
         distances = [_distance(b, pair, segments, regressed, config) for b, pair in enumerate(pairs)]
         joining = zip(streams, pairs, distances, strict=True)
         joined = each(
             join,
             [
-                (b, *given, pair[:3], d, pair.new, pair.occupied, pair.near, settings, regressed)
+                (b, *fused, pair[:3], d, pair.new, pair.occupied, pair.near, settings, regressed)
                 for b, pair, d in joining
             ],
         )
