@@ -149,7 +149,8 @@ def _visible(mean, covariance, index, whitening, log_peak, K, height, width, lim
         for i in range(6):
             constants[n, i] = fields[n, 3 + i]
         constants[n, 6], constants[n, 7] = fields[n, 9], m[index[k]]
-        constants[n, 8] = features[index[k], features.shape[1] - 1] if features.shape[1] > 0 else 0.0
+        for g in range(min(3, features.shape[1])):
+            constants[n, 8 + g] = features[index[k], features.shape[1] - 1 - g]
         index[n] = index[k]
         n += 1
     return n
