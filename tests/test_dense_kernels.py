@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from ufmstar_torch.kernels import dense_cpu
 from ufmstar_torch.kernels.dense_cpu import Search, Views, best_pixels, measure
 from ufmstar_torch.kernels.sight_cpu import patches, sight
 
@@ -152,3 +153,17 @@ def test_a_landmark_is_sighted_where_it_projects_and_not_behind_something(scene)
     hidden[20:60, 30:50] = plane(9, np.eye(4))[20:60, 30:50]
     assert sight(hidden, *kept, MOVED[0], K)[3].tolist() == [-1, 1]
     assert sight(others[0], *kept, pose(turned=(0, np.pi, 0)), K)[3].tolist() == [0, 0], "behind the camera"
+
+
+def test_a_search_along_the_last_row_reads_nothing_beyond_the_image():
+    """In Python, which checks bounds: compiled code would read what lies behind the image."""
+    height, width = 12, 24
+    key = np.random.default_rng(0).integers(0, 256, height * width, dtype=np.uint8)
+    rows, scores, place = np.empty((2, 9), np.uint64), np.empty(9, np.float32), np.empty(4)
+    patch = key.reshape(height, width)[-8:, 7:15].astype(np.float32).ravel()
+    patch -= patch.mean()
+    patch /= np.linalg.norm(patch)
+    line = (6.5, height - 4.5, 1.0, np.array([8.0, 0.0, 0.0]), 0.0, 1.0)
+    assert dense_cpu._search(patch, key, width, height, *line, rows, scores, place)
+    assert place[:2].tolist() == [10.5, height - 4.5]
+    assert place[2] == pytest.approx(1, abs=1e-5)

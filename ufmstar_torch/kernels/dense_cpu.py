@@ -321,7 +321,7 @@ def _search(patch, key, width, height, x, y, z, b, low, high, rows, scores, plac
         left, top = int(np.floor(u_low + s * du + FIRST + 0.5)), int(np.floor(v_low + s * dv + FIRST + 0.5))
         scores[s] = -2
         if left >= 0 and top >= 0 and left + SIDE <= width and top + SIDE <= height:
-            _copied(key, top * width + left, width, rows[0])
+            _copied(key, top * width + left, width, rows[0, :SIDE])
             scores[s] = zncc(patch, rows[0].view(np.uint8))
             if scores[s] > best:
                 best, at = scores[s], s
