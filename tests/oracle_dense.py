@@ -119,7 +119,7 @@ def errors_and_depths(change, value, variance, across_change, across, across_var
 
 def alone(pixel, rho, variance, cell):
     """[N] squared errors to expect by the anchors in the 5 x 5 cells around each: the probability to be wrong, .026 in
-    the mean, which goes with the fourth power of the share of others, times their mean squared difference. No two
+    the mean, which goes with the eighth power of the share of others, times their mean squared difference. No two
     anchors have a cell in common."""
     cells, power, square = np.floor(pixel / cell), np.zeros(len(rho)), np.zeros(len(rho))
     for n in range(len(rho)):
@@ -130,5 +130,5 @@ def alone(pixel, rho, variance, cell):
             if (rho[m] - rho[n]) ** 2 >= max(9 * (variance[m] + variance[n]), (0.05 * rho[n]) ** 2)
         ]
         if others:
-            power[n], square[n] = (len(others) / (len(near) + 1)) ** 4, np.mean(others)
+            power[n], square[n] = (len(others) / (len(near) + 1)) ** 8, np.mean(others)
     return (0.026 * power / max(power.mean(), 0.026)) ** 2 * square

@@ -175,9 +175,9 @@ def update(state, depth, claimed, pixel, g, variance):
         weights = (part / total) ** 2 / count
         unit = ratio(state, name) / np.maximum(part, 1e-12)
         new[name] = (weights * (part + square - total) * unit).sum(), weights.sum()
-    quarter = 0.45 * np.nan_to_num(claimed)
+    counted = 0.45 * np.nan_to_num(claimed)
     new |= discs(
-        state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([quarter[r, c] for c, r in at]) / d**2
+        state, logs, Q, mean0, H, y, weight, noise, node, u, v, np.array([counted[r, c] for c, r in at]) / d**2
     )
     q = GLOBALS + HATS * HATS
     after = {"frames": state["frames"] + 1, "m0": m0, "b": mean[:4], "C": C[:4, :4], "sums": {}}
@@ -196,7 +196,7 @@ def update(state, depth, claimed, pixel, g, variance):
     offset, share = HX[:, 4:] @ mean[4:], np.minimum(away / 0.6, 1)
     around = y_variance(logs.shape, node, y, noise, np.ones(N, bool), mean[0])
     spread += [tail(*each) for each in zip(share, offset, around, strict=True)]
-    return after, *read(depth, quarter, logs, mean[:q], offset, spread, share)
+    return after, *read(depth, counted, logs, mean[:q], offset, spread, share)
 
 
 def local(shape, node, z2, noise):

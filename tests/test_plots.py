@@ -22,7 +22,7 @@ from ufmstar_torch.eval.report.colours import (
     robust_range,
 )
 from ufmstar_torch.eval.report.panels import FramePanel, contact_sheet, fit_scales, map_columns
-from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
+from ufmstar_torch.eval.report.video import preview_frame, write_video
 
 
 def panel(name: str = "a", *, error: bool = True, size: tuple[int, int] = (24, 32), seed: int = 0) -> FramePanel:
@@ -34,10 +34,10 @@ def panel(name: str = "a", *, error: bool = True, size: tuple[int, int] = (24, 3
     return FramePanel(name, image, depth, sigma, 2 * sigma if error else None, valid)
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray[Any, Any]]) -> None:
-    with VideoWriter(path, fps=5) as video:
+def write(path: Path, frames: Iterable[np.ndarray[Any, Any]], fps: float = 5) -> None:
+    with write_video(path, fps) as add:
         for frame in frames:
-            video.add(frame)
+            add(frame)
 
 
 def load(path: Path) -> np.ndarray[Any, Any]:
@@ -176,7 +176,7 @@ class TestPreview:
 
         # Flat colours, which survive the codec: frame i is grey 40 i.
         frames = [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(6)]
-        write_video(tmp_path / "v.mp4", frames)
+        write(tmp_path / "v.mp4", frames)
         video = cv2.VideoCapture(str(tmp_path / "v.mp4"))
         assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(5)
         for i in range(6):
@@ -196,25 +196,25 @@ class TestPreview:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            write_video(tmp_path / "v.mp4", interrupted())
+            write(tmp_path / "v.mp4", interrupted())
         video = cv2.VideoCapture(str(tmp_path / "v.mp4"))
         assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3
         video.release()
 
     def test_no_frame_no_file(self, tmp_path: Path) -> None:
-        write_video(tmp_path / "v.mp4", [])
+        write(tmp_path / "v.mp4", [])
         assert list(tmp_path.iterdir()) == []
 
     def test_errors(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(ValueError, match="path must end in"):
-            VideoWriter(tmp_path / "v.avi", 5)
+            write(tmp_path / "v.avi", [])
         with pytest.raises(ValueError, match="fps"):
-            VideoWriter(tmp_path / "v.mp4", 0)
+            write(tmp_path / "v.mp4", [], 0)
         with pytest.raises(ValueError, match="even size"):
-            write_video(tmp_path / "v.mp4", [np.zeros((3, 4, 3), np.uint8)])
+            write(tmp_path / "v.mp4", [np.zeros((3, 4, 3), np.uint8)])
         frames = [np.zeros((32, 32, 3), np.uint8), np.zeros((32, 34, 3), np.uint8)]
         with pytest.raises(ValueError, match="size of the first"):
-            write_video(tmp_path / "v.mp4", frames)
+            write(tmp_path / "v.mp4", frames)
         monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
         with pytest.raises(ImportError, match=r"ufmstar-torch\[eval\]"):
-            VideoWriter(tmp_path / "v.mp4", 5)
+            write(tmp_path / "v.mp4", [])

@@ -187,8 +187,8 @@ def test_contradictory_anchors_and_depth_that_they_pull_near_are_less_certain():
         given = checked(depth, pixel, 2.0 * factor * np.ones(len(pixel)), np.full(len(pixel), 1e-3))
         out = posterior_cpu.update(torch.zeros(1, SIZE), *given, torch.zeros(1, 36, 48))[1]
         relative[name] = (out.variance / out.depth.square())[0, 24:34, 34:46].mean()
-    assert relative["mixed"] > 4 * relative["alike"]
-    assert relative["nearer"] > 2 * relative["farther"]
+    assert relative["mixed"] > 2 * relative["alike"]
+    assert relative["nearer"] > 1.3 * relative["farther"]
 
 
 def test_far_from_evidence_the_variance_is_larger_and_contains_what_ufm_star_claims():

@@ -25,7 +25,7 @@ from ufmstar_torch.eval.report.figures_calibration import (
     draw_sequence_calibration,
 )
 from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
-from ufmstar_torch.eval.report.figures_error import ONE_METRE, density, draw_entropy, draw_error, entropy_range
+from ufmstar_torch.eval.report.figures_error import density, draw_entropy, draw_error, entropy_range
 from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
 from ufmstar_torch.eval.report.means import difference, mean_of
 from ufmstar_torch.eval.report.names import NLL
@@ -163,9 +163,6 @@ class TestEntropy:
         merged = Merged({}, {"entropy_counts": counts.tolist(), "entropy_edges": edges.tolist()})
         assert entropy_range([merged]) == (-3.5, 0.25)
 
-    def test_one_metre(self):
-        assert pytest.approx(0.5 * math.log(2 * math.pi * math.e * 1.0**2)) == ONE_METRE
-
 
 def noisy(value: float, seed: int = 0) -> Row:
     return Row(UFM_STAR.method, Setting(rotation_noise=value, seed=seed) if value else Setting())
@@ -234,10 +231,6 @@ class TestSweeps:
         assert point.get_markerfacecolor() == style_of(either.method).colour  # beyond its interval: filled
         assert [label.get_text() for label in axes.get_yticklabels()] == ["pruning rule either"]
         assert draw_changes(in_memory({(UFM_STAR, ("d", "a")): {"nll": 1.0}}), "ensemble") is None
-
-    def test_two_values_are_no_sweep(self):
-        rows = [UFM_STAR, Row(UFM_STAR.method, Setting({"eta": 0.7}))]
-        assert sweeps(in_memory({(row, ("d", "s")): {"nll": 1.0} for row in rows})) == []
 
 
 class TestCost:

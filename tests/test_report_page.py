@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from evaluations import HOSTILE, KITCHEN, LATER, TITLE, rows_of, write_evaluation
+from evaluations import HOSTILE, KITCHEN, LATER, TITLE, in_memory, rows_of, write_evaluation
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.metrics import mean_and_ci
@@ -20,7 +20,6 @@ from ufmstar_torch.eval.report import figures as figures_module
 from ufmstar_torch.eval.report.data import Failed, Results
 from ufmstar_torch.eval.report.findings import best_rows, caveats, compare, comparisons, headlines
 from ufmstar_torch.eval.report.page import command, write_page
-from ufmstar_torch.eval.results.record import Record
 
 VOID = {"br", "hr", "img", "meta", "input"}
 
@@ -76,14 +75,13 @@ def results_of(
     values: Mapping[str, Sequence[Mapping[str, float]]], *, datasets: Sequence[str] | None = None, **changes: Any
 ) -> Results:
     """Figures of methods, sequence by sequence."""
-    records = tuple(
-        Record("own", datasets[n] if datasets else "d", f"s{n}", "FastDepth", method, figures=dict(figures))
+    of = {
+        (*rows_of(method), (datasets[n] if datasets else "d", f"s{n}")): figures
         for n in range(max(map(len, values.values())))
-        for method, result in values.items()
-        for figures in result[n : n + 1]
-    )
-    rows = [{"method": method, "setting": {}} for method in values]
-    return Results(Path("nowhere"), {"suite": "own", "title": "T", "rows": rows}, records, **changes)
+        for method, listed in values.items()
+        for figures in listed[n : n + 1]
+    }
+    return in_memory(of, **changes)
 
 
 def figures(nll: float, ece: float = 0.2, spearman: float = 0.5, delta1: float = 0.8) -> dict[str, float]:
@@ -294,22 +292,19 @@ class TestPage:
         assert undrawn[1] == ["entropy ensemble", "no <b>such</b> glyph"]
         assert len(page.all("img")) >= 4
 
-    def test_the_command_names_networks(self) -> None:
-        network = {"model": "trained", "files": [{"name": "m0.safetensors"}, {"name": "m1.safetensors"}]}
-        about = {"suite": "depth-only", "datasets": ["tum"], "networks": {"ensemble": network}}
-        expected = "--network ensemble=trained:DIR/m0.safetensors,DIR/m1.safetensors --out OUT"
-        assert command(about) == f"ufmstar eval --suite depth-only --root tum=DIR {expected}"
-
-    def test_the_command_has_what_was_chosen(self) -> None:
-        network = {"model": "trained", "files": [{"name": "m.safetensors", "member": 0}]}
-        about = {"suite": "depth-only", "datasets": ["tum"], "networks": {"aleatoric": network}}
-        begin = "ufmstar eval --suite depth-only --root tum=DIR --network aleatoric=trained:DIR/m.safetensors#0"
+    def test_the_command_has_networks_and_what_was_chosen(self) -> None:
+        files = [{"name": "m0.safetensors"}, {"name": "m.safetensors", "member": 0}]
+        networks = {"aleatoric": {"model": "trained", "files": files}}
+        about = {"suite": "depth-only", "datasets": ["tum"], "networks": networks}
+        begin = "ufmstar eval --suite depth-only --root tum=DIR "
+        begin += "--network aleatoric=trained:DIR/m0.safetensors,DIR/m.safetensors#0"
         for settings, words in (
-            ({"frames": [None, None, None], "confident": 0.5}, "--confident 0.5"),
+            ({}, ""),
+            ({"frames": [None, None, None], "confident": 0.5}, " --confident 0.5"),
             ({"frames": [0, 8, None], "trajectory": "slam.txt", "depth_scale": 0.001},
-             "--frames 0:8: --trajectory slam.txt --depth-scale 0.001"),
+             " --frames 0:8: --trajectory slam.txt --depth-scale 0.001"),
         ):  # fmt: skip
-            assert command({**about, "settings": settings}) == f"{begin} {words} --out OUT"
+            assert command({**about, "settings": settings}) == f"{begin}{words} --out OUT"
 
     def test_pictures_that_do_not_fit_are_named(self, tmp_path: Path) -> None:
         results = replace(results_of({"Ensemble": ALONE}), out=tmp_path)

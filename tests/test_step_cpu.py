@@ -100,7 +100,7 @@ def test_agrees_with_the_reference(name, dtype, tolerance):
 
 @pytest.mark.parametrize("name", ["default", "full", "anchored"])
 def test_a_stream_gives_the_same_bits_alone_and_on_any_number_of_threads(name, monkeypatch):
-    monkeypatch.setattr(threads_cpu, "_SHARE", 16 * 64)  # pixels; up to three parts of a stream
+    monkeypatch.setattr(threads_cpu, "_SHARE", 4 * 64)  # pixels; up to three parts of a stream
     config = CONFIGS[name].replace(on_bad_frame="skip")
     together = [UfMStar(config) for _ in range(3)]
     alone = [UfMStar(config) for _ in range(3)]
@@ -152,7 +152,7 @@ def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
     near, occupied = reach_cpu.reached(motion, *slots, camera, SIZE, 1.0, 1e-6, 0)
     u, v = (camera[i, i] * mean[:, i] / mean[:, 2] + camera[i, 2] for i in range(2))
     inside = (u >= -0.5) & (u < SIZE[1] - 0.5) & (v >= -0.5) & (v < SIZE[0] - 0.5) & (mean[:, 2] > 0.05)
-    args = (mean, covariance, weight, weight, np.zeros((400, 0)), camera, *SIZE, 1.0, 0.0, 1e-6, np.float64(0))
+    args = (mean, covariance, weight, weight, np.zeros((400, 0)), camera, np.full(SIZE, 1e4), 1.0, 0.0, 1e-6)
     summed = in_view(everyone, 400, *args)[0]
     assert occupied == 400
     assert set(everyone[inside]) | set(summed) <= set(near)

@@ -69,18 +69,14 @@ def measure_anchors(
     history: int,
     in_view: int,
     step_size: int,
-    tour: TrackedTour = TrackedTour(),
 ) -> dict[str, Any]:
     """Time the tracker and the anchored step with ``points`` corners, on one thread of torch, numba and OpenCV.
 
     Args:
-        source: of the step's depth maps.
-        config: of the step.
+        source, config, step_size: of the step and its depth maps [px].
         points: corners to follow on average, and anchors of a step.
         frames: timed.
         history, in_view: as :func:`~ufmstar_torch.eval.bench.step.build_up` takes them.
-        step_size: of the step's depth maps [px].
-        tour: images of the tracker.
 
     Returns:
         "tracker" (see :func:`measure_tracker`), "step" (see :func:`measure_anchored_step`) and the settings.
@@ -89,7 +85,7 @@ def measure_anchors(
         ValueError: too few frames.
         ModuleNotFoundError: OpenCV is not installed.
     """
-    rounds = _STEP_WARM_UP + frames
+    tour, rounds = TrackedTour(), _STEP_WARM_UP + frames
     with pinned_threads(1, opencv=True):
         tracker = measure_tracker(tour.frames(_TRACKER_WARM_UP + frames), points)
         built, depths, _ = build_up(

@@ -25,13 +25,12 @@ _LAUNCHES = ("LaunchKernel", "MemcpyAsync", "MemsetAsync", "GraphLaunch")  # in 
 def measure_device(
     device: str, sizes: tuple[int, ...], frames: int, seed: int, progress: Callable[[str], object]
 ) -> dict[str, Any]:
-    """Time steps of :data:`STREAMS` streams, and networks of one image, on a GPU.
+    """Time steps of :data:`STREAMS` streams, and networks of one image, on a GPU ("cuda" or "cuda:N").
 
     Args:
-        device: "cuda" or "cuda:N".
+        device, seed: of the steps, of the rooms.
         sizes: of the square depth maps [px].
         frames: that are timed.
-        seed: of the rooms.
         progress: is called with a description of what is measured next.
 
     Returns:

@@ -158,12 +158,7 @@ class PowerMeter:
 
 
 def consumed(rail: Rail, start: float, end: float, seconds: float) -> float:
-    """Energy between two readings of a counter [J], also where it has wrapped in between.
-
-    Args:
-        rail: whose counter it is.
-        start, end: readings [J].
-        seconds: between them [s].
+    """Energy between two readings of a rail's counter [J], ``seconds`` apart [s], also where it has wrapped in between.
 
     Raises:
         SensorError: the counter did not move, went back, or may have wrapped more than once.
@@ -277,15 +272,8 @@ def _one(
 def repeated(
     calls: Sequence[Callable[[], object]], wait: Callable[[], None], clock: Callable[[], float] = time.perf_counter
 ) -> Work:
-    """Call after call, each waited for as in a robot's loop, over and over until the time is up.
-
-    Args:
-        calls: at least one, one per frame.
-        wait: until the device has finished.
-        clock: [s].
-
-    Raises:
-        ValueError: no call.
+    """Call after call (one per frame), each followed by ``wait`` until the device has finished, as in a robot's loop,
+    over and over until the time is up; no call raises ValueError.
     """
     if not calls:
         raise ValueError("calls must hold at least one")

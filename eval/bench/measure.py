@@ -142,12 +142,8 @@ def measure(
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json.
 
-    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device.
-
-    Args:
-        job: an evaluation whose sequences are done.
-        plan: how much is measured; None = the defaults, with fewer frames where a sequence has no more. Windows of
-            energy are divided among the sequences, at least one for each.
+    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Of sequences with fewer frames
+    than the plan has, all are taken; windows of energy are divided among the sequences, at least one for each.
 
     Raises:
         ValueError: no sequence can be opened, none has frames enough, or no row can be measured.

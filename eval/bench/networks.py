@@ -31,18 +31,16 @@ class Inseparable(Exception):
 
 
 class TimedNetwork:
-    """The loaded network(s) of a base, on one device and in eval mode.
+    """The loaded network(s) of a base (a key of ``BASES``), on one device and in eval mode.
 
     Args:
-        base: a key of ``BASES``.
+        base: see above.
         members: in the order of their turns; for "mc_dropout" one network that samples by itself.
         label: the architecture as shown, "FastDepth". Bases of one label share a part of the table.
         samples: of "mc_dropout", passes per image of the multi-inference baseline.
 
     Attributes:
-        members: opened.
         passes: inferences that all members, or all samples, take.
-        preprocess: of the members.
         depth: the network without anything that uncertainty adds: of the first member, a copy.
         why_whole: None, or why ``depth`` is the whole network instead.
 
@@ -71,11 +69,11 @@ class TimedNetwork:
             self.why_whole = str(error)
 
     def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
-        """One of the three forms of inference.
+        """Depth without uncertainty ("depth"), with it by the member whose turn it is ("once"), or by "every" member
+        (or sample) one after the other, combined.
 
         Args:
-            part: "depth" without uncertainty; "once" with it, by the member whose turn it is; "every" member (or
-                sample) one after the other, combined.
+            part: see above.
             x: [1, 3, H, W] the networks' input.
             intrinsics: [1, 3, 3] of the input [px], for networks that take them.
             turn: number of the image, for "once".

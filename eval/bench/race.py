@@ -100,8 +100,7 @@ class Race:
         times: by "base/part" or "row/multiview", of the frames after the warm-up.
         given: by base, the networks' input of every frame.
         predictions: by base and part ("once" or "every"), the multiview steps' input of every frame.
-        steps: by row's label, the state after the last frame.
-        staged: likewise, the stages of UfM*.
+        steps, staged: by row's label, the state after the last frame, and the stages of UfM*.
     """
 
     warm_up: int

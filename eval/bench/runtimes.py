@@ -66,12 +66,18 @@ def fastest(network: nn.Module, side: int, *, runtime: str = "auto") -> tuple[Ca
             if number >= _WARM_UP:
                 least[name] = min(least[name], 1000 * (time.perf_counter() - started))
     chosen = min(least, key=lambda name: least[name])
+    apart = None
+    if len(calls) > 1:
+        one, other = (call() for call in calls.values())
+        apart = float((one - other).abs().max() / other.abs().max())
+        if not apart <= _AGREEMENT:
+            raise ValueError(f"the runtimes {', '.join(calls)} differ by {apart:.2g} of the largest output")
     about = {
         "runtime": "onnxruntime" if chosen == ONNX else "torch",
         "version": version("onnxruntime") if chosen == ONNX else torch.__version__,
         "threads": torch.get_num_threads(),
         "runtimes": least,
-        "apart": _apart(calls),
+        "apart": apart,
     }
     return calls[chosen], about
 
@@ -96,14 +102,3 @@ def _in_onnx_runtime(network: nn.Module, image: Tensor) -> Callable[..., Tensor]
         session = open_session(path, torch.get_num_threads(), ("CPUExecutionProvider",))
     feeds = {session.get_inputs()[0].name: image.numpy()}
     return lambda *_: torch.from_numpy(session.run(None, feeds)[0])
-
-
-def _apart(calls: dict[str, Callable[..., Tensor]]) -> float | None:
-    """The largest relative difference of the runtimes' outputs; None of one."""
-    if len(calls) < 2:
-        return None
-    one, other = (call() for call in calls.values())
-    apart = float((one - other).abs().max() / other.abs().max())
-    if not apart <= _AGREEMENT:
-        raise ValueError(f"the runtimes {', '.join(calls)} differ by {apart:.2g} of the largest output")
-    return apart

@@ -182,15 +182,11 @@ def components_in_view(ufm: UfMStar, frame: PosedDepth) -> int:
 def reference_networks(
     size: int, fastdepth: FastDepth, runtime: str = "auto"
 ) -> tuple[dict[str, Callable[..., Any]], dict[str, Any]]:
-    """Forward passes to compare with, each in the runtime that is fastest here, and what they are.
+    """Forward passes on images of ``size`` [px] to compare with, each in the runtime that is fastest here (see
+    ``fastest``), and what they are.
 
     FastDepth with its batch norms folded, at the nearest size it takes (multiples of 32); torchvision's
     ResNet50 up to and including layer4, with random weights, where torchvision is installed.
-
-    Args:
-        size: of the step's depth maps [px].
-        fastdepth: in torch.
-        runtime: see ``fastest``.
     """
     networks: dict[str, tuple[torch.nn.Module, int]] = {
         "fastdepth": (fastdepth.folded(), max(MULTIPLE, MULTIPLE * round(size / MULTIPLE)))

@@ -70,7 +70,7 @@ def most_threads() -> int:
 
 
 class TimedCalls:
-    """Calls on the same frames, one after the other, each timed.
+    """Calls on the same frames, one after the other, each timed; ``times`` has them by name.
 
     On odd frames the order is reversed: no call always follows the same neighbour, and a busy machine slows all calls
     of a frame alike.
@@ -78,9 +78,6 @@ class TimedCalls:
     Args:
         before: predecessors by name: one of them in turn runs before every call, as a network runs before a
             step in use, on the same arguments. Each is timed the first time that it runs on a frame.
-
-    Attributes:
-        times: by the names of the calls and of ``before``.
     """
 
     def __init__(self, before: Mapping[str, Callable[..., Any]] | None = None) -> None:
@@ -125,13 +122,10 @@ class TimedCalls:
 
 
 class StagedStep:
-    """UfM* with the times of its steps' stages: the module's observer (``ufmstar_torch.step.StepObserver``).
+    """UfM* with the times of its steps' stages: the observer (``ufmstar_torch.step.StepObserver``) of a module.
 
-    The stages are those that the step names; what follows the last one, the output's assembly, belongs to none.
-
-    Args:
-        module: whose ``observer`` it becomes.
-        device: where the module computes; it is waited for at both ends of every stage.
+    The stages are those that the step names; what follows the last one, the output's assembly, belongs to none. The
+    module's device is waited for at both ends of every stage.
     """
 
     def __init__(self, module: UfMStar, device: torch.device = _CPU) -> None:

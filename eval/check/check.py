@@ -36,13 +36,10 @@ class SequenceCheck:
     """Outcome of :func:`check_sequence`.
 
     Attributes:
-        pairs: pairs of frames compared, ``gap`` frames apart.
-        gap: see ``pairs``.
+        pairs, gap: pairs of frames compared, and how many frames apart.
         error: median relative error of warped depth, as the sequence is given; inf without overlap.
-        poses: the reading of the poses that fits best, by the name that ``open_sequence`` takes, and ``scale``, by
-            which depth must be multiplied then; ``best_error`` is the error with both.
-        scale: see ``poses``.
-        best_error: see ``poses``.
+        poses, scale, best_error: the reading of the poses that fits best, by the name that ``open_sequence`` takes, by
+            what depth must be multiplied then, and the error with both.
         registration: how depth lies on the image, or None where it was not checked.
         unreadable: files that could not be decoded.
         problems: what is wrong, in words; empty if nothing.

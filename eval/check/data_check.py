@@ -31,20 +31,16 @@ class DataReport:
     """Outcome of a check; lengths in metres, sizes (H, W).
 
     Attributes:
-        name: of the sequence.
-        path: as given.
+        name, path: of the sequence; the path as given.
         layout: "" where it could not be opened.
-        frames: usable ones, ``on_disk`` counts all.
-        on_disk: see ``frames``.
+        frames, on_disk: usable ones, and all.
         skipped: number of frames left out, by reason.
         without_depth: number of usable frames without a depth map.
-        posed: whether there are poses; ``walked`` is their path's length [m].
-        walked: see ``posed``.
+        posed, walked: whether there are poses, and their path's length [m].
         image_size, depth_size: or None.
         intrinsics: fx, fy, cx, cy of the images [px].
         depth_intrinsics: those of the depth maps, or None if they are the images'.
-        depth_range: 1 % and 99 % quantiles of the sampled depth [m], or None; ``filled`` is the share of valid pixels.
-        filled: see ``depth_range``.
+        depth_range, filled: 1 % and 99 % quantiles of the sampled depth [m], or None; the share of valid pixels.
         checked: what ``check_sequence`` measured, plain values; {} where it could not.
         problems: what is wrong, in words.
         remedies: what to do about it; options are named as on the command line.
@@ -82,9 +78,7 @@ class DataReport:
 
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
-    """Opens a sequence and checks all that needs no network.
-
-    A sequence that cannot be opened is a report with that problem.
+    """Opens a sequence and checks all that needs no network; one that cannot be opened is a report with that problem.
 
     Args:
         path: as ``open_sequence`` takes it.

@@ -13,7 +13,7 @@ def page(report: DataReport) -> str:
         return "\n".join([f"{report.name}: {report.path}", *_problems(report), _end(report)])
     lines = [
         f"{report.name}: layout {report.layout}, {report.frames} of {report.on_disk} frames usable",
-        *(f"  skipped       {count} x {reason}" for reason, count in report.skipped.items()),
+        *(f"  skipped       {n} x {reason}" for reason, n in report.skipped.items()),
         f"  images        {_size(report.image_size)}, {_camera(report.intrinsics)}",
         f"  depth         {_depth(report)}",
         f"  poses         {f'path of {report.walked:.1f} m' if report.posed else 'none: single images'}",

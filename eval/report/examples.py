@@ -54,9 +54,7 @@ class Example:
     """A frame.
 
     Attributes:
-        dataset: as "scannet"; sequence: its name within it; frame: its name within that.
-        sequence: see ``dataset``.
-        frame: see ``dataset``.
+        dataset, sequence, frame: "scannet", the sequence's name within it, and the frame's name within that.
         image: [H, W, 3] uint8.
         truth: [h, w] ground truth [m], 0 = none.
         K: [3, 3] intrinsics of the maps [px].
@@ -104,14 +102,11 @@ def deviation(variance: Map, valid: NDArray[np.bool_]) -> Map:
 
 
 def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list[Example]:
-    """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames.
+    """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames, with the rows'
+    names for people by file name.
 
     Rows whose maps show the frame with another camera (a network of another size) make an example of their own. Rows
     without a variance have nothing to show and are left out, and so are frames without any row.
-
-    Args:
-        folder: of the sequence.
-        labels: rows' names for people, by file name.
 
     Raises:
         ValueError: a file cannot be read or its maps do not fit; the message names it.

@@ -13,9 +13,9 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.colours import FAINT
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import value_of
+from ufmstar_torch.eval.report.names import count
 from ufmstar_torch.eval.report.style import (
     Style,
-    counted,
     finish,
     hidden_panels,
     label_ends,
@@ -42,7 +42,7 @@ def draw_calibration(results: Results, dataset: str) -> Any | None:
     }
     if not panels:
         return None
-    title = f"Calibration on {dataset}, all pixels of {counted(len(results.sequences(dataset)))}"
+    title = f"Calibration on {dataset}, all pixels of {count(len(results.sequences(dataset)), 'sequence')}"
     return _draw_columns(title, list(panels.values()), PER_LINE, (0.5, 3.4, 0.4, 6.0), ends=True)
 
 
@@ -167,12 +167,8 @@ def _errors(records: Mapping[Row, Record], key: str, letter: str) -> str:
 
 
 def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -> None:
-    """Draw delta calibration, quantile calibration and sparsification side by side and write the picture (PNG).
-
-    Args:
-        path: the file; its folder must exist.
-        curves: ``SequenceMetrics.curves()`` by the name that the legend shows.
-        title: over the picture.
+    """Draw delta calibration, quantile calibration and sparsification (``SequenceMetrics.curves()`` by the name that
+    the legend shows) side by side under a title, and write the picture (PNG).
 
     Raises:
         ValueError: there are no curves, or more than have a look of their own.

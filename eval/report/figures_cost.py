@@ -20,6 +20,7 @@ from ufmstar_torch.eval.report.style import (
     new_figure,
     short_name,
     spread_apart,
+    stretch,
     style_of,
 )
 
@@ -113,7 +114,12 @@ def draw_tradeoff(results: Results) -> Any | None:
                 x, mean.value, yerr=np.nan_to_num(mean.half), color=style_of(row.method).colour, markersize=6,
                 marker=_BASE_MARKERS[row.method.base], linewidth=1, elinewidth=0.5, capsize=0,
             )  # fmt: skip
-        _cost_axis(axes, list(panel.values()))
+        # Methods alone keep nothing: there is room for 0 at the left.
+        stretch(axes, list(panel.values()), 8, linthresh=0.5, linscale=0.8)
+        if axes.get_xscale() == "linear":
+            axes.set_xlim(left=0)
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.set_ylim(bottom=0)
         finish(axes, x=word, y="ECE_δ ↓ (bar: 95 % interval)")
         if len(points) <= MOST_NAMES:
             _name_points(axes, [(x, points[row].value, row) for row, x in panel.items()])
@@ -133,20 +139,6 @@ def _legend(rows: Sequence[Row]) -> list[Any]:
         *(Line2D([], [], marker="o", color=colour, label=name, **look) for name, colour in methods.items()),
         *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **look) for base in bases),
     ]
-
-
-def _cost_axis(axes: Any, values: Sequence[float]) -> None:
-    """Logarithmic, with room for 0 at the left (methods alone keep nothing)."""
-    positive = [value for value in values if value > 0]
-    if positive and max(positive) > 8 * min(positive):
-        if min(values) > 0:
-            axes.set_xscale("log")
-        else:
-            axes.set_xscale("symlog", linthresh=min(positive) / 2, linscale=0.8)
-    else:
-        axes.set_xlim(left=0)
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_ylim(bottom=0)
 
 
 def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:

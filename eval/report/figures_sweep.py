@@ -22,6 +22,7 @@ from ufmstar_torch.eval.report.names import (
     NLL,
     SETTINGS,
     SPEARMAN,
+    count,
     setting_label,
     setting_name,
 )
@@ -30,11 +31,11 @@ from ufmstar_torch.eval.report.style import (
     LABEL,
     TICK,
     Style,
-    counted,
     finish,
     label_ends,
     new_figure,
     short_name,
+    stretch,
     style_of,
 )
 from ufmstar_torch.eval.report.sweeps import Point, Rest, SweepLine, default_value, sweep_lines
@@ -79,7 +80,7 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     anchored = any("anchors" in dict(line.rest) for line in drawn)
     shown = (*SHOWN, SPEARMAN) if anchored else SHOWN
     word, unit = SETTINGS.get(name, (setting_name(name), ""))
-    title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {counted(len(results.sequences()))}"
+    title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {count(len(results.sequences()), 'sequence')}"
     figure = new_figure(4.0 * len(shown), 6.0 if below else 3.4, title)
     axes = figure.subplots(1 + bool(below), len(shown), squeeze=False, sharex=True)
 
@@ -173,13 +174,8 @@ def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[f
 
 
 def _scale(axes: Any, values: Sequence[float]) -> None:
-    """Logarithmic where values span a factor of 20 or more, with a linear piece about 0 where 0 is among them."""
-    positive = [value for value in values if value > 0]
-    if positive and max(positive) >= 20 * min(positive):
-        if min(values) > 0:
-            axes.set_xscale("log")
-        else:
-            axes.set_xscale("symlog", linthresh=min(positive), linscale=0.5)
+    """Logarithmic where values span a factor of 20 or more, with a tick for every value of a few."""
+    stretch(axes, values, 20, linthresh=1.0, linscale=0.5)
     ticks = sorted(set(values))
     if len(ticks) <= 9:
         axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
@@ -192,7 +188,7 @@ def draw_changes(results: Results, base: str) -> Any | None:
     if not lines:
         return None
     shown = [q for q in DIFFERENCES if q.key != "ause_rmse"]
-    title = f"What each setting changes: {BASES[base][0]}, in pairs on {counted(len(results.sequences()))}"
+    title = f"What each setting changes: {BASES[base][0]}, in pairs on {count(len(results.sequences()), 'sequence')}"
     figure = new_figure(2.8 + 2.3 * len(shown), 1.3 + 0.24 * len(lines), title)
     axes = figure.subplots(1, len(shown), squeeze=False, sharey=True)[0]
     for place, quantity in zip(axes, shown, strict=True):

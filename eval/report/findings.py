@@ -21,7 +21,17 @@ from ufmstar_torch.eval.report.means import (
     references,
     value_of,
 )
-from ufmstar_torch.eval.report.names import DELTA1, DIFFERENCES, ECE_DELTA, ECE_Q, LOWER, NLL, Quantity, row_label
+from ufmstar_torch.eval.report.names import (
+    DELTA1,
+    DIFFERENCES,
+    ECE_DELTA,
+    ECE_Q,
+    LOWER,
+    NLL,
+    Quantity,
+    count,
+    row_label,
+)
 from ufmstar_torch.eval.report.table import number
 
 BETTER, WORSE, OPEN, UNDECIDED = "better", "worse", "open", "no verdict"
@@ -35,15 +45,8 @@ QUALITY = (NLL, ECE_DELTA, ECE_Q)
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """A row against another one in one figure, in pairs on the same sequences.
-
-    Attributes:
-        row: judged.
-        reference: beside which.
-        quantity: the figure.
-        mine: mean of the row over the sequences that both have.
-        theirs: that of the reference.
-        difference: mine - theirs, with its interval.
+    """A row against another one in one figure, in pairs on the same sequences: means over the sequences that both have,
+    and the mean of mine - theirs with its interval.
     """
 
     row: Row
@@ -69,9 +72,12 @@ class PairedComparison:
     @property
     def words(self) -> str:
         """ "NLL 1.33 → 0.96 (-0.37 ± 0.11)"."""
-        q = self.quantity
-        before, after = number(self.theirs, q.decimals), number(self.mine, q.decimals)
-        return f"{q.name} {before} → {after}{_unit(q)} ({change(self.difference, q)})"
+        return f"{self.quantity.name} {self.means}{_unit(self.quantity)} ({change(self.difference, self.quantity)})"
+
+    @property
+    def means(self) -> str:
+        """ "1.33 → 0.96"."""
+        return f"{number(self.theirs, self.quantity.decimals)} → {number(self.mine, self.quantity.decimals)}"
 
 
 def change(mean: Mean, quantity: Quantity) -> str:
@@ -248,11 +254,6 @@ def _settings(results: Results) -> list[str]:
 def join(parts: Sequence[str]) -> str:
     """ "a, b and c"."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
-def count(n: int, noun: str) -> str:
-    """ "1 row", "2 rows"."""
-    return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def _left_out(results: Results) -> list[str]:

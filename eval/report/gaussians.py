@@ -99,14 +99,8 @@ def write_ellipsoids_ply(
 
 
 def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> None:
-    """Write all streams exactly, atomically: the fields of ``GaussianMixture`` and ``T_world_first``.
-
-    Slots behind the last occupied one of all streams are left out.
-
-    Args:
-        path: the file, ending in .npz; its folder must exist.
-        mixture: B streams.
-        T_world_first: [B, 4, 4] or [4, 4], kept beside it in float64.
+    """Write all streams exactly, atomically: the fields of ``GaussianMixture``, and ``T_world_first`` ([B, 4, 4] or
+    [4, 4]) in float64. Slots behind the last occupied one of all streams are left out.
 
     Raises:
         OSError: see ``write_atomic``.

@@ -95,6 +95,7 @@ SETTINGS = {
     "skip": ("images skipped", ""),
     "eta": ("overlap threshold η", ""),
     "eta_occlusion": ("occlusion threshold η_occl", ""),
+    "occlusion_depth": ("occlusion depth", "of the depth seen"),
     "ema_alpha": ("smoothing α", ""),
     "prior_weight": ("prior weight π₀", "px/m³"),
     "prior_mean": ("prior mean μ₀", "m²"),
@@ -180,3 +181,8 @@ def shared_words(rows: Iterable[Row]) -> str:
     """How images were prepared for all rows, "" where their networks' weights decide or rows differ."""
     prepared = {row.setting.preprocess for row in rows}
     return _WORDS.get(("preprocess", prepared.pop()), "") if len(prepared) == 1 else ""
+
+
+def count(n: int, noun: str) -> str:
+    """ "1 row", "2 rows"."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -13,15 +13,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.report.panels import FramePanel, MapColumn, contact_sheet, map_columns
-from ufmstar_torch.eval.report.video import VideoWriter, preview_frame
+from ufmstar_torch.eval.report.video import preview_frame, write_video
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
@@ -116,9 +118,9 @@ def draw_sheet(finished: Finished, columns: Sequence[MapColumn], title: str) -> 
 
 def draw_video(finished: Finished, columns: Sequence[MapColumn]) -> Iterator[int]:
     """Write preview.mp4 frame by frame; yields how many are done, so that the caller can report and stop."""
-    with VideoWriter(finished.out / "preview.mp4", finished.fps()) as video:
+    with write_video(finished.out / "preview.mp4", finished.fps()) as add:
         for number in range(len(finished.records)):
-            video.add(preview_frame(finished.panel(number), columns))
+            add(preview_frame(finished.panel(number), columns))
             yield number + 1
 
 
@@ -140,9 +142,7 @@ def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
     """
     f = max(K[0, 0], K[1, 1])
     new = (round(size[0] * f / K[1, 1]), round(size[1] * f / K[0, 0]))
-    sx, sy = new[1] / size[1], new[0] / size[0]
-    cx, cy = (K[0, 2] + 0.5) * sx - 0.5, (K[1, 2] + 0.5) * sy - 0.5
-    return pinhole(K[0, 0] * sx, K[1, 1] * sy, cx, cy), new
+    return resize_intrinsics(torch.from_numpy(K), size, new).numpy(), new
 
 
 def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) -> NDArray[np.uint8]:
@@ -158,12 +158,8 @@ def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: 
 
 
 def panel(name: str, note: str, result: FrameResult) -> FramePanel:
-    """One row of the demo's sheet: depth, sigma and true error, of UfM* and of the posterior.
-
-    Args:
-        name: of the frame.
-        note: the kind of room.
-        result: the frame through the demo's rows, with an image and ground truth.
+    """One row of the demo's sheet: depth, sigma and true error, of UfM* and of the posterior, for a frame (with an
+    image and ground truth) through the demo's rows; ``note`` is the kind of room.
     """
     star: Any = result.rows[UFM_STAR]
     maps: dict[str, Any] = {}
@@ -184,10 +180,10 @@ def write_pictures(
     ufm_star: UfMStar,
     title: str,
 ) -> dict[str, str | None]:
-    """Write all of :data:`DEMO_FILES`.
+    """Write all of :data:`DEMO_FILES` into an existing folder.
 
     Args:
-        out: an existing folder.
+        out: the folder.
         panels: rows of the contact sheet.
         metrics: by the name that the legend shows.
         ufm_star: at the end of the tour.
@@ -195,9 +191,6 @@ def write_pictures(
 
     Returns:
         By file: None if it was written, else why not (an optional package is missing).
-
-    Raises:
-        OSError: a full disk, say.
     """
     from ufmstar_torch.eval.report.figures_calibration import write_curves
 

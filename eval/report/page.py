@@ -15,11 +15,11 @@ from typing import Any
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.efficiency import efficiency_tables
-from ufmstar_torch.eval.report.findings import PairedComparison, best_rows, caveats, comparisons, count, headlines, join
+from ufmstar_torch.eval.report.findings import PairedComparison, best_rows, caveats, comparisons, headlines, join
 from ufmstar_torch.eval.report.means import MIN_SEQUENCES, value_of
-from ufmstar_torch.eval.report.names import DIFFERENCES, row_label
+from ufmstar_torch.eval.report.names import DIFFERENCES, count, row_label
 from ufmstar_torch.eval.report.pictures import BREAKDOWN, COMPARE, ROOM, STRIP, Picture
-from ufmstar_torch.eval.report.table import Table, number
+from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.report.tables import difference_table, extra_table, main_table, sequence_tables
 from ufmstar_torch.eval.results.files import write_atomic
 
@@ -81,9 +81,6 @@ def write_page(
         undrawn: reasons by figure, of those that could not be drawn.
         most_bytes: of all pictures together; those that do not fit are named instead.
 
-    Returns:
-        The file.
-
     Raises:
         ValueError: a picture cannot be read.
         ImportError: Pillow or Jinja2 is missing.
@@ -108,7 +105,7 @@ def write_page(
         (r.dataset, r.sequence): max(0, int(f)) for r in results.records if (f := value_of(r, "frames.done")) == f
     }
     n = len(results.sequences())
-    facts = {"rows": len(results.rows), f"sequence{'s' if n > 1 else ''}": n, "frames": sum(frames.values())}
+    facts = {"rows": len(results.rows), "sequences" if n > 1 else "sequence": n, "frames": sum(frames.values())}
     text = _template().render(
         results=results,
         parts=parts,
@@ -178,16 +175,11 @@ def _board(pairs: Mapping[tuple[Row, Row], Sequence[PairedComparison]], title: s
     shown = [q for q in DIFFERENCES if any(c.quantity is q for made in pairs.values() for c in made)]
     rows = []
     for (row, reference), made in pairs.items():
-        cells = {c.quantity.key: _verdict(c) for c in made}
+        cells = {c.quantity: c for c in made}
         sequences = count(max(c.difference.sequences for c in made), "sequence")
         beside = f"beside {row_label(reference)}, {sequences}"
-        rows.append((row_label(row), beside, [cells.get(q.key) for q in shown]))
+        rows.append((row_label(row), beside, [cells.get(q) for q in shown]))
     return {"title": title, "heads": ["UfM*, beside", *(q.heading for q in shown)], "rows": rows}
-
-
-def _verdict(c: PairedComparison) -> dict[str, str]:
-    means = f"{number(c.theirs, c.quantity.decimals)} → {number(c.mine, c.quantity.decimals)}"
-    return {"verdict": c.verdict, "means": means, "words": c.words}
 
 
 def _part(title: str, tables: Sequence[Table] = (), folded: Sequence[Table] = (), words: str = "") -> Part:

@@ -33,13 +33,8 @@ _GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One picture.
-
-    Attributes:
-        rgb: [h, w, 3] uint8; None leaves a place with the words ``absent``.
-        caption: above it.
-        box: outlined in it.
-        absent: why there is no picture.
+    """One picture [h, w, 3] uint8 with a caption above and a box outlined in it; None leaves a place with the words
+    ``absent``.
     """
 
     rgb: NDArray[np.uint8] | None
@@ -105,11 +100,8 @@ def draw_grid(
         dpi: pixels per inch.
 
     Raises:
-        ValueError: there is no row.
         ImportError: matplotlib is missing.
     """
-    if not rows:
-        raise ValueError("rows must hold at least one row of pictures")
     names = [break_name(row.title, max(8, int(12 * words))) for row in rows]
     named = [0.16 * (name.count("\n") + 1) + 0.05 for name in names]
     heads = [_CAPTION if any(panel.caption for panel in row.panels) else 0.0 for row in rows]

@@ -16,9 +16,7 @@ class PaperTable:
     """A table of the paper.
 
     Attributes:
-        number: its number.
-        network: the depth network.
-        measured_on: data and machine.
+        number, network, measured_on: its number, the depth network, data and machine.
         columns: keys, those of ``Record.figures`` where they mean the same.
         rows: cells as printed, by method and column; a column in which a dash is printed is missing.
         suite: the suite that repeats it, "" = none.

@@ -271,20 +271,12 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
 
 
 def largest_difference(difference: NDArray[Any], share: float) -> Box:
-    """The box with the largest mean |difference|, missing values (NaN) counting as none.
-
-    Args:
-        difference: [h, w].
-        share: side of the box by that of the map, in (0, 1].
+    """The box with the largest mean |difference| [h, w], missing values (NaN) counting as none; the first such box from
+    the top left.
 
     Returns:
-        (left, top, width, height) [px]; the first such box from the top left.
-
-    Raises:
-        ValueError: share is out of range.
+        (left, top, width, height) [px]; its side by that of the map is ``share``, in (0, 1].
     """
-    if not 0 < share <= 1:
-        raise ValueError(f"share must lie in (0, 1], got {share}")
     h, w = difference.shape
     height, width = max(1, round(share * h)), max(1, round(share * w))
     size = np.where(np.isfinite(difference), np.abs(difference), 0).astype(np.float64)

@@ -83,15 +83,8 @@ def choose_times(snapshots: Sequence[Snapshot], most: int = MOST_TIMES) -> list[
 
 
 def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourScale:
-    """Draw each time in a column, from above and obliquely, with the camera's path; one scale for all of them.
-
-    Args:
-        path: the picture (PNG).
-        snapshots: at least one; times of the same room.
-        title: over the picture.
-
-    Returns:
-        The scale of sqrt(m) [m].
+    """Draw each time in a column, from above and obliquely, with the camera's path, on one scale of sqrt(m) [m], which
+    is returned; write the picture (PNG).
 
     Raises:
         ValueError: there is no snapshot, or none with a Gaussian.
@@ -252,13 +245,9 @@ def project(view: Projection, covariance: Array) -> tuple[Array, Array]:
 
 
 def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[Projection, Projection]:
-    """From above, and obliquely from behind the first camera.
+    """From above, and obliquely from behind the first of cameras [n, 4, 4], ``elevation`` over the horizon [degrees].
 
     Data sets differ in which axis points up; a camera's own up (-y) is right on average.
-
-    Args:
-        T_world_cam: [n, 4, 4] poses of cameras.
-        elevation: of the oblique view over the horizon [degrees].
     """
     up = _unit(-T_world_cam[:, :3, 1].mean(0), np.array([0.0, 0.0, 1.0]))
     first = T_world_cam[0, :3, 2]

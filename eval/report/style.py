@@ -56,11 +56,6 @@ def short_name(method: Method) -> str:
     return f"{name}{'-Full' if method.full else ''}{cap}{' fixed-param' if method.fixed_param else ''}"
 
 
-def counted(sequences: int) -> str:
-    """ "1 sequence", "6 sequences"."""
-    return f"{sequences} sequence{'' if sequences == 1 else 's'}"
-
-
 def new_figure(width: float, height: float, title: str) -> Any:
     """A figure with a title [inches].
 
@@ -126,6 +121,18 @@ def label_ends(axes: Any, ends: Sequence[tuple[float, str, str]]) -> None:
     height = axes.get_position().height * axes.figure.get_figheight()
     for place, (_, name, colour) in zip(spread_apart(wanted, 1.25 * TICK / 72 / height, 0, 1), ends, strict=True):
         axes.text(1.02, place, plain(name), transform=axes.transAxes, color=colour, size=TICK, va="center", ha="left")
+
+
+def stretch(axes: Any, values: Sequence[float], factor: float, **about_zero: float) -> None:
+    """A logarithmic x axis where values span ``factor`` or more, with a linear piece about 0 where 0 is among them:
+    ``linthresh`` in units of the least positive value, and ``linscale``."""
+    positive = [value for value in values if value > 0]
+    if not positive or max(positive) < factor * min(positive):
+        return
+    if min(values) > 0:
+        axes.set_xscale("log")
+    else:
+        axes.set_xscale("symlog", **about_zero | {"linthresh": about_zero["linthresh"] * min(positive)})
 
 
 def save_figure(figure: Any, path: Path) -> None:

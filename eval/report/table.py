@@ -21,13 +21,8 @@ DASH = "–"
 
 @dataclass(frozen=True)
 class Cell:
-    """The content of a cell, as printed.
-
-    Attributes:
-        value: "" = no such figure (a dash).
-        half: half-width of its confidence interval, "" = none.
-        bold: the best of its block.
-        remark: a word behind it.
+    """The content of a cell, as printed: "" = no such figure (a dash), the half-width of its confidence interval ("" =
+    none), whether it is the best of its block, and a word behind it.
     """
 
     value: str = ""

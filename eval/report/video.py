@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -86,83 +87,54 @@ def _font(size: int) -> Any:
     return ImageFont.truetype(Path(require_matplotlib().get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
 
 
-class VideoWriter:
-    """Writes an H.264 mp4 frame by frame with imageio; a context manager.
+@contextmanager
+def write_video(path: str | Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+    """Write an H.264 mp4 with imageio, ``fps`` frames per second; the value appends a frame [H, W, 3] uint8 RGB, H and
+    W even and the same for all.
 
-    The file appears under its name when the block ends, also when it ends by Ctrl-C or an error: it then
-    holds the frames so far. Without a frame there is no file.
-
-    Args:
-        path: ends in .mp4; its folder must exist.
-        fps: frames per second.
+    The file appears under its name (ending in .mp4, in an existing folder) when the block ends, also when it ends by
+    Ctrl-C or an error: it then holds the frames so far. Without a frame there is no file.
 
     Raises:
         ImportError: imageio or imageio-ffmpeg is missing; names the extra that brings it.
-        ValueError: another ending, or fps is not positive.
+        ValueError: another ending, fps is not positive, or a frame of a wrong shape or type.
+        OSError: ffmpeg stopped, on a full disk, say, or wrote no file.
     """
+    path = Path(path)
+    if path.suffix != ".mp4":
+        raise ValueError(f"path must end in .mp4, got {path.name}")
+    if not fps > 0:
+        raise ValueError(f"fps must be positive, got {fps}")
+    if find_spec("imageio_ffmpeg") is None:
+        raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'")
+    import imageio.v2
 
-    def __init__(self, path: str | Path, fps: float) -> None:
-        self.path = Path(path)
-        if self.path.suffix != ".mp4":
-            raise ValueError(f"path must end in .mp4, got {self.path.name}")
-        if not fps > 0:
-            raise ValueError(f"fps must be positive, got {fps}")
-        if find_spec("imageio_ffmpeg") is None:
-            raise ImportError("a video needs imageio-ffmpeg: pip install 'ufmstar-torch[eval]'")
-        self.fps = fps
-        self._size: tuple[int, ...] = ()
-        self._writer: Any = None
-        # ffmpeg goes by the ending, so it comes last here.
-        self._temporary = self.path.with_name(f".{self.path.stem}.{os.getpid()}.tmp.mp4")
+    # ffmpeg goes by the ending, so it comes last here.
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.mp4")
+    # yuv420p is what browsers and slide programs play.
+    how: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "quality": 7}
+    writer: Any = None
+    size: tuple[int, ...] = ()
 
-    def add(self, frame: NDArray[np.uint8]) -> None:
-        """Append a frame [H, W, 3] uint8 RGB, H and W even and the same for all.
-
-        Raises:
-            ValueError: wrong shape or type.
-            OSError: ffmpeg stopped, on a full disk, say.
-        """
+    def add(frame: NDArray[np.uint8]) -> None:
+        nonlocal writer, size
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or any(n % 2 for n in frame.shape[:2]):
             raise ValueError(f"frame must be uint8 [H, W, 3] of even size, got {frame.dtype} {frame.shape}")
-        if self._writer is None:
-            self._writer, self._size = self._open(), frame.shape
-        if frame.shape != self._size:
-            raise ValueError(f"frame must have the size of the first, {self._size[1::-1]}, got {frame.shape[1::-1]}")
-        self._writer.append_data(np.ascontiguousarray(frame))
+        if writer is None:
+            writer = imageio.v2.get_writer(temporary, format="FFMPEG", fps=fps, ffmpeg_log_level="error", **how)
+            size = frame.shape
+        if frame.shape != size:
+            raise ValueError(f"frame must have the size of the first, {size[1::-1]}, got {frame.shape[1::-1]}")
+        writer.append_data(np.ascontiguousarray(frame))
 
-    def _open(self) -> Any:
-        import imageio.v2
-
-        return imageio.v2.get_writer(
-            self._temporary,
-            format="FFMPEG",
-            fps=self.fps,
-            codec="libx264",
-            pixelformat="yuv420p",  # what browsers and slide programs play
-            macro_block_size=2,
-            quality=7,
-            ffmpeg_log_level="error",
-        )
-
-    def close(self) -> None:
-        """Finish the file.
-
-        Raises:
-            OSError: ffmpeg wrote no file.
-        """
-        if self._writer is None:
-            return
-        writer, self._writer = self._writer, None
+    try:
+        yield add
+    finally:
         try:
-            writer.close()
-            if not self._temporary.is_file() or self._temporary.stat().st_size == 0:
-                raise OSError(f"ffmpeg wrote no video for {self.path}")
-            os.replace(self._temporary, self.path)
+            if writer is not None:
+                writer.close()
+                if not temporary.is_file() or temporary.stat().st_size == 0:
+                    raise OSError(f"ffmpeg wrote no video for {path}")
+                os.replace(temporary, path)
         finally:
-            self._temporary.unlink(missing_ok=True)
-
-    def __enter__(self) -> VideoWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+            temporary.unlink(missing_ok=True)

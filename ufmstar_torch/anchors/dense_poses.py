@@ -36,9 +36,9 @@ _ENOUGH = 10
 _MEDIAN_SQUARE = 0.4549
 # [px] Standard deviation of a position by errors of the poses before it is estimated, and the least one.
 _FIRST, _LEAST = 0.3, 0.003
-# A pixel's own variance over the one stated by the match: _PATCH, which all views share, and _VIEWS times the mean
-# squared difference of its views, estimated with _BEFORE views' worth of the running one. Fitted on tours.
-_PATCH, _VIEWS, _BEFORE = 0.08, 1.5, 0.15
+# A pixel's own variance over the one stated by its match is so many times the mean squared difference of its views,
+# with the running one as that of one more: views share the patch and its errors. Fitted on tours.
+_PATCH = 2.0
 # Times that their effect is linearised.
 _LINEARISED = 2
 # [px] What errors of the poses leave of it.
@@ -151,9 +151,8 @@ class PoseErrors:
         if trusted:
             self._learn_camera(solution, views.image.shape[2])
         self._learn_noise(solution.residual[used], solution.beside, measured.across_noise, shows, shares)
-        views_agree = np.maximum(measured.agreed - 1, 0)
-        apart = (_BEFORE * self._disagreement + solution.residual.sum(1)) / (_BEFORE + views_agree)
-        variance = (_PATCH + _VIEWS * apart) * own.min(1, initial=np.inf) + solution.common
+        apart = (self._disagreement + solution.residual.sum(1)) / np.maximum(measured.agreed, 1)
+        variance = _PATCH * apart * own.min(1, initial=np.inf) + solution.common
         return Fit(rho, variance)
 
     def _before(self, shares: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

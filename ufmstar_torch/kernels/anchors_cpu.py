@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,15 +31,17 @@ from ufmstar_torch.anchors.hook import Learnt
 from ufmstar_torch.anchors.hook import learn as learn_reference
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
+from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.regress_cpu import EPSILON
-from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare, slots_in_use
+from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
+from ufmstar_torch.kernels.regress_vectors_cpu import add_shares
 from ufmstar_torch.kernels.threads_cpu import each
+from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+_LOG2_E = math.log2(math.e)
 
 # Anchors of a cell, on average, where neighbours are searched and where components are.
 _FEW, _SOME = 3, 32
@@ -81,35 +82,16 @@ def _check(given, measured, spread, mask, depth, use, farthest, pixel, index, pr
 
 def inliers(anchors: AnchorInput) -> Tensor:
     """As :func:`ufmstar_torch.anchors.evidence.inliers`, for CPU tensors; the same anchors."""
-    b, n = anchors.valid.shape
-    out, most = np.empty((b, n), np.bool_), max(min(NEIGHBOURS, n - 1), 0)
+    out = np.empty(anchors.valid.shape, np.bool_)
     given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.valid)
-    arrays = zip(*(value.contiguous().numpy() for value in given), out, strict=True)
-    each(_inliers, [(*arguments, most) for arguments in arrays])
+    each(_inliers, list(zip(*map(array, given), out, strict=True)))
     return torch.from_numpy(out)
 
 
-def _inliers(
-    pixel: Floats, predicted: Floats, depth: Floats, variance: Floats, valid: Mask, out: Mask, most: int
-) -> None:
+@kernel
+def _inliers(pixel, predicted, depth, variance, valid, out):
     """One stream, N anchors, into ``out`` [N]."""
-    n = valid.size
-    neighbour, count, ratio = np.empty((n, most), np.int64), np.empty(n, np.int64), np.empty(n)
-    differ = np.empty(n * most)
-    total = _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ)
-    _support(variance, depth, valid, ratio, neighbour, count, _lower_quartile(differ[:total]), out)
-
-
-def _lower_quartile(values: Floats) -> float:
-    """``torch.quantile(values, 0.25)``, 0 of no values."""
-    if values.size == 0:
-        return 0.0
-    rank = 0.25 * (values.size - 1)
-    below = int(rank)
-    above = min(below + 1, values.size - 1)
-    part = np.partition(values, (below, above))
-    low, high, weight = float(part[below]), float(part[above]), rank - below
-    return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
+    _supported(pixel, predicted, depth, variance, valid, out)
 
 
 def learn(
@@ -118,51 +100,54 @@ def learn(
     frame: FrameInput,
     anchors: AnchorInput | None,
     config: UfMStarConfig,
+    near: Sequence[tuple[NDArray[np.int64], int]] | None = None,
 ) -> Learnt:
-    """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors; with the exact sum, shares are right to twice the
-    error of the regression's in the dtype of the evidence."""
+    """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors, of evidence that may have less room than the
+    mixture; with the exact sum, shares are right to twice the error of the regression's in the dtype of the evidence.
+
+    ``near`` are the slots of each stream that can matter, in increasing order, and how many are occupied; None = all.
+    """
     if config.regression != "exact":
-        return learn_reference(evidence, mixture_cam, frame, anchors, config, distribute, inliers)
-    b, capacity, _ = evidence.component.shape
+        padded = evidence.padded(mixture_cam.capacity)
+        return learn_reference(padded, mixture_cam, frame, anchors, config, distribute, inliers)
+    b, capacity = mixture_cam.weight.shape
     dtype = evidence.overall.dtype
+    if near is None:
+        near = [(slots, slots.size) for slots in map(np.flatnonzero, array(mixture_cam.weight) > 0)]
     # In float64 for every dtype, so that there is one kernel to compile.
-    real: Any = {"dtype": torch.float64}
-    component, beyond = torch.empty(b, capacity, 3, **real), torch.empty(b, capacity, 2, **real)
-    overall, stream, used = torch.empty(b, 3, **real), torch.empty(b, 2, **real), torch.zeros(b, dtype=torch.int64)
+    component, beyond = np.empty((b, capacity, 3)), np.empty((b, capacity, 2))
+    overall, stream, used = np.empty((b, 3)), np.empty((b, 2)), np.zeros((b, 1), np.int64)
     if anchors is None:
-        fields = [torch.empty(b, 0, dtype=torch.int64)] + [torch.empty(b, 0, dtype=torch.float64)] * 4
-        fields += [torch.empty(b, 0, dtype=torch.bool)]
+        fields = [np.empty((b, 0), np.int64), np.empty((b, 0, 2)), *np.empty((4, b, 0)), np.empty((b, 0), np.bool_)]
     else:
-        fields = [anchors.index, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance]
-        fields += [inliers(anchors)]
-    mixture = (value.double() for value in (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight))
-    given = [*fields, frame.intrinsics.double(), *mixture, evidence.component.double(), evidence.overall.double()]
-    results = (component, overall, used[:, None], beyond, stream)
-    memory = 0.5 ** (1 / config.anchor_half_life)
+        given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
+        fields = [array(anchors.index), *map(array, given), array(anchors.valid)]
+    given = (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight, frame.intrinsics)
+    doubles = [np.asarray(array(v), np.float64) for v in (*given, evidence.component, evidence.overall)]
     settings = (
-        frame.size[1],
-        memory,
-        config.anchor_shrinkage,
-        config.prior_weight,
-        EPSILON[dtype],
-        dtype == torch.float32,
-    )
-    arrays = zip(*(value.contiguous().numpy() for value in given), strict=True)
-    out = zip(*(value.numpy() for value in results), strict=True)
-    each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
-    return Learnt(Evidence(component.to(dtype), overall.to(dtype)), used, beyond, stream)
+        frame.size[1], 0.5 ** (1 / config.anchor_half_life), config.anchor_shrinkage, config.prior_weight,
+        EPSILON[dtype], dtype == torch.float32,
+    )  # fmt: skip
+    arrays = zip(*fields, *doubles, strict=True)
+    out = zip(component, overall, used, beyond, stream, strict=True)
+    calls = zip(near, arrays, out, strict=True)
+    each(_learn, [(*slots, *arguments, *settings, *into) for slots, arguments, into in calls])
+    learnt = Evidence(torch.from_numpy(component).to(dtype), torch.from_numpy(overall).to(dtype))
+    return Learnt(learnt, torch.from_numpy(used[:, 0]), torch.from_numpy(beyond), torch.from_numpy(stream))
 
 
 @kernel
 def _learn(
-    index, predicted, depth, variance, own, supported, K, mean, covariance, weight, before, overall_before, width,
-    memory, shrinkage, prior_weight, epsilon, single, component, overall, used, beyond, stream,
+    slots, occupied, index, pixel, predicted, depth, variance, own, valid, mean, covariance, weight, K, before,
+    overall_before, width, memory, shrinkage, prior_weight, epsilon, single, component, overall, used, beyond, stream,
 ):  # fmt: skip
-    """One stream: N anchors, K components."""
-    rows, sums = np.empty((supported.size, 3)), np.zeros((component.shape[0], 3))
+    """One stream: N anchors, K components, of which only ``slots`` [n] can explain a point."""
+    supported = np.empty(valid.size, np.bool_)
+    rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
+    _supported(pixel, predicted, depth, variance, valid, supported)
     used[0] = _rows(predicted, depth, variance, own, supported, rows)
-    if supported.size > 0:
-        mixture = (mean, covariance, weight)
+    if valid.size > 0:
+        mixture = (slots, occupied, mean, covariance, weight)
         _distribute(index, predicted, supported, rows, K, width, mixture, prior_weight, epsilon, sums)
     fade = memory if used[0] > 0 else 1.0
     for c in range(3):
@@ -171,7 +156,8 @@ def _learn(
         stream[c] = overall[c + 1] / (overall[0] + shrinkage)
     for k in range(component.shape[0]):
         for c in range(3):
-            component[k, c] = _rounded(fade * before[k, c] + sums[k, c], single)
+            old = before[k, c] if k < before.shape[0] else 0.0
+            component[k, c] = _rounded(fade * old + sums[k, c], single)
         for c in range(2):
             beyond[k, c] = (component[k, c + 1] - component[k, 0] * stream[c]) / (component[k, 0] + shrinkage)
 
@@ -259,7 +245,45 @@ def _grid(pixel, chosen, mean_count):
     return low, side, columns, rows, start, order
 
 
-@kernel
+@part
+def _supported(pixel, predicted, depth, variance, valid, out):
+    """Which of N anchors are valid and supported by their neighbours (``evidence.inliers``), into ``out`` [N]."""
+    n = valid.size
+    most = max(min(NEIGHBOURS, n - 1), 0)
+    neighbour, count, ratio = np.empty((n, most), np.int64), np.empty(n, np.int64), np.empty(n)
+    differ = np.empty(n * most)
+    total = _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ)
+    _support(variance, depth, valid, ratio, neighbour, count, _lower_quartile(differ, total), out)
+
+
+@part
+def _lower_quartile(values, n):
+    """``torch.quantile(values[:n], 0.25)``, 0 where n = 0; reorders the values."""
+    if n == 0:
+        return 0.0
+    rank = 0.25 * (n - 1)
+    below, first, last = int(rank), 0, n - 1
+    while first < last:  # Hoare's selection: what is not above values[below] moves before it
+        pivot, i, j = values[below], first, last
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if j < below:
+            first = i
+        if below < i:
+            last = j
+    low, high, weight = values[below], values[min(below + 1, n - 1)], rank - below
+    for i in range(below + 1, n):
+        high = min(high, values[i])
+    return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
+
+
+@part
 def _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ):
     """Write log g/d of the valid anchors of N, their nearest ones [N, most] and how many these are; return the number
     of differences of log g/d that are written to ``differ``."""
@@ -281,7 +305,7 @@ def _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ)
     return total
 
 
-@kernel
+@part
 def _support(variance, depth, valid, ratio, neighbour, count, quartile, out):
     """Which of the valid anchors enough of their neighbours support; all of a few."""
     sigma2, few = (quartile / LOWER_QUARTILE) * (quartile / LOWER_QUARTILE) + 2 * LEAST_SIGMA**2, 0
@@ -335,59 +359,41 @@ def _nearest(ordered, u_a, v_a, a, low, side, columns, rows, start, order, dista
 def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight, epsilon, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
-    Left out is what adds less than eps/K of the prior or of the largest component to the denominator.
+    Left out is what adds less than eps/K of the prior to the denominator.
     """
-    mean, covariance, weight = mixture
+    slots, count, mean, covariance, weight = mixture
     points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
     for i in range(chosen.size):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
-    occupied, whitening, log_peak = prepare(slots_in_use(weight), mean, covariance, weight)
-    share = math.log(epsilon / max(occupied.size, 1))
+    occupied, whitening, log_peak = prepare(slots.copy(), mean, covariance, weight)
+    share = math.log(epsilon / max(count, 1))
     boxes = _boxes(mean, covariance, occupied, log_peak, share + math.log(prior_weight))
     start, order = _grid(pixel, chosen, _SOME)[4:]
     near = _touched(points, order, np.arange(occupied.size), boxes)
-    fields, exponent, counted = np.empty((10, near.size)), np.empty(near.size), np.empty(near.size, np.int64)
+    room = (near.size + LANES - 1) // LANES * LANES
+    fields, density, added = np.empty((10, room)), np.empty(room), np.empty((3, room))
+    point, row, scale = np.empty(3), np.empty(4), math.sqrt(0.5 * _LOG2_E)
+    row[3] = prior_weight
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:
             continue
         kept = _touched(points, order[start[cell] : start[cell + 1]], near, boxes)
-        for i in range(kept.size):
+        n = (kept.size + LANES - 1) // LANES * LANES
+        for i in range(n):
+            k = kept[i] if i < kept.size else -1
             for axis in range(3):
-                fields[axis, i] = mean[occupied[kept[i]], axis]
+                fields[axis, i] = mean[occupied[k], axis] if k >= 0 else 0.0
+                added[axis, i] = 0.0
             for entry in range(6):
-                fields[3 + entry, i] = whitening[kept[i], entry]
-            fields[9, i] = log_peak[kept[i]]
+                fields[3 + entry, i] = whitening[k, entry] * scale if k >= 0 else 0.0
+            fields[9, i] = log_peak[k] * _LOG2_E if k >= 0 else -np.inf
         for place in range(start[cell], start[cell + 1]):
             p = order[place]
-            _exponents(fields, kept.size, points[p, 0], points[p, 1], points[p, 2], exponent)
-            limit = math.log(prior_weight)
-            for i in range(kept.size):
-                limit = exponent[i] if exponent[i] > limit else limit
-            limit += share
-            n, evidence = 0, prior_weight
-            for i in range(kept.size):
-                counted[n] = i
-                n += exponent[i] >= limit
-            for j in range(n):
-                i = counted[j]
-                exponent[i] = math.exp(exponent[i])
-                evidence += exponent[i]
-            r0, r1, r2 = rows[p, 0] / evidence, rows[p, 1] / evidence, rows[p, 2] / evidence
-            for j in range(n):
-                i = counted[j]
-                k, density = occupied[kept[i]], exponent[i]
-                sums[k, 0] += density * r0
-                sums[k, 1] += density * r1
-                sums[k, 2] += density * r2
-
-
-@part
-def _exponents(fields, n, x, y, z, out):
-    """log of the densities of n components at a point."""
-    for i in range(n):
-        dx, dy, dz = x - fields[0, i], y - fields[1, i], z - fields[2, i]
-        y0, y1 = fields[3, i] * dx, fields[4, i] * dx + fields[5, i] * dy
-        y2 = fields[6, i] * dx + fields[7, i] * dy + fields[8, i] * dz
-        out[i] = fields[9, i] - 0.5 * (y0 * y0 + y1 * y1 + y2 * y2)
+            for axis in range(3):
+                point[axis], row[axis] = points[p, axis], rows[p, axis]
+            add_shares(fields, room, n, point, row, density, added)
+        for i in range(kept.size):
+            for axis in range(3):
+                sums[occupied[kept[i]], axis] += added[axis, i]

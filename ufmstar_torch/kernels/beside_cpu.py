@@ -14,8 +14,8 @@ from ufmstar_torch.kernels.compile_cpu import reordered
 # Two anchors are alike within so many standard deviations of their difference, or this share of the inverse depth.
 _SIGMAS, _SHARE = 3.0, 0.05
 # Share of wrong anchors in a frame; they are those that differ from most of the anchors around them: each one's part of
-# that share goes with the fourth power of the share of others around it, counted with one more that is alike.
-_WRONG, _POWER = 0.026, 4
+# that share goes with the eighth power of the share of others around it, counted with one more that is alike.
+_WRONG, _POWER = 0.026, 8
 # A side is that of the surface where the mean directions of those alike and of the others differ by this much along the
 # gradient (2 = opposite); the pixel then moves to it by 1 px, or by 2 px where they differ by _FAR.
 _APART, _FAR = 0.25, 1.0

@@ -5,6 +5,7 @@ What takes time is compiled (``field_cpu``, ``cells_cpu``); what is left are a f
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -242,7 +243,7 @@ def _spread(scene: _Scene, near: _Near, used: NDArray[np.bool_], mean: float) ->
     grid, y = scene.grid, scene.observed.value
     sums = [np.bincount(scene.observed.node, x, grid.rows * grid.cols) for x in (each, each * y, each * y**2)]
     nodes = np.stack(sums).reshape(3, grid.rows, grid.cols)
-    weight, first, second = (_window(grid.rows) @ nodes @ _window(grid.cols)).reshape(3, -1)
+    weight, first, second = (_window(grid.rows, MODEL.window) @ nodes @ _window(grid.cols, MODEL.window)).reshape(3, -1)
     total = weight + MODEL.few
     middle = (first + MODEL.few * mean) / total
     moment = (second + MODEL.few * (mean**2 + MODEL.prior[0] ** 2)) / total
@@ -250,9 +251,10 @@ def _spread(scene: _Scene, near: _Near, used: NDArray[np.bool_], mean: float) ->
     return spread
 
 
-def _window(count: int) -> Floats:
+@functools.lru_cache(maxsize=4)  # the sizes of the grid hardly change
+def _window(count: int, width: float) -> Floats:
     at_ = np.arange(count) / count
-    return np.exp(-(((at_[:, None] - at_) / MODEL.window) ** 2) / 2)
+    return np.exp(-(((at_[:, None] - at_) / width) ** 2) / 2)
 
 
 def _tail(share: Floats, offset: Floats, spread: Floats) -> Floats:

@@ -68,9 +68,8 @@ def regress_maps(
             calls += [(z[b], K[b], *fields, *settings, out[b], features[b], i, shares) for i in range(shares)]
             continue
         slots = np.flatnonzero(fields[2] > 0) if near is None else near[b][0]
-        view = in_view(
-            slots, len(slots) if near is None else near[b][1], *fields, K[b], *z.shape[1:], *settings, z.dtype.type(0)
-        )
+        occupied = len(slots) if near is None else near[b][1]
+        view = in_view(slots, occupied, *fields, K[b], z[b], *settings)
         if pixels is None:
             calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
         else:

@@ -3,6 +3,7 @@
 A component k adds w_k(x) = pi_k N(x; mu_k, Sigma_k) to the denominator D(x) = pi_0 + sum_k w_k(x) of a point x.
 
 1. Image: w_k(x) exceeds a threshold in an ellipsoid only. Its silhouette has a bounding box of pixels.
+   Those that level 2 leaves out in a box around all points of the image go at once, which changes no bit.
 2. Block of 32 x 32 pixels: for the components whose silhouette meets the image, interval arithmetic over the bounding
    box of the block's points gives l_k <= w_k(x) <= h_k.
 3. Tile of 8 x 8 pixels: the same, for the components that the block keeps.
@@ -36,29 +37,68 @@ _LOG2_E = math.log2(math.e)
 
 
 @kernel
-def in_view(
-    slots, occupied, mean, covariance, weight, m, features, K, height, width, prior_weight, prior_mean, epsilon, zero
-):
+def in_view(slots, occupied, mean, covariance, weight, m, features, K, depth, prior_weight, prior_mean, epsilon):
     """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
 
     Args:
         slots: [n] increasing, the only ones that are looked at.
         occupied: how many components the mixture has, others than those included.
+        depth: [H, W], not positive where there is none.
 
     Returns:
-        Indices [n], fields [n, 10], the same in the dtype of ``zero`` and by field [10, n and more], the terms of the
-        sum but their offsets [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold.
+        Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
+        sum but their offsets [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold,
+        and how many components level 1 left.
     """
+    height, width = depth.shape
     index, whitening, log_peak = prepare(slots.copy(), mean, covariance, weight)
     least, limit = math.log2(_PRIOR * prior_weight), negligible(prior_weight, epsilon, occupied)
-    fields, constants = np.empty((index.size, FIELDS)), np.empty((index.size, TERMS), np.array(zero).dtype)
+    fields, constants = np.empty((index.size, FIELDS)), np.empty((index.size, TERMS), depth.dtype)
     n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
-    packed = np.empty((FIELDS, _padded(n)), constants.dtype)
+    packed, kept = np.empty((FIELDS, _padded(n)), depth.dtype), np.empty(n, np.int64)
+    _pack(fields, n, packed)
+    z = _farthest(depth)
+    left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
+    right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
+    box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
+    settings, work = (prior_weight, prior_mean, epsilon, least, n), np.empty(8 + packed.shape[1], depth.dtype)
+    # Blocks take n components; a few more lower the threshold by more than what rounding can make of two boxes.
+    chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, kept)
+    for i in range(chosen):
+        k = kept[i]
+        index[i] = index[k]
+        for j in range(FIELDS):
+            fields[i, j] = fields[k, j]
+        for j in range(TERMS):
+            constants[i, j] = constants[k, j]
+    packed = np.empty((FIELDS, _padded(chosen)), depth.dtype)
+    _pack(fields, chosen, packed)
+    return index[:chosen], fields, packed, constants, settings
+
+
+@leaf
+def _pack(fields, n, packed):
+    """The fields [n, 10] by field, and behind them components that are nowhere."""
     for i in range(FIELDS):
         for k in range(n):
             packed[i, k] = fields[k, i]
     pad(packed, n)
-    return index[:n], fields, packed, constants, (prior_weight, prior_mean, epsilon, least)
+
+
+@leaf
+def _farthest(depth):
+    """The largest depth, in four chains of comparisons, which do not wait for each other."""
+    most = np.float64(0)
+    for v in range(depth.shape[0]):
+        row = depth[v]
+        a = b = c = d = row[0]
+        for u in range(0, depth.shape[1] - 3, 4):
+            a, b = row[u] if row[u] > a else a, row[u + 1] if row[u + 1] > b else b
+            c, d = row[u + 2] if row[u + 2] > c else c, row[u + 3] if row[u + 3] > d else d
+        for u in range(depth.shape[1] - depth.shape[1] % 4, depth.shape[1]):
+            a = row[u] if row[u] > a else a
+        most = max(most, np.float64(max(max(a, b), max(c, d))))
+    return most
 
 
 @leaf
@@ -109,7 +149,8 @@ def _visible(mean, covariance, index, whitening, log_peak, K, height, width, lim
         for i in range(6):
             constants[n, i] = fields[n, 3 + i]
         constants[n, 6], constants[n, 7] = fields[n, 9], m[index[k]]
-        constants[n, 8] = features[index[k], features.shape[1] - 1] if features.shape[1] > 0 else 0.0
+        for g in range(min(3, features.shape[1])):
+            constants[n, 8 + g] = features[index[k], features.shape[1] - 1 - g]
         index[n] = index[k]
         n += 1
     return n
@@ -144,13 +185,14 @@ def _meets(mean, covariance, k, square, K, height, width):
 
 
 @leaf
-def cull(packed, n, box, settings, work, kept):
-    """Write the packed components that matter in the box (low, high) to ``kept``; return how many.
+def cull(packed, n, level, box, settings, work, kept):
+    """Write those of the n packed components that matter in the box (low, high) to ``kept``; return how many.
 
+    ``level`` is how many components the level has, whose share of a threshold each may add.
     ``work`` is scratch for 8 numbers and one for each component.
     """
     real = packed.dtype.type
-    _, _, epsilon, least = settings
+    epsilon, least = settings[2], settings[3]
     slack = 16 * np.finfo(packed.dtype).eps
     for i in range(3):
         centre, half = 0.5 * (box[i] + box[3 + i]), 0.5 * (box[3 + i] - box[i])
@@ -158,7 +200,7 @@ def cull(packed, n, box, settings, work, kept):
     work[6], work[7] = slack, least
     upper = work[8:]
     bounds(packed, packed.shape[1], _padded(n), work, upper)
-    threshold = work[7] + real(_limit(epsilon, n))
+    threshold = work[7] + real(_limit(epsilon, level))
     count = 0
     for j in range(n):
         kept[count] = j

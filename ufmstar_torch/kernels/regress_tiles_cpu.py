@@ -16,13 +16,23 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf, part
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull, pad
-from ufmstar_torch.kernels.regress_vectors_cpu import PIXELS, TERMS, TILE, mix, place, read_tile, write_tile
+from ufmstar_torch.kernels.regress_vectors_cpu import (
+    PIXELS,
+    TERMS,
+    TILE,
+    mix,
+    mix_more,
+    mix_three,
+    place,
+    read_tile,
+    write_tile,
+)
 from ufmstar_torch.kernels.vectors_cpu import LANES
 
 _SIDE = 4  # tiles of a block
 _TILES = _SIDE * _SIDE
 _BLOCK = TILE * _SIDE  # pixels
-_EVIDENCE, _TOTAL, _LAST = range(3)  # rows of a tile's sums and averages, as `mix` writes them
+_EVIDENCE, _TOTAL, _LAST = range(3)  # rows of a tile's sums and averages, as `mix` writes them, then further features
 
 
 @kernel
@@ -59,10 +69,10 @@ def _scratch(view, out_f):
         Of the tiles: their pixels' rays less that through the middle [2, 64], the depths of one of them [64], points
         [16, 192], boxes and origins [16, 9] in float64, whether they have a pixel, what :func:`place` adds in holes
         [16, 64], and its work [10]. Of lists of components: their fields, work of :func:`cull`, and two lists. Of sums
-        at a tile: what they start with [3], terms and densities of components, the sums [3, 64], and averages of the
-        features but the last.
+        at a tile: what they start with [3], terms and densities of components, the sums [5, 64], averages of the
+        other features, and the values of one of them.
     """
-    n, dtype, more = view[2].shape[1], view[2].dtype, max(out_f.shape[0] - 1, 0)  # n is padded
+    n, dtype, more = view[2].shape[1], view[2].dtype, out_f.shape[0] - _mixed(out_f.shape[0])  # n is padded
     tiles = (
         np.empty((2, PIXELS), dtype), np.empty(PIXELS, dtype), np.empty((_TILES, 3 * PIXELS), dtype),
         np.empty((_TILES, 9)), np.empty(_TILES, np.bool_), np.empty((_TILES, PIXELS), dtype), np.empty(10, dtype),
@@ -73,8 +83,17 @@ def _scratch(view, out_f):
     densities = np.empty((n if more > 0 else 0, PIXELS), dtype)
     return (
         tiles, lists,
-        (start, np.empty((n, TERMS), dtype), densities, np.empty((3, PIXELS), dtype), np.empty((more, PIXELS), dtype)),
+        (
+            start, np.empty((n, TERMS), dtype), densities, np.empty((5, PIXELS), dtype),
+            np.empty((more, PIXELS), dtype), np.empty(n, dtype),
+        ),
     )  # fmt: skip
+
+
+@leaf
+def _mixed(features):
+    """How many of the last features are averaged together with m."""
+    return features if features < 1 else 1 if features < 3 else 3
 
 
 @leaf
@@ -98,14 +117,14 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
                 _blank(v, u, out, out_f)
         if not some:
             continue
-        count = cull(everyone, view[0].size, _union(boxes, seen), view[4], work, in_block)
+        count = cull(everyone, view[0].size, view[4][4], _union(boxes, seen), view[4], work, in_block)
         for i in range(FIELDS):
             for j in range(count):
                 near[i, j] = everyone[i, in_block[j]]
         pad(near, count)
         for tile in range(_TILES):
             if seen[tile]:
-                chosen = cull(near, count, _box(boxes, tile), view[4], work, in_tile)
+                chosen = cull(near, count, count, _box(boxes, tile), view[4], work, in_tile)
                 for j in range(chosen):
                     in_tile[j] = in_block[in_tile[j]]
                 _average(PIXELS, tiles, tile, in_tile, chosen, view, features, sums)
@@ -151,15 +170,15 @@ def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sum
                 z[i] = depth[v, u]
             some = _place((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0)
             if some:
-                count = cull(view[2], view[0].size, _box(tiles[3], 0), view[4], lists[1], kept)
+                count = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], kept)
                 filled = (high - low + LANES - 1) // LANES * LANES
                 _average(filled, tiles, 0, kept, count, view, features, sums)
             for i in range(high - low):
                 out[order[low + i]] = averages[_TOTAL, i] if some else nan
-                for g in range(last):
+                for g in range(more.shape[0]):
                     out_f[g, order[low + i]] = more[g, i] if some else nan
-                if last >= 0:
-                    out_f[last, order[low + i]] = averages[_LAST, i] if some else nan
+                for g in range(more.shape[0], last + 1):
+                    out_f[g, order[low + i]] = averages[_LAST + last - g, i] if some else nan
 
 
 @leaf
@@ -225,17 +244,17 @@ def _blank(v_low, u_low, out, out_f):
 def _average(some, tiles, tile, chosen, count, view, features, sums):
     """As :func:`mix` at the first points of a tile, over ``chosen`` components, with averages of further features."""
     points, boxes, hole = tiles[2], tiles[3], tiles[5]
-    start, terms, densities, averages, more = sums
+    start, terms, densities, averages, more, values = sums
     index, fields, _, constants, _ = view
     _offsets(fields, constants, chosen, count, boxes[tile], terms)
-    mix(terms, count, points[tile], some, start, hole[tile], averages, densities, more.shape[0] > 0)
+    if features.shape[1] < 3:
+        mix(terms, count, points[tile], some, start, hole[tile], averages, densities, more.shape[0] > 0)
+    else:
+        mix_three(terms, count, points[tile], some, start, hole[tile], averages, densities, more.shape[0] > 0)
     for g in range(more.shape[0]):
-        for i in range(PIXELS):
-            more[g, i] = 0
         for j in range(count):
-            _add_feature(averages.dtype.type(features[index[chosen[j]], g]), densities[j], more[g])
-        for i in range(PIXELS):
-            more[g, i] = more[g, i] / averages[_EVIDENCE, i] + hole[tile, i]
+            values[j] = features[index[chosen[j]], g]
+        mix_more(values, count, densities, averages, hole[tile], more[g])
 
 
 @contracted
@@ -253,22 +272,13 @@ def _offsets(fields, constants, chosen, count, box, terms):
         row[TERMS - 1] = k[6] * dx + k[7] * dy + k[8] * dz
 
 
-@contracted
-def _add_feature(value, density, total):
-    """Add what a component's densities [64] add to the sum of one feature."""
-    for i in range(PIXELS):
-        total[i] += density[i] * value
-
-
 @leaf
 def _write(sums, v0, u0, out, out_f):
     """The averages at a tile into the maps."""
     averages, more, last = sums[3], sums[4], out_f.shape[0] - 1
     _copy(averages[_TOTAL], v0, u0, out)
-    for g in range(last):
-        _copy(more[g], v0, u0, out_f[g])
-    if last >= 0:
-        _copy(averages[_LAST], v0, u0, out_f[last])
+    for g in range(out_f.shape[0]):
+        _copy(more[g] if g < more.shape[0] else averages[_LAST + last - g], v0, u0, out_f[g])
 
 
 @leaf

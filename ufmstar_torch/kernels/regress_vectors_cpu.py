@@ -9,7 +9,9 @@ from ufmstar_torch.kernels.vectors_cpu import Lanes, vectors
 
 TILE = 8  # pixels, the side of a tile
 PIXELS = TILE * TILE
-TERMS = 12  # of a component: whitening (6), log2 of the peak, m, last feature, whitened offset of the tile's origin (3)
+# Of a component: whitening (6), log2 of the peak, m, the last three features from the last on, whitened offset of the
+# tile's origin (3).
+TERMS = 14
 
 
 @vectors
@@ -77,6 +79,17 @@ def bounds(code, packed, stride, n, box, upper):
 
 @vectors
 def mix(code, terms, count, points, some, start, hole, sums, densities, keep):
+    """Averages of m and of the last feature (:func:`_mix`)."""
+    _mix(code, terms, count, points, some, start, hole, sums, densities, keep, 1)
+
+
+@vectors
+def mix_three(code, terms, count, points, some, start, hole, sums, densities, keep):
+    """Averages of m and of the last three features (:func:`_mix`)."""
+    _mix(code, terms, count, points, some, start, hole, sums, densities, keep, 3)
+
+
+def _mix(code, terms, count, points, some, start, hole, sums, densities, keep, features):
     """Averages over components at the points of a tile, weighted by their densities.
 
     Args:
@@ -85,26 +98,74 @@ def mix(code, terms, count, points, some, start, hole, sums, densities, keep):
         some: of the points are computed, from the first on; a multiple of a vector's length.
         start: [3] what the prior adds to each sum.
         hole: [64] NaN where there is a hole, else 0.
-        sums: [3, 64] the sum of the densities, the average of m, and that of the last feature; the averages are NaN
-            in a hole.
+        sums: [5, 64] the sum of the densities, the average of m, and those of so many features from the last on; the
+            averages are NaN in a hole.
         densities: [n, 64], written where ``keep`` is True.
+        features: how many.
     """
     with code.loop(some, code.lanes) as i:
         x, y, z = (points.load(i, axis * PIXELS) for axis in range(3))
-        totals = [code.variable(start.one(row)) for row in range(3)]
+        totals = [code.variable(start.one(min(row, 2))) for row in range(2 + features)]
         with code.loop(count) as j:
             at = code.times(j, TERMS)
-            a, b, c, d, e, f, peak, m, last, x0, y0, z0 = (terms.one(at, term) for term in range(TERMS))
+            a, b, c, d, e, f, peak, *averaged, x0, y0, z0 = (
+                terms.one(at, term) for term in (*range(8 + features), TERMS - 3, TERMS - 2, TERMS - 1)
+            )
             p, q, r = a * x + x0, b * x + (c * y + y0), d * x + (e * y + (f * z + z0))
             density = (((peak - p * p) - q * q) - r * r).exp2()
-            for total, part in zip(totals, (density, density * m, density * last), strict=True):
+            for total, part in zip(totals, (density, *(density * value for value in averaged)), strict=True):
                 total.value = total.value + part
             with code.when(keep):
                 densities.store(density, code.plus(code.times(j, PIXELS), i))
         evidence, holes = totals[0].value, hole.load(i)
         sums.store(evidence, i)
-        for row in (1, 2):
+        for row in range(1, 2 + features):
             sums.store(totals[row].value.over(evidence) + holes, i, row * PIXELS)
+
+
+@vectors
+def mix_more(code, values, count, densities, sums, hole, averages):
+    """The averages [64] of one more feature, of which the components have ``values`` [n].
+
+    ``densities`` and ``sums`` are those of :func:`mix`, for ``count`` components.
+    """
+    rows = range(0, PIXELS, code.lanes)
+    totals = [code.variable(sums.load(row) * 0.0) for row in rows]
+    with code.loop(count) as j:
+        value, at = values.one(j), code.times(j, PIXELS)
+        for row, total in zip(rows, totals, strict=True):
+            total.value = total.value + densities.load(at, row) * value
+    for row, total in zip(rows, totals, strict=True):
+        averages.store(total.value.over(sums.load(row)) + hole.load(row), row)
+
+
+@vectors
+def add_shares(code, fields, stride, n, point, row, density, added):
+    """Add the row of a point, in shares by which components explain it, to the rows of the components.
+
+    Args:
+        fields: [10, stride] of the components: mean, whitening, log2 of the peak.
+        n: of them, a multiple of a vector's length.
+        point: [3].
+        row: [4], of which the last is the prior's weight.
+        density: [n] scratch.
+        added: [3, stride] the components' rows.
+    """
+    at = [point.one(axis) for axis in range(3)]
+    total = code.variable(at[0] * 0.0)
+    with code.loop(n, code.lanes) as j:
+        given = [fields.load(code.plus(j, code.times(stride, i))) for i in range(10)]
+        (x, y, z), (a, b, c, d, e, f) = (one - mean for one, mean in zip(at, given[:3], strict=True)), given[3:9]
+        p, q, r = a * x, b * x + c * y, d * x + (e * y + f * z)
+        value = (((given[9] - p * p) - q * q) - r * r).exp2()
+        density.store(value, j)
+        total.value = total.value + value
+    evidence = total.value.everywhere(Lanes.__add__) + row.one(3)
+    shares = [row.one(axis).over(evidence) for axis in range(3)]
+    with code.loop(n, code.lanes) as j:
+        for axis, share in enumerate(shares):
+            place = code.plus(j, code.times(stride, axis))
+            added.store(added.load(place) + density.load(j) * share, place)
 
 
 @vectors

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Evidence, before_regression
+from ufmstar_torch.anchors.hook import AnchorInput, Evidence
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
@@ -39,8 +39,8 @@ from ufmstar_torch.step import StepObserver, after_regress, frame_statistics
 
 Floats = NDArray[np.floating[Any]]
 _NAMES = tuple(field.name for field in fields(GaussianMixture))
-_COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels", "unmeasured")
-_COUNTS += ("anchors", "anchors_used")
+_COUNTS: tuple[str, ...] = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
+_COUNTS += ("unmeasured", "anchors", "anchors_used")
 
 
 class _Pairs(NamedTuple):
@@ -82,10 +82,9 @@ def step(
     after = first, started, frames, skipped = tuple(map(np.empty_like, before))
     mean_cam, covariance_cam = np.empty(slots[0].shape), np.empty(slots[1].shape)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    # Anchors and the neighbourhood look at every component.
-    narrow = config.regression == "exact" and not config.anchored
+    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchored else 1.0)
     ratio = float("inf") if config.occlusion_depth is None else config.occlusion_depth
-    reach, depth = (config.prior_weight, EPSILON[frame.depth.dtype] if narrow else 0.0, ratio), array(frame.depth)
+    reach, depth = (config.prior_weight, least if config.regression == "exact" else 0.0, ratio), array(frame.depth)
     given = (camera, before, after, slots[:3], segments[:3], depth, thresholds, reach, mean_cam, covariance_cam)
     with kernel("correspond"):
         pairs = [_Pairs(*found) for found in each(match, [(b, *given) for b in streams])]
@@ -96,18 +95,18 @@ def step(
     updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
     regressed = (
         _grown(mean_cam, capacity), _grown(covariance_cam, capacity), np.empty(updated[2].shape),
-        np.empty(updated[2].shape), np.empty((*updated[2].shape, config.features + 1)),
+        np.empty(updated[2].shape), np.empty((*updated[2].shape, config.features + (3 if config.anchored else 1))),
     )  # fmt: skip
     stated = config.prior_mean if config.unmeasured == "prior" else -1.0
     settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps), stated
-    given = present, first, slots, updated, (*segments[:3], segments[5])
+    fused = present, first, slots, updated, (*segments[:3], segments[5])
     with kernel("fuse"):
         distances = [_distance(b, pair, segments, regressed, config) for b, pair in enumerate(pairs)]
         joining = zip(streams, pairs, distances, strict=True)
         joined = each(
             join,
             [
-                (b, *given, pair[:3], d, pair.new, pair.occupied, pair.near, settings, regressed)
+                (b, *fused, pair[:3], d, pair.new, pair.occupied, pair.near, settings, regressed)
                 for b, pair, d in joining
             ],
         )
@@ -120,17 +119,22 @@ def step(
     totals = np.zeros((len(_COUNTS), len(streams)), np.int64)
     counts = dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))
     if config.anchored:
-        mixture_cam, share = mixture_cam.replace(features=features[..., :-1]), features[..., -1:]
-        evidence, used, mixture_cam, stream = before_regression(evidence, mixture_cam, frame, anchors, config, learn)
-        mixture_cam = mixture_cam.replace(features=torch.cat([mixture_cam.features, share], -1))
-        counts["anchors_used"].copy_(used)
+        learnt = learn(evidence, mixture_cam, frame, anchors, config, joined)
+        features[..., -3:-1] = learnt.beyond  # before the share that was measured, as `before_regression` has them
+        evidence, stream = learnt.evidence, learnt.stream
+        counts["anchors_used"].copy_(learnt.used)
     if anchors is not None:
         counts["anchors"].copy_(anchors.valid.sum(1))
     stage("append")
 
     with kernel("regress_image"):
         result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, joined)
-    result, residual, measured = after_regress(result, stream, frame, config, pixels)
+    if stream is not None:
+        result.features[..., -3:-1] += stream.to(frame.depth.dtype).view(-1, *[1] * (result.features.dim() - 2), 2)
+    result, _, measured = after_regress(result, None, frame, config, pixels)
+    residual = None
+    if stream is not None:
+        residual, result = result.features[..., -2:], replace(result, features=result.features[..., :-2])
     stage("regress")
 
     disagreement, smoothed = result.disagreement, state.smoothed

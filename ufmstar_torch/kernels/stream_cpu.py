@@ -98,9 +98,9 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
         near: the slots within reach [n] of :func:`match`.
         settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`; the disagreement [m^2] of what was seen from one
             view, negative for its own.
-        regressed: mean, covariance, weight, disagreement and features [B, K, ...] for the regression, one feature more
-            (``unmeasured.before_regression``). Its mean and covariance are those of :func:`match`; what has changed is
-            written, and the rest of the fields.
+        regressed: mean, covariance, weight, disagreement and features [B, K, ...] for the regression, the last feature
+            as ``unmeasured.before_regression``, others behind the mixture's own unset. Its mean and covariance are
+            those of :func:`match`; what has changed is written, and the rest of the fields.
 
     Returns:
         The slots within reach, with those of the new components, and how many components the mixture has.
@@ -133,7 +133,7 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
         regressed[3][b, k] = disagreement[k] if seen_again or stated < 0 else stated
         for f in range(last):
             more[k, f] = features[k, f]
-        more[k, last] = 1.0 if seen_again else 0.0
+        more[k, more.shape[1] - 1] = 1.0 if seen_again else 0.0
     components = occupied - dropped
     for c in range(new.size):
         components += new[c]

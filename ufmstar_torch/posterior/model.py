@@ -20,7 +20,7 @@ class Model(NamedTuple):
         hat: variance of a hat, times the amplitude.
         prior, drift: standard deviation of the coefficients of 1, log d, u and v before the first anchor, and of their
             change from frame to frame: those of the true error on tours.
-        inflation: factor of the field's variance and the roughness: what the outliers add is counted apart.
+        inflation: factor of the field's variance and the roughness; what outliers add is counted apart.
         common: variance of y that all nodes share: the scale of the poses.
         limit: largest distance from evidence that counts.
         growth: variance of y by distance from evidence, beyond what held-out anchors show: they lie where there is
