@@ -139,41 +139,6 @@ def candidate(component_cam, K, size, near):
     return (mean, cov) if inside else None
 
 
-def seen_depth(depth, valid, side=16):
-    """Largest depth of every block of side x side pixels; infinite where less than half of its pixels have one."""
-    rows, columns = -(-depth.shape[0] // side), -(-depth.shape[1] // side)
-    out = np.full((rows, columns), np.inf)
-    for row in range(rows):
-        for column in range(columns):
-            part = slice(row * side, (row + 1) * side), slice(column * side, (column + 1) * side)
-            if 2 * valid[part].sum() >= valid[part].size:
-                out[row, column] = depth[part][valid[part]].max()
-    return out
-
-
-def hidden(g, seen, K, ratio, prior_weight, side=16):
-    """Whether a component of the camera frame lies behind what the blocks see, or projects nowhere into the image.
-
-    The outline of (x - mu)^T S^-1 (x - mu) = r^2 is the conic whose dual is K (r^2 S - mu mu^T) K^T =: C; the lines
-    u = const that touch it have C_33 u^2 - 2 C_13 u + C_11 = 0.
-    """
-    peak = g["weight"] / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(g["cov"]))
-    r2 = max(2 * np.log(peak / (1e-9 * prior_weight)), 0.0)
-    z = g["mean"][2]
-    near = z - np.sqrt(r2 * g["cov"][2, 2])
-    if near <= 0:
-        return False
-    C, spans = K @ (r2 * g["cov"] - np.outer(g["mean"], g["mean"])) @ K.T, []
-    for axis in (0, 1):
-        spans.append(sorted(np.roots([C[2, 2], -2 * C[axis, 2], C[axis, axis]]).real))
-    met = [-np.inf]
-    for row, column in np.ndindex(seen.shape):
-        low = np.array([column, row]) * side - 0.5
-        if all(spans[i][0] <= low[i] + side and spans[i][1] >= low[i] for i in (0, 1)):
-            met.append(seen[row, column])
-    return bool(near > max(met) and z > ratio * max(met))
-
-
 def correspond(previous_cam, current_cam, K, size, eta, eta_occl, near):
     """For every c the list of matched k, and the overlaps."""
     projected = [candidate(k, K, size, near) for k in previous_cam]

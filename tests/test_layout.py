@@ -17,7 +17,7 @@ HEAVY = ("torch", "lightning", "torchvision", "kornia", "matplotlib", "torchmetr
 HEAVY += ("numba",)
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
 REFERENCE = ("gaussian", "camera", "segment", "correspond", "disagree", "fuse", "regress", "mixture", "step", "frame")
-REFERENCE += ("anchors", "evidence", "hook", "output", "state", "fixed_order", "merge", "occlude")
+REFERENCE += ("anchors", "evidence", "hook", "output", "state", "fixed_order", "merge")
 
 
 def layer_of(path: Path) -> str:
@@ -125,8 +125,6 @@ def test_kernels_import_back_only_plain_types():
         "GLOBALS",
         "FEATURES",
         "RATIOS",
-        "BLOCK",
-        "NEGLIGIBLE",
     }
     for path in (ROOT / "ufmstar_torch" / "kernels").glob("*_cpu.py"):
         if path.stem in ("step_cpu", "anchors_cpu"):

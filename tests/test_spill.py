@@ -179,19 +179,6 @@ def test_a_folder_of_another_version_is_an_error(name, text, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == [name], "nothing was written"
 
 
-def test_what_is_hidden_stays_out_and_changes_no_component(tmp_path):
-    """With occlusion_depth: as with everything in memory to the last bit, with fewer pages read than without."""
-    r = UfMStarConfig(occlusion_depth=1.5)
-    plain, expected, _ = walk(r)
-    ufm, maps, counts = walk(r.replace(max_components=LIMIT, spill=str(tmp_path)))
-    assert torch.equal(rows(ufm), rows(plain)), "to the last bit"
-    for ours, theirs in zip(maps, expected, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-7, equal_nan=True)
-    paper, _, more = walk(UfMStarConfig(max_components=LIMIT, spill=MEMORY))
-    print(ufm.spilled, paper.spilled, sum(counts), sum(more))
-    assert ufm.spilled.read < paper.spilled.read
-
-
 @pytest.mark.parametrize("values", [{"spill": "x"}, {"spill": "", "max_components": 5}])
 def test_a_folder_needs_a_limit(values):
     with pytest.raises(ValueError, match="spill needs a folder or 'memory', and max_components"):

@@ -29,7 +29,6 @@ CONFIGS = {
         segment=SMALL, features=2, max_components=12, initial_capacity=3, unmeasured="nan", aleatoric_in_moments=True
     ),
     "anchored": UfMStarConfig(segment=SMALL, anchored=True, unmeasured="prior", prior_mean=0.2),
-    "hidden": UfMStarConfig(segment=SMALL, occlusion_depth=1.0),
 }
 
 

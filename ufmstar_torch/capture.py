@@ -138,7 +138,6 @@ def _require_fixed(ufm: UfMStar) -> None:
             config.anchored or config.overlap_weighted or config.regression != "exact" or bool(config.merge)
         ),
         "disagreement='w2'": config.disagreement != "w2",
-        "no occlusion_depth": config.occlusion_depth is not None,
         "no features": bool(config.features),
     }
     if missing := [text for text, bad in wrong.items() if bad]:

@@ -154,8 +154,6 @@ class UfMStarConfig(Checked):
         aleatoric_in_moments: add the network's variance per pixel to the Gaussians' covariance
         eta: overlap from which on two Gaussians correspond
         eta_occlusion: overlap with a nearer Gaussian from which on a Gaussian counts as hidden
-        occlusion_depth: multiple of the depth seen where a Gaussian projects to, beyond which it counts as hidden too;
-            null = only a nearer Gaussian hides
         near_plane: Gaussians nearer to the camera are not in view
         overlap_weighted: weight a fusion by the overlap of its Gaussians
         disagreement: between views: squared 2-Wasserstein distance (w2), or squared depth difference where both
@@ -195,8 +193,6 @@ class UfMStarConfig(Checked):
     # Correspondence (section "Multiview Gaussian Correspondence")
     eta: float = number(0.5, "eta", "1", 0.0, 1.0, open_low=True)
     eta_occlusion: float = number(0.7, "eta_occl", "1", 0.0, 1.0, open_low=True)
-    # An extension, not in the paper (``occlude``)
-    occlusion_depth: float | None = number(None, "r_occl", "of the depth", 1.0)
     near_plane: float = number(0.05, "z_near", "m", 0.0, open_low=True)
 
     # Fusion (section "Multiview Fusion")

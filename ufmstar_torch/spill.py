@@ -8,10 +8,8 @@ that it may reach is read back. A component is within reach of a frame where
 - its density may exceed 1e-9 of the prior's weight at a point of the depth map: then the regression reads it.
 
 Both are decided by axis-aligned boxes against the planes of the viewing pyramid, which can only say "reached" too
-often. With ``config.occlusion_depth`` what is hidden (``occlude``) is out of reach too, of which a page is certain
-where the box around its components is. So matching and fusion are those of a mixture that was never written out, to the
-last bit, and the map differs by rounding; components stand in another order. What lies in cubes within reach of one
-frame is kept even beyond the limit.
+often. So matching and fusion are those of a mixture that was never written out, to the last bit, and the map differs by
+rounding; components stand in another order. What lies in cubes within reach of one frame is kept even beyond the limit.
 
 The work of a frame depends on what is in memory and what it reads back: pages are looked up in a tree of boxes
 (``spill_index``), and a journal keeps what changed (``spill_store``). Streams are independent; each has its own limit
@@ -33,8 +31,7 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.occlude import BLOCK, NEGLIGIBLE, seen_depth
-from ufmstar_torch.spill_index import CELL, Page, PageIndex, Screen, View
+from ufmstar_torch.spill_index import CELL, Page, PageIndex, View
 from ufmstar_torch.spill_store import Change, Folder, Memory
 from ufmstar_torch.state import UfMStarState
 
@@ -42,6 +39,7 @@ MEMORY = "memory"
 _COLUMNS = ("mean", "covariance", "weight", "disagreement", "count", "features", "evidence")
 _CUBE = CELL / 8  # [m] edge of the cubes whose components share a page
 _KEPT = 0.75  # share of the limit that is left after writing out
+_NEGLIGIBLE = 1e-9  # density at a point, in units of the prior's weight
 
 
 @dataclass(frozen=True)
@@ -249,7 +247,7 @@ def _boxes(rows: NDArray, config: UfMStarConfig) -> NDArray:
     """[n, 2, 2, 3] the means as boxes, and the boxes outside of which a component's density is negligible [m]."""
     mean, covariance, weight = rows[:, :3], rows[:, 3:12].reshape(-1, 3, 3), rows[:, 12]
     log_peak = np.log(weight) - 1.5 * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(covariance)[1]
-    square = np.maximum(2 * (log_peak - math.log(NEGLIGIBLE * config.prior_weight)), 0.0)
+    square = np.maximum(2 * (log_peak - math.log(_NEGLIGIBLE * config.prior_weight)), 0.0)
     half = np.sqrt(square[:, None] * np.einsum("kii->ki", covariance)) * (1 + 1e-6)
     return np.stack([mean, mean, mean - half, mean + half], 1).reshape(-1, 2, 2, 3)
 
@@ -266,7 +264,4 @@ def _view(state: UfMStarState, frame: FrameInput, b: int, config: UfMStarConfig)
     depth = torch.where(frame.valid[b], frame.depth[b], 0.0).max()
     near, far = [0, 0, 1, -config.near_plane * (1 - 1e-6)], [0, 0, -1, float(depth) * (1 + 1e-6)]
     planes = [np.array([*sides, *rest], dtype=np.float64) @ move for rest in ([near], [[0, 0, 1, 0], far])]
-    if config.occlusion_depth is None:
-        return View(planes[0], planes[1])
-    seen = seen_depth(frame.depth[b : b + 1], frame.valid[b : b + 1])[0].cpu().numpy()
-    return View(planes[0], planes[1], Screen(move[:3], K.numpy(), seen, BLOCK, config.occlusion_depth))
+    return View(*planes)

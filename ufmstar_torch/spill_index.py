@@ -35,60 +35,21 @@ class Page:
     boxes: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Screen:
-    """What a frame sees, behind which components are hidden (``occlude``).
-
-    Attributes:
-        motion: [3, 4] from the frame of the boxes into the camera's.
-        intrinsics: [3, 3] [px].
-        seen: [h, w] the depth that every block of pixels sees [m].
-        side: of a block [px].
-        ratio: ``config.occlusion_depth``.
-    """
-
-    motion: NDArray[np.float64]
-    intrinsics: NDArray[np.float64]
-    seen: NDArray[np.float64]
-    side: int
-    ratio: float
-
-    def hides(self, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[n] True where all that lies in boxes [n, 2, 2, 3] is hidden, or projects nowhere into the image."""
-        corner = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(8, 1, 1, 3)
-        corners = np.where(corner, boxes[:, :, 1], boxes[:, :, 0]) @ self.motion[:, :3].T + self.motion[:, 3]
-        mean_z, near = corners[:, :, 0, 2].min(0), corners[:, :, 1, 2].min(0)
-        x = corners[:, :, 1, :2] / np.maximum(corners[:, :, 1, 2:], 1e-9)  # [8, n, 2]
-        K, met = self.intrinsics, []
-        for axis, blocks in ((0, self.seen.shape[1]), (1, self.seen.shape[0])):
-            pixel, block = K[axis, axis] * x[..., axis] + K[axis, 2], np.arange(blocks)
-            low, high = (pixel.min(0) + 0.499) / self.side, (pixel.max(0) + 0.501) / self.side
-            met.append((block + 1 >= low[:, None]) & (block <= high[:, None]))
-        rows = np.where(met[0][:, None], self.seen, -np.inf).max(-1)  # [n, h]
-        depth = np.where(met[1], rows, -np.inf).max(-1) * (1 + 1e-9)
-        return np.asarray((near > 1e-6) & (near > depth) & (mean_z > self.ratio * depth))
-
-
 @dataclass(frozen=True)
 class View:
-    """What a frame can reach: half spaces n . x + d >= 0, all of which a point within reach satisfies.
+    """What a frame can reach, as half spaces n . x + d >= 0, all of which a point within reach satisfies.
 
     Attributes:
         matching: [P, 4] (n, d) around the means that may project into the image.
         density: [Q, 4] around the points of the depth map.
-        screen: what hides the rest; None = nothing.
     """
 
     matching: NDArray[np.float64]
     density: NDArray[np.float64]
-    screen: Screen | None = None
 
     def reaches(self, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """[n] False where a page with boxes [n, 2, 2, 3] lies outside, or is hidden, for certain."""
-        reached = _meets(boxes[:, 0], self.matching) | _meets(boxes[:, 1], self.density)
-        if self.screen is not None and reached.any():
-            reached[reached] = ~self.screen.hides(boxes[reached])
-        return reached
+        """[n] False where a page with boxes [n, 2, 2, 3] lies outside for certain."""
+        return _meets(boxes[:, 0], self.matching) | _meets(boxes[:, 1], self.density)
 
 
 class _Node:

@@ -28,7 +28,6 @@ from ufmstar_torch.disagree import with_overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import pixel_footprint, storage_floor
 from ufmstar_torch.mixture import GaussianMixture
-from ufmstar_torch.occlude import hidden
 from ufmstar_torch.output import FrameStatistics, StepOutput, given
 from ufmstar_torch.regress import Regression, moving_average
 from ufmstar_torch.segment_input import SegmentInput
@@ -219,11 +218,7 @@ def step(
     mixture = state.mixture
     R_cam, t_cam = relative_pose(first, frame.T_world_cam)
     previous_cam = mixture.to(torch.float64).rigid(R_cam, t_cam)
-    candidates = previous_cam
-    if config.occlusion_depth is not None:
-        weight = previous_cam.weight.masked_fill(hidden(previous_cam, frame, config), 0)
-        candidates = previous_cam.replace(weight=weight)
-    pairs = kernels.correspond(candidates, current_cam, frame.intrinsics, frame.size, config)
+    pairs = kernels.correspond(previous_cam, current_cam, frame.intrinsics, frame.size, config)
     stage("correspond")
 
     if config.disagreement == "overlap":

@@ -60,8 +60,6 @@ class BenchSettings:
             again; a drive straight on, 2 m a frame
         merge: limits of merging (UfMStarConfig.merge) of the long runs, which are run with each; 0 = off
         max_components: likewise limits of the components in memory, the others in a temporary folder; 0 = all in memory
-        occlusion_depth: likewise multiples of the depth seen beyond which components are hidden
-            (UfMStarConfig.occlusion_depth); 0 = the paper's rule alone
         anchors: also time the tracker of this many corners at 640 x 480 and the step with as many anchors, both on one
             thread (300 without a number; needs OpenCV)
         skip_compile: do not time compilation (some tens of seconds)
@@ -86,7 +84,6 @@ class BenchSettings:
     world: tuple[str, ...] = field(default=("room",), metadata={"choices": ("room", "building", "drive")})
     merge: tuple[float, ...] = (0.0,)
     max_components: tuple[int, ...] = (0,)
-    occlusion_depth: tuple[float, ...] = (0.0,)
     anchors: int | None = field(default=None, metadata={"const": _TARGET_CORNERS})
     skip_compile: bool = False
     device: str = "cpu"
@@ -101,10 +98,6 @@ class BenchSettings:
             raise ValueError(f"--merge must be limits of at least 0, got {list(self.merge)}")
         if not self.max_components or min(self.max_components) < 0:
             raise ValueError(f"--max-components must be limits of at least 0, got {list(self.max_components)}")
-        if not self.occlusion_depth or any(0 != value < 1 for value in self.occlusion_depth):
-            raise ValueError(
-                f"--occlusion-depth must be 0 or multiples of at least 1, got {list(self.occlusion_depth)}"
-            )
         if min(self.sizes) < 16:
             raise ValueError(f"--sizes must be at least 16 pixels, got {list(self.sizes)}")
 
@@ -197,9 +190,8 @@ def _growth(
     worlds = {"room": (source, config), "building": (building, config), "drive": (street, far)}
     chosen = {name: worlds[name] for name in options.world}
     return measure_growth(
-        chosen, options.merge, options.max_components, options.occlusion_depth, size=_TARGET_SIZE, frames=options.long,
-        progress=progress,
-    )  # fmt: skip
+        chosen, options.merge, options.max_components, size=_TARGET_SIZE, frames=options.long, progress=progress
+    )
 
 
 def _inputs(options: BenchSettings) -> tuple[Any, Any]:

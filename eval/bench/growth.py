@@ -86,36 +86,30 @@ def measure_growth(
     worlds: dict[str, tuple[FrameSource, UfMStarConfig]],
     merge: tuple[float, ...],
     limits: tuple[int, ...],
-    occlusion: tuple[float, ...] = (0.0,),
     *,
     size: int,
     frames: int,
     window: int = 100,
     progress: Callable[[str], object] = lambda text: None,
 ) -> list[dict[str, Any]]:
-    """Long runs in every world, with every limit of merging, of the components in memory, and rule of what is hidden.
+    """Long runs in every world, with every limit of merging and every one of the components in memory.
 
     Args:
         worlds: frames and config by name.
         merge: values of ``UfMStarConfig.merge``.
         limits: values of ``max_components``, the others in a temporary folder; 0 = all in memory.
-        occlusion: values of ``occlusion_depth``; 0 = the paper's rule alone.
         size, frames, window: see :func:`measure_long_run`; the early window is around frame ``window``.
         progress: is called with a description of what is measured next.
 
     Returns:
-        Of each run "world", "merge", "max_components", "occlusion_depth" and what :func:`measure_long_run` returns.
+        Of each run "world", "merge", "max_components" and what :func:`measure_long_run` returns.
     """
     runs = []
-    for (world, (source, config)), limit, most, beyond in product(worlds.items(), merge, limits, occlusion):
-        progress(
-            f"long run, {world}, {frames} frames, merge {limit:g}, at most {most or 'all'} components in memory, "
-            f"occlusion depth {beyond:g}"
-        )
+    for (world, (source, config)), limit, most in product(worlds.items(), merge, limits):
+        progress(f"long run, {world}, {frames} frames, merge {limit:g}, at most {most or 'all'} components in memory")
         with TemporaryDirectory() as folder:
             spill = {"max_components": most, "spill": folder} if most else {}
-            settings = config.replace(merge=limit, occlusion_depth=beyond or None, **spill)
+            settings = config.replace(merge=limit, **spill)
             run = measure_long_run(source, settings, size=size, frames=frames, early=window, window=window)
-        chosen = {"merge": limit, "max_components": most or None, "occlusion_depth": beyond or None}
-        runs.append({"world": world, **chosen, **run})
+        runs.append({"world": world, "merge": limit, "max_components": most or None, **run})
     return runs

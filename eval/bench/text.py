@@ -118,8 +118,7 @@ def _against(against: Mapping[str, Any]) -> list[str]:
 def _long_run(run: Mapping[str, Any]) -> list[str]:
     lines = [
         f"long run, {run['world']}, {run['size']} x {run['size']}, {run['frames']} frames, merge {run['merge']:g}, at "
-        f"most {run['max_components'] or 'all'} components in memory, "
-        f"occlusion depth {run['occlusion_depth'] or 'off'}: "
+        f"most {run['max_components'] or 'all'} components in memory: "
         f"last steps / early ones = {run['ratio']:.2f} (CPU {run['cpu_ratio']:.2f}), "
         f"{run['memory']['in_use'] / 1e3:.1f} kB in use, {run['memory']['packed'] / 1e3:.1f} kB packed",
         f"  {'frames':>12}{'step [ms]':>11}{'CPU [ms]':>10}{'memory':>8}{'out':>8}{'read':>6}{'in view':>9}"

@@ -7,7 +7,7 @@ from typing import Any
 
 from ufmstar_torch.eval.report.style import Style, finish, label_ends, new_figure
 
-# Runs of one world differ in their limits of merging and of components in memory, and in what is hidden.
+# Runs of one world differ in their limits of merging and of components in memory; without either comes first.
 _STYLES = (Style("#6b6b6b", "^"), Style("#0072B2", "o"), Style("#D55E00", "v"), Style("#009E73", "D"))
 _PANELS = {"components": "components in memory", "step_median_ms": "time of a step [ms], median"}
 
@@ -38,5 +38,4 @@ def draw_growth(runs: Sequence[Mapping[str, Any]]) -> Any:
 def _label(run: Mapping[str, Any]) -> str:
     merge = f"merge {run['merge']:g}" if run["merge"] else ""
     most = f"at most {run['max_components']}" if run["max_components"] else ""
-    hidden = f"occlusion depth {run['occlusion_depth']:g}" if run["occlusion_depth"] else ""
-    return ", ".join(words for words in (merge, most, hidden) if words) or "off"
+    return ", ".join(words for words in (merge, most) if words) or "off"

@@ -95,7 +95,6 @@ SETTINGS = {
     "skip": ("images skipped", ""),
     "eta": ("overlap threshold η", ""),
     "eta_occlusion": ("occlusion threshold η_occl", ""),
-    "occlusion_depth": ("occlusion depth", "of the depth seen"),
     "ema_alpha": ("smoothing α", ""),
     "prior_weight": ("prior weight π₀", "px/m³"),
     "prior_mean": ("prior mean μ₀", "m²"),

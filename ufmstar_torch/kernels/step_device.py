@@ -8,9 +8,8 @@ only the map of the frame before was regressed without it. Growth starts before 
 rare.
 
 What the paper's step does not have (anchors, a subset of pixels, ``config.disagreement == "overlap"``,
-``config.overlap_weighted``, ``config.occlusion_depth``, the neighbourhood) runs as ``step.step`` with the GPU's
-kernels. It grows one frame ahead instead: to slots for all that a frame can segment, so that it reads nothing but the
-count of the frame before.
+``config.overlap_weighted``, the neighbourhood) runs as ``step.step`` with the GPU's kernels. It grows one frame ahead
+instead: to slots for all that a frame can segment, so that it reads nothing but the count of the frame before.
 """
 
 from __future__ import annotations
@@ -113,7 +112,7 @@ class DeviceStep:
         anchors: AnchorInput | None = None,
         observer: StepObserver | None = None,
     ) -> tuple[UfMStarState, StepOutput]:
-        plain = config.disagreement == "w2" and config.regression == "exact" and config.occlusion_depth is None
+        plain = config.disagreement == "w2" and config.regression == "exact"
         if config.anchored or config.overlap_weighted or not plain or pixels is not None or observer is not None:
             state = self._with_room(state, config, ahead=most_kept(SegmentInput.of_frame(frame, config)))
             fixed = replace(config, max_components=state.mixture.capacity)

@@ -7,7 +7,6 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
-from ufmstar_torch.kernels.occlude_cpu import visible
 from ufmstar_torch.kernels.reach_cpu import reached
 from ufmstar_torch.kernels.rigid_cpu import move, relative
 from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
@@ -42,7 +41,7 @@ def match(b, camera, before, after, mixture, segments, depth, thresholds, reach,
         mixture, segments: mean, covariance and weight.
         depth: [B, H, W], 0 where there is none.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
-        reach: prior weight, epsilon of :func:`reached`, and ratio of :func:`visible` (infinite: nothing is hidden).
+        reach: prior weight and epsilon of :func:`reached`.
 
     Returns:
         The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
@@ -67,8 +66,6 @@ def match(b, camera, before, after, mixture, segments, depth, thresholds, reach,
             for j in range(3):
                 turned[k, i, j] = 0.0
     move(motion, mean, covariance, weight, weight.size, chosen, moved, turned)
-    if reach[2] < np.inf:
-        near = visible(near, pi, moved, turned, K, depth[b], reach[2], reach[0])
     c, k, overlap = matches(near, moved, turned, pi, mean_c, cov_c, weight_c, K, *depth.shape[1:], *thresholds)
     new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
