@@ -122,8 +122,8 @@ def learn(
     else:
         given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
         fields = [array(anchors.index), *map(array, given), array(anchors.valid)]
-    given = (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight, frame.intrinsics)
-    doubles = [np.asarray(array(v), np.float64) for v in (*given, evidence.component, evidence.overall)]
+    own = (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight, frame.intrinsics)
+    doubles = [np.asarray(array(v), np.float64) for v in (*own, evidence.component, evidence.overall)]
     settings = (
         frame.size[1], 0.5 ** (1 / config.anchor_half_life), config.anchor_shrinkage, config.prior_weight,
         EPSILON[dtype], dtype == torch.float32,
