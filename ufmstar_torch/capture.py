@@ -63,7 +63,7 @@ class Captured:
             ufm._store(state)
 
     def __call__(self, *frame: Tensor | None) -> UfMStarOutput:
-        """Take in the next frame, given as at the capture.
+        """Process the next frame, given as at the capture.
 
         Raises:
             ValueError: another number of arguments, or a shape or dtype other than at the capture.

@@ -173,7 +173,7 @@ class UfMStarConfig(Checked):
         add_epistemic: add the network's epistemic variance to the result
         anchored: use anchors, sparse measured depths (an extension)
         anchor_half_life: age after which an anchor's evidence counts half
-        anchor_shrinkage: anchors that a Gaussian needs to be believed half
+        anchor_shrinkage: anchors with which a Gaussian's own mean counts half
         posterior: with anchors, also a corrected depth and its variance (UfMStarOutput.posterior)
         merge: loss per pixel up to which two Gaussians are joined; 0 = Gaussians are never merged
         merge_share: share in its own points below which a Gaussian is dissolved in the others

@@ -32,7 +32,7 @@ class UncertainPrediction:
     """A depth prediction with its total variance.
 
     Attributes:
-        prediction: what the network said (for "full": the predictive mean, mean A and E over the members).
+        prediction: the network's output (for "full": the predictive mean, mean A and E over the members).
         ufm: the output of UfM*; ``ufm.variance`` [m^2] is the answer.
         intrinsics: [B, 3, 3] of the predicted depth map [px].
         member: index of the network that was run, or None if all were.

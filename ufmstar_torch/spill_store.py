@@ -87,7 +87,7 @@ class Folder:
             return file.read()
 
     def write(self, name: str, content: bytes) -> None:
-        """Keep a page; its name says its content, so that one that is there needs no second write."""
+        """Keep a page. Its name is a hash of its content, so that a page that exists is not written again."""
         path = os.path.join(self._path, name)
         if not os.path.exists(path):
             self._replace(path, content)

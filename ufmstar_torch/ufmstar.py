@@ -114,7 +114,7 @@ class UfMStar(StatefulModule):
         features: Tensor | None = None,
         anchors: Anchors | None = None,
     ) -> UfMStarOutput:
-        """Take in one predicted depth map per stream and return its variance.
+        """Process one predicted depth map per stream and return its variance.
 
         Args:
             depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype.
@@ -370,7 +370,7 @@ class UfMStar(StatefulModule):
     def _observe(
         self, frame: FrameInput, anchors: Anchors | None, pixels: Tensor | None = None, *, average: bool = True
     ) -> tuple[StepOutput, Tensor, Tensor | None, Posterior | None]:
-        """Take in a frame: run the step and keep its state.
+        """Process a frame: run the step and keep its state.
 
         Args:
             frame: checked.

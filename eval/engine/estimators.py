@@ -49,7 +49,7 @@ class Estimator:
     """Turns the predictions of a sequence, one after the other, into variances; this one remembers nothing."""
 
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
-        """Take in the next frame.
+        """Process the next frame.
 
         Args:
             prediction: [h, w] maps on the estimator's device.

@@ -110,7 +110,7 @@ class RowRunner:
         return Update(self, prediction, truth, T, member, anchors)
 
     def finish(self, frame: Frame, update: Update) -> RowFrame:
-        """Take in the next frame, which :meth:`begin` returned and the estimator has answered.
+        """Process the next frame, which :meth:`begin` returned and the estimator has answered.
 
         Raises:
             FrameError: the estimator refuses the pose or the intrinsics, and the row skips such frames.

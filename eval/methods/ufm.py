@@ -159,7 +159,7 @@ class UfM(StatefulModule):
         epistemic: Tensor | None = None,
         valid: Tensor | None = None,
     ) -> UfMOutput:
-        """Take in one predicted depth map per stream and return its variance.
+        """Process one predicted depth map per stream and return its variance.
 
         Args:
             depth: [B, H, W] or [B, 1, H, W] metric depth along the optical axis [m], any floating dtype.

@@ -49,7 +49,7 @@ class Video:
             raise ValueError(f"{self.path}: the video has no frame that can be decoded")
 
     def __len__(self) -> int:
-        """Frames that the file says it has; a truncated one ends earlier, with :class:`FrameError`."""
+        """Number of frames stated in the file; a truncated file ends earlier, with :class:`FrameError`."""
         return self._length
 
     def read(self, index: int) -> np.ndarray:

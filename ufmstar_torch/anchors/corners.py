@@ -43,7 +43,7 @@ def follow(
             wrong, and those are searched without.
 
     Returns:
-        Positions [N, 2] in ``after`` [px], and which may be believed [N]: found both ways and inside the image.
+        Positions [N, 2] in ``after`` [px], and which are reliable [N]: found both ways and inside the image.
     """
     if expected is None:
         return _there_and_back(before, after, position, position, _LEVELS, back_tolerance)
@@ -67,7 +67,7 @@ def _there_and_back(
     options: dict[str, Any] = {"winSize": _PATCH, "criteria": (3, _ITERATIONS, _CONVERGED), "flags": flags}
     start, guess = (np.array(value, np.float32, order="C").reshape(-1, 1, 2) for value in (position, first))
     forward, result, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, maxLevel=levels, **options)
-    # Back from where it came to, starting where it should arrive: the finest level tells.
+    # Back from where it came to, starting where it should arrive: the finest level decides.
     back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, forward, start.copy(), maxLevel=0, **options)
     gap = np.linalg.norm(back - start, axis=-1)[:, 0]
     height, width = after.shape

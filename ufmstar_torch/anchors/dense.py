@@ -54,7 +54,7 @@ class DenseConfig(Checked):
         sigmas: standard deviations by which measurements may differ, and half width of the search in them.
         match_noise: variance of a match, over that which its residual would make of independent pixels.
         min_share: least share of the pixels with a match on which the views agree. Where fewer do, poses and images
-            contradict each other, and none is believed.
+            contradict each other, and none is used.
         memory: share of the running estimates that remains after a frame.
 
     Raises:
@@ -134,7 +134,7 @@ class DenseEvidence:
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
     ) -> Landmarks:
-        """Take in the next image.
+        """Process the next image.
 
         Args:
             image: [H, W, 3] RGB or [H, W] gray, uint8, undistorted.

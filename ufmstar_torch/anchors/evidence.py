@@ -45,12 +45,12 @@ from ufmstar_torch.fixed_order import total
 # Entries of a row of sums.
 COUNT, BIAS, EXCESS = 0, 1, 2
 SUMS = 3
-# A wrong track stands alone: an anchor is believed where at least SUPPORT of its NEIGHBOURS nearest ones in the image
+# A wrong track stands alone: an anchor is used where at least SUPPORT of its NEIGHBOURS nearest ones in the image
 # have a similar ratio g/d. Not a distance from the frame's median: a network may be wrong by another factor on each
 # surface, and a small region that differs from the rest is what anchors are to find.
 NEIGHBOURS, SUPPORT = 8, 3
 # [px^2] By which an anchor counts as farther away than the one given before it: more than the rounding of a squared
-# distance in an image, less than tells.
+# distance in an image, less than can be distinguished.
 TIE = 1e-6
 # "Similar" is within 2.5 sigma of what neighbours differ by; sigma is from the lower quartile of all such differences,
 # .4506 sigma for normal errors; with 30 % wrong tracks half of the pairs are still clean, so it is not blown up.
@@ -91,7 +91,7 @@ class Evidence:
 def inliers(anchors: AnchorInput) -> Tensor:
     """[B, N] True for valid anchors that enough of their neighbours in the image support.
 
-    With fewer anchors than have neighbours enough to ask, all valid ones are believed.
+    With too few anchors for that many neighbours, all valid ones are used.
     """
     n = anchors.valid.shape[1]
     few = anchors.valid.sum(1, keepdim=True) <= SUPPORT
@@ -164,7 +164,7 @@ def _weight(r2: Tensor, claim: Tensor, supported: Tensor) -> Tensor:
 
 
 def means(evidence: Evidence, shrinkage: float) -> tuple[Tensor, Tensor]:
-    """What is believed of each component beyond the stream, and of the stream.
+    """What was learnt of each component beyond the stream, and of the stream.
 
     Args:
         evidence: so far.

@@ -116,7 +116,7 @@ class Anchors:
 
 @dataclass(frozen=True)
 class AnchorInput:
-    """Checked anchors, and what the frame says where they lie.
+    """Checked anchors, and the frame's values where they lie.
 
     Attributes:
         pixel: [B, N, 2] position (u, v) [px], 0 where not finite.
@@ -194,8 +194,8 @@ def check_anchors(
 ) -> AnchorInput:
     """Anchors of one frame, ready to be used; in float64 on the depth's device.
 
-    An anchor whose values make no sense, that lies beside the image or on a pixel without a depth, or that says nothing
-    (a standard deviation as large as its depth, a depth off from the prediction by a factor of 100), is not valid.
+    An anchor is not valid whose values are impossible, which lies beside the image or on a pixel without a depth, whose
+    standard deviation is as large as its depth, or whose depth is off from the prediction by a factor of 100.
 
     Args:
         anchors: see :class:`Anchors`.

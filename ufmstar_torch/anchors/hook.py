@@ -1,6 +1,6 @@
 """The one place where anchors meet the algorithm: two ends around step 5's single regression.
 
-Before it, a frame's anchors become evidence, and what the evidence says of each component is appended to the
+Before it, a frame's anchors become evidence, and the evidence of each component is appended to the
 mixture's features; after it, those features are taken off the regressed ones again. The rest of the package uses
 anchors through this file only.
 """

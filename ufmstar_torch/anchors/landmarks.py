@@ -44,7 +44,7 @@ class LandmarkSource(Protocol):
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
     ) -> Landmarks:
-        """Take in the next image [H, W, 3] RGB, its pose [4, 4] [m] and its intrinsics [3, 3] [px].
+        """Process the next image [H, W, 3] RGB, its pose [4, 4] [m] and its intrinsics [3, 3] [px].
 
         Raises:
             ValueError: a wrong shape or dtype; the source is as it was then.

@@ -53,7 +53,7 @@ class TrackerConfig:
             ``pixel_noise`` would make: less parallax is no anchor. Not less than needed: what is far away has little
             parallax, and to leave it out would hide the error there.
         min_share: least share of the triangulated tracks that fit, 0 to 1. Where fewer do, poses and image contradict
-            each other, and those that fit do so by chance: none is believed.
+            each other, and those that fit do so by chance: none is used.
 
     Raises:
         ValueError: an impossible value.
@@ -208,7 +208,7 @@ class LandmarkTracker:
     def update(
         self, image: NDArray[np.uint8] | None, T_world_cam: NDArray[np.float64], K: NDArray[np.float64]
     ) -> Landmarks:
-        """Take in the next image.
+        """Process the next image.
 
         Args:
             image: [H, W, 3] RGB or [H, W] gray, uint8.

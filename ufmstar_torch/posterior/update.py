@@ -151,7 +151,7 @@ def update(
     anchors: AnchorInput | None,
     claimed: Tensor,
 ) -> tuple[Tensor, Posterior]:
-    """Take in a frame.
+    """Process a frame.
 
     Args:
         packed: [B, running.SIZE] what was learnt; not modified.
@@ -160,7 +160,7 @@ def update(
         claimed: [B, H, W] V of UfM* without B [m^2], NaN where not valid.
 
     Returns:
-        What is known after the frame, and the posterior. A stream without a usable anchor keeps what it knew.
+        What was learnt up to this frame, and the posterior. A stream without a usable anchor keeps its state.
     """
     given = anchors is not None
     anchors = anchors if anchors is not None and anchors.valid.shape[1] else _none(frame)
