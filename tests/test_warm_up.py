@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import importlib.util
 import json
 import os
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 from numba.core import event
 
 from ufmstar_torch.eval.engine import warm_up as commands
-from ufmstar_torch.kernels import compile_beside
+from ufmstar_torch.kernels import compile_beside, compile_cpu
 from ufmstar_torch.kernels.compile_beside import compiling_beside
 from ufmstar_torch.kernels.compile_cpu import kernel
 from ufmstar_torch.kernels.regress_tiles_cpu import exact
@@ -135,3 +136,21 @@ def test_a_cold_start_compiles_the_regression_beside_and_gives_the_same(tmp_path
     assert cold["variance"] == warm["variance"]
     for result in (cold, warm):
         assert result["steps"] == [[done, 23] for done in range(24)]
+
+
+def test_a_kernel_on_disk_is_outdated_when_another_file_of_the_kernels_changes(tmp_path, monkeypatch):
+    path = tmp_path / "one_kernel.py"
+    path.write_text(
+        "from ufmstar_torch.kernels.compile_cpu import kernel\n\n\n@kernel\ndef plus_one(x):\n    return x + 1\n"
+    )
+
+    def hits() -> int:
+        spec = importlib.util.spec_from_file_location("one_kernel", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        assert module.plus_one(1) == 2
+        return sum(module.plus_one.stats.cache_hits.values())
+
+    assert [hits(), hits()] == [0, 1]
+    monkeypatch.setattr(compile_cpu, "_SOURCES", "of other files")
+    assert [hits(), hits()] == [0, 1]

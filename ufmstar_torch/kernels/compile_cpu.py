@@ -1,13 +1,17 @@
 """How code for the CPU is compiled (numba): kernels, which Python calls, and their parts, which only kernels call.
 
 A kernel is kept on disk. A part is compiled into the kernels that call it and has no interface of its own, which would
-take longer to compile than the part itself; called from Python it is a plain function. Neither numba's cache nor a
-kernel notices a change of these options, nor of a part in another file: delete ``__pycache__`` after one.
+take longer to compile than the part itself; called from Python it is a plain function.
+
+A kernel on disk counts as long as its own file and those whose code and constants are compiled into kernels are the
+same: by itself numba looks at the first alone, and would go on with an outdated part.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from numba import njit
@@ -16,14 +20,29 @@ from numba.extending import register_jitable
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
+def _sources() -> str:
+    """Hash of the files whose code and constants are compiled into kernels."""
+    core, digest = Path(__file__).parents[1], hashlib.sha256()
+    for folder in (core, core / "kernels", core / "posterior"):
+        for file in sorted(folder.glob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+_SOURCES = _sources()
+
+
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile at the first call, and keep the result on disk; in memory alone where no folder can be written to."""
 
     def decorated(function: Callable[..., Any]) -> Any:
         try:
-            return njit(cache=True, **_OPTIONS, **options)(function)
+            compiled = njit(cache=True, **_OPTIONS, **options)(function)
         except RuntimeError:  # numba: "no locator available"
             return njit(**_OPTIONS, **options)(function)
+        file = compiled._cache._cache_file  # no public way to widen what a cached kernel depends on
+        file._source_stamp = (file._source_stamp, _SOURCES)
+        return compiled
 
     return decorated
 
