@@ -65,8 +65,8 @@ def warm_up(
 ) -> None:
     """Take a module through two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
 
-    On a machine's very first call the regression and ``also`` are compiled in a process beside this one, where there
-    are two cores.
+    On a machine's very first call the regression, the image average and ``also`` are compiled in a process beside this
+    one, where there are two cores.
 
     Args:
         module: without frames so far; it is changed.
@@ -89,7 +89,10 @@ def warm_up(
     anchors = None
     if config.anchored:
         anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
-    jobs: list[tuple[str, str, dict[str, Any]]] = [(__name__, "regression", {"kind": config.regression})]
+    jobs: list[tuple[str, str, dict[str, Any]]] = [
+        (__name__, "regression", {"kind": config.regression}),
+        (__name__, "sampling", {}),
+    ]
     jobs += [(function.__module__, function.__qualname__, {}) for function in also]
     with warnings.catch_warnings(), select_beside(config.backend, device.type, jobs) as wait:
         warnings.simplefilter("ignore", UserWarning)  # a small image has no segment
@@ -114,6 +117,15 @@ def regression(kind: str) -> None:
     depth = torch.full((1, 8, 8), _DISTANCE)
     for pixels in (None, torch.zeros(1, 1, dtype=torch.int64)):
         regress_maps(mixture, depth, _camera(8, 8)[None], UfMStarConfig(regression=kind), pixels)
+
+
+def sampling() -> None:
+    """Compile the average over a sample of pixels of single-precision maps, on the CPU."""
+    from ufmstar_torch.kernels.sample_cpu import sample_mean, sample_pixels
+
+    valid = torch.ones(1, 8, 8, dtype=torch.bool)
+    _, used = sample_pixels(valid, 1, 0)
+    sample_mean(torch.zeros(1, 1), used, used, valid.sum((1, 2)))
 
 
 def _camera(height: int, width: int) -> torch.Tensor:
