@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from ufmstar_torch.anchors.hook import Anchors
@@ -65,8 +66,8 @@ def warm_up(
 ) -> None:
     """Take a module through two frames of ``size`` (H, W) and an image average; see ``UfMStar.warm_up``.
 
-    On a machine's very first call the regression, the image average and ``also`` are compiled in a process beside this
-    one, where there are two cores.
+    On a machine's very first call the description of the segments, the regression, the image average and ``also`` are
+    compiled in a process beside this one, where there are two cores.
 
     Args:
         module: without frames so far; it is changed.
@@ -90,6 +91,7 @@ def warm_up(
     if config.anchored:
         anchors = Anchors(torch.zeros(streams, 1, 2, device=device), corner, 1e-4 * corner)
     jobs: list[tuple[str, str, dict[str, Any]]] = [
+        (__name__, "description", {}),  # first: this process needs it soonest
         (__name__, "regression", {"kind": config.regression}),
         (__name__, "sampling", {}),
     ]
@@ -106,6 +108,16 @@ def warm_up(
         for function in also:
             function()
             stages.step()
+
+
+def description() -> None:
+    """Compile what turns segments of single-precision maps into Gaussians, on the CPU."""
+    from ufmstar_torch.kernels.stream_cpu import describe
+
+    none, index = np.empty(0), np.empty(0, np.int64)
+    rounded = np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty(0, np.float32)
+    segments = index, np.empty((0, 1)), index[:, None]
+    describe(segments, rounded, 1.0, 1.0, 1.0, 1.0, np.empty((0, 3)), np.empty((0, 3, 3)), none, index)
 
 
 def regression(kind: str) -> None:
