@@ -134,7 +134,7 @@ def test_the_state_has_the_bits_of_a_sequence_alone(tours):
 
 @pytest.mark.slow
 def test_maps_of_other_sizes_are_another_batch(tours):
-    small = in_memory("tour:9?frames=3&size=48x64", 3, 9)
+    small = in_memory(open_tour("tour:9?frames=3&size=48x64"), slice(None))
     sequences, rows = [tours[0], small, tours[1], small], [row("UfM*-DepthOnly"), row("DepthOnly")]
     bases = {"depth_only": own_depth()}
     alone = evaluate_all(sequences, rows, bases)
