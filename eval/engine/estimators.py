@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,9 +46,10 @@ class Estimate:
     statistics: FrameStatistics | None = None  # of UfM*, [1] per count, or None
 
 
-class Estimator:
+class Estimator(ABC):
     """Turns the predictions of a sequence, one after the other, into variances; this one remembers nothing."""
 
+    @abstractmethod
     def update(self, prediction: Prediction, T_world_cam: Tensor, anchors: Anchors | None = None) -> Estimate:
         """Process the next frame.
 
@@ -56,7 +58,6 @@ class Estimator:
             T_world_cam: [4, 4] float64 camera-to-world [m], on the CPU.
             anchors: [1, N] of the frame in the map's pixels; None = none.
         """
-        raise NotImplementedError
 
     def memory(self) -> dict[str, float]:
         """What is kept for the next frame: "bytes" and "count" of points or components, "smoothing_bytes" of the map

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,7 +85,7 @@ def combined(predictions: Sequence[Prediction]) -> Prediction:
     return Prediction.of(joint, predictions[0].intrinsics, sum(times) if len(times) == len(predictions) else None)
 
 
-class DepthSource:
+class DepthSource(ABC):
     """Where depth comes from: networks, or maps that exist already.
 
     Attributes:
@@ -116,10 +117,10 @@ class DepthSource:
         """What runs the networks, for the record: name, version, threads, precision; None of maps."""
         return None
 
+    @abstractmethod
     def prepared(self, how: str) -> DepthSource:
         """The same source with its images prepared by ``Setting.preprocess``; itself where that is no change. Raises
         ValueError: there are no images to prepare."""
-        raise NotImplementedError
 
     def turn(self, position: int) -> int:
         """The member for the image that a row uses after ``position`` others; 0 for maps."""
@@ -128,9 +129,9 @@ class DepthSource:
     def prepare(self, frame: Frame) -> None:
         """Do ahead of :meth:`one`, in another thread, what can be done before a network runs."""
 
+    @abstractmethod
     def one(self, frame: Frame, n: int) -> Prediction:
         """One timed inference, of member (or sample) n. Raises FrameError: the frame has nothing to predict from."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ time: networks and UfM* then get batches.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -46,7 +47,7 @@ class FrameResult:
     state: Mapping[str, Tensor] = field(default_factory=dict)
 
 
-class FrameSink:
+class FrameSink(ABC):
     """Takes what comes of the frames: metrics, writers, progress. Each defines its own ``take``."""
 
     # Its time stands in ``FrameResult.ms`` under this name for the sinks after it; None = it is not timed.
@@ -55,9 +56,9 @@ class FrameSink:
     def begin(self, stream: FrameStream) -> None:
         """Before the first frame, or the first one after a resume."""
 
+    @abstractmethod
     def take(self, result: FrameResult) -> None:
         """After every frame, skipped ones too. The stream's state is that after the frame."""
-        raise NotImplementedError
 
     def end(self) -> None:
         """After the last frame; not after a stop or an error."""

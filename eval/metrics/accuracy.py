@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
@@ -63,7 +64,7 @@ class Delta1(SumMetric):
         }
 
 
-class _MeanError(SumMetric):
+class _MeanError(SumMetric, ABC):
     """Mean over all pixels of an error, which a subclass defines."""
 
     total: Tensor
@@ -78,8 +79,9 @@ class _MeanError(SumMetric):
         error = self._error(select_pixels(depth, None, target, valid))
         self.add(total=error.sum(), pixels=torch.tensor(error.numel()))
 
+    @abstractmethod
     def _error(self, p: Pixels) -> Tensor:
-        raise NotImplementedError
+        """[N] the error of each pixel."""
 
 
 class AbsRel(_MeanError):

@@ -238,6 +238,7 @@ def vectors(function: Callable[..., None]) -> Any:
 
     names = list(inspect.signature(function).parameters)[1:]
     parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("typing", *names)]
-    typed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    typed.__name__, typed.__doc__ = function.__name__, function.__doc__
-    return intrinsic(typed)
+    described: Any = typed
+    described.__signature__ = inspect.Signature(parameters)
+    described.__name__, described.__doc__ = function.__name__, function.__doc__
+    return intrinsic(described)
