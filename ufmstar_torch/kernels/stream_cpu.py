@@ -105,14 +105,12 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
     mean, covariance, weight, disagreement, count, features = (
         after[0][b], after[1][b], after[2][b], after[3][b], after[4][b], after[5][b],
     )  # fmt: skip
-    _extend(before[0][b], mean)
-    _extend(before[1][b].reshape(-1, 9), covariance.reshape(-1, 9))
-    _extend(before[5][b], features)
-    for k in range(weight.size):
-        old = k < before[2].shape[1]
-        weight[k] = before[2][b, k] if old else 0
-        disagreement[k] = before[3][b, k] if old else 0
-        count[k] = before[4][b, k] if old else 0
+    _extend(before[0][b].reshape(-1), mean.reshape(-1))
+    _extend(before[1][b].reshape(-1), covariance.reshape(-1))
+    _extend(before[2][b], weight)
+    _extend(before[3][b], disagreement)
+    _extend(before[4][b], count)
+    _extend(before[5][b].reshape(-1), features.reshape(-1))
     moved, turned = np.zeros(mean_c.shape), np.zeros(cov_c.shape)
     move(relative(present[b], first[b]), mean_c, cov_c, weight_c, moved, turned)
     slots, given = (mean, covariance, weight, disagreement, count, features), (moved, turned, weight_c, features_c)
@@ -145,10 +143,11 @@ def _at(values, index):
 
 @part
 def _extend(before, after):
-    """Copy the slots [K, n], and fill the others with zeros."""
-    for k in range(after.shape[0]):
-        for i in range(after.shape[1]):
-            after[k, i] = before[k, i] if k < before.shape[0] else 0
+    """Copy numbers, and fill those behind them with zeros."""
+    for i in range(before.size):
+        after[i] = before[i]
+    for i in range(before.size, after.size):
+        after[i] = 0
 
 
 @part
