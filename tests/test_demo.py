@@ -318,17 +318,6 @@ def test_rows_of_the_sheet(unfamiliar, expected):
 # ---- what goes wrong ----
 
 
-@pytest.fixture
-def ufmstar(capfd):
-    def call(*words):
-        capfd.readouterr()
-        code = cli.main([str(word) for word in words])
-        printed = capfd.readouterr()
-        return code, printed.out, printed.err
-
-    return call
-
-
 def test_a_folder_of_someone_else_is_left_alone(ufmstar, weights, tmp_path):
     (tmp_path / "summary.json").write_text('{"program": "ufmstar run"}')
     (tmp_path / "contact_sheet.png").write_text("mine")
