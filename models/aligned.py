@@ -9,7 +9,7 @@ from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction, infer, takes_intrinsics
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 
 class AlignedNetwork(DepthNetwork):
@@ -28,9 +28,9 @@ class AlignedNetwork(DepthNetwork):
         self.preprocess = preprocess or Preprocess()
 
     @property
-    def takes_intrinsics(self) -> bool:
-        """Whether the relative network does."""
-        return takes_intrinsics(self.network)
+    def wrapped(self) -> tuple[nn.Module]:
+        """The relative network."""
+        return (self.network,)
 
     @property
     def max_depth(self) -> float | None:

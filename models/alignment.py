@@ -12,7 +12,7 @@ counts as disagreement, and removes the frame-to-frame error of scale that is th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypedDict, Unpack
 
 import torch
@@ -39,15 +39,13 @@ class Alignment(Checked):
         ValueError: another kind, values that are not finite, a scale that is not positive, different shapes.
     """
 
-    kind: str
+    kind: str = field(metadata={"choices": KINDS})
     scale: Tensor
     shift: Tensor
     max_depth: float | None = number(None, "d_max", "m", 0.0, open_low=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.kind not in KINDS:
-            raise ValueError(f"Alignment.kind must be one of {KINDS}, got {self.kind!r}")
         for name in ("scale", "shift"):
             value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
             object.__setattr__(self, name, value)
@@ -61,12 +59,7 @@ class Alignment(Checked):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, exactly."""
-        return {
-            "kind": self.kind,
-            "scale": self.scale.tolist(),
-            "shift": self.shift.tolist(),
-            "max_depth": self.max_depth,
-        }
+        return {**super().to_dict(), "scale": self.scale.tolist(), "shift": self.shift.tolist()}
 
     def depth(self, prediction: Tensor) -> Tensor:
         """Depth [B, H, W] [m]; 0, which UfM* takes as no prediction, where it is not :meth:`valid`.
@@ -142,7 +135,7 @@ class AlignmentSums:
         """
         w, wx, wy, wxx, wxy = self.values.unbind(-1)
         if shift is None:
-            gram = torch.stack([torch.stack([wxx, wx], -1), torch.stack([wx, w], -1)], -2)
+            gram = torch.stack([wxx, wx, wx, w], -1).unflatten(-1, (2, 2))
             theta, determined = solve_normal(gram, torch.stack([wxy, wy], -1))
             scale, offset = theta.unbind(-1)
         else:

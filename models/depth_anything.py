@@ -17,7 +17,7 @@ import torch
 from ufmstar_torch.checked import Checked
 from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face import HuggingFaceDepth, own_preprocess, patch_size, with_alignment
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, patch_size, with_alignment
 from ufmstar_torch.models.hugging_face_files import read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
 
@@ -86,8 +86,7 @@ class DepthAnything(HuggingFaceDepth):
             raise ValueError(f"size must be (height, width) in multiples of the patch, {multiple} px, got {size}")
         if not checkpoint.processor:
             checkpoint = replace(checkpoint, processor=_PROCESSOR)
-        preprocess = own_preprocess(checkpoint, size, keep_aspect)
-        return cls.of_checkpoint(checkpoint, preprocess, dtype=dtype).to(device)
+        return cls.of_checkpoint(checkpoint, HuggingFaceSpec(size=size, keep_aspect=keep_aspect), dtype).to(device)
 
 
 @dataclass(frozen=True)

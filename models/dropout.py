@@ -13,7 +13,7 @@ from ufmstar_torch.models.distribution import DepthDistribution, split_batch
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
-from ufmstar_torch.prediction import DepthPrediction, infer, stated_range, takes_intrinsics
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 SAMPLES = 10  # passes of the paper's multi-inference baseline
 
@@ -122,14 +122,9 @@ class MonteCarloDropout(DepthNetwork):
         return self.network.distribution(image)
 
     @property
-    def takes_intrinsics(self) -> bool:
-        """Whether the network does."""
-        return takes_intrinsics(self.network)
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] Of the network."""
-        return stated_range([self.network])
+    def wrapped(self) -> tuple[DepthNetwork]:
+        """The network."""
+        return (self.network,)
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; with

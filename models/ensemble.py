@@ -15,7 +15,7 @@ from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.pipeline import combine
-from ufmstar_torch.prediction import DepthPrediction, infer, stated_range, takes_intrinsics
+from ufmstar_torch.prediction import DepthPrediction, infer, takes_intrinsics
 
 
 class Ensemble(DepthNetwork):
@@ -40,14 +40,9 @@ class Ensemble(DepthNetwork):
         self.preprocess = expected[0]
 
     @property
-    def takes_intrinsics(self) -> bool:
-        """Whether a member does."""
-        return any(takes_intrinsics(member) for member in self.members)
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] Of all members."""
-        return stated_range(self.members)
+    def wrapped(self) -> Sequence[nn.Module]:
+        """The members."""
+        return list(self.members)
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Mean depth [B, H, W] [m], mean A, and the variance between the members (+ mean E) as E [m^2] of

@@ -7,7 +7,7 @@ every network here; where both exist, they have to agree.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -42,6 +42,32 @@ _METRIC = ("depth_pro", "zoedepth")
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
 
 
+@dataclass(frozen=True)
+class HuggingFaceSpec(Checked):
+    """What is declared about a checkpoint: arguments of :func:`from_hugging_face` for configuration files.
+
+    Attributes:
+        kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"
+            (DPT and MiDaS otherwise) or "affine" (depth up to scale and shift). None = as the configuration or the
+            architecture states, if it does.
+        scale: [m] length of one unit of metric depth.
+        size: (height, width) [px] of the input; None = that of preprocessor_config.json.
+        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
+        preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
+        allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
+            "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
+        alignment: of a relative network, in configuration files only.
+    """
+
+    kind: str | None = None
+    scale: float = 1.0
+    size: tuple[int, int] | None = None
+    keep_aspect: bool | None = None
+    preprocess: Preprocess | None = None
+    allow_missing: tuple[str, ...] = ()
+    alignment: Alignment | None = None
+
+
 class HuggingFaceDepth(DepthNetwork):
     """A transformers depth model; made by :func:`from_hugging_face`.
 
@@ -49,17 +75,13 @@ class HuggingFaceDepth(DepthNetwork):
         raw: the :class:`RawDepth`; ``raw(image)`` is what alignments are fitted to.
         kind: "metric", "inverse" or "affine".
         scale: [m] length of one unit, where metric.
+        max_depth: [m] the ``max_depth`` of a metric checkpoint, of which its output is a share.
     """
 
+    max_depth: float | None = None
+
     def __init__(
-        self,
-        raw: RawDepth,
-        preprocess: Preprocess,
-        kind: str,
-        *,
-        scale: float = 1.0,
-        source: str = "",
-        max_depth: float | None = None,
+        self, raw: RawDepth, preprocess: Preprocess, kind: str, *, scale: float = 1.0, source: str = ""
     ) -> None:
         super().__init__()
         if kind not in (METRIC, *KINDS):
@@ -73,33 +95,23 @@ class HuggingFaceDepth(DepthNetwork):
         self.kind = kind
         self.scale = scale
         self.source = source
-        self._max_depth = max_depth
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] The ``max_depth`` of a metric checkpoint, of which its output is a share."""
-        return self._max_depth
 
     @classmethod
-    def of_checkpoint(
-        cls,
-        checkpoint: Checkpoint,
-        preprocess: Preprocess,
-        *,
-        kind: str | None = None,
-        scale: float = 1.0,
-        allow_missing: Sequence[str] = (),
-        dtype: torch.dtype = torch.float32,
-    ) -> Self:
-        """From a checkpoint that was read; arguments and errors as :func:`from_hugging_face`."""
-        kind = _kind(checkpoint, kind)
-        model, reading = load_model(checkpoint, dtype, allow_missing), _ARCHITECTURES[checkpoint.model_type]
+    def of_checkpoint(cls, checkpoint: Checkpoint, spec: HuggingFaceSpec, dtype: torch.dtype = torch.float32) -> Self:
+        """From a checkpoint that was read, in eval mode; errors as :func:`from_hugging_face`."""
+        kind, preprocess = _kind(checkpoint, spec.kind), spec.preprocess
+        if preprocess is None:
+            preprocess = own_preprocess(checkpoint, spec.size, spec.keep_aspect)
+        elif spec.size is not None or spec.keep_aspect is not None:
+            raise ValueError("preprocess excludes size and keep_aspect, which it contains")
+        model, reading = load_model(checkpoint, dtype, spec.allow_missing), _ARCHITECTURES[checkpoint.model_type]
         if reading is PaddedDepth and not checkpoint.processor.get("do_pad", True):
             reading = RawDepth
         raw = reading(model, patch_size(checkpoint))
-        shares = checkpoint.config.get("depth_estimation_type") == METRIC
-        reach = scale * float(checkpoint.config["max_depth"]) if shares else None
-        return cls(raw, preprocess, kind, scale=scale, source=checkpoint.name, max_depth=reach).eval()
+        network = cls(raw, preprocess, kind, scale=spec.scale, source=checkpoint.name)
+        if checkpoint.config.get("depth_estimation_type") == METRIC:
+            network.max_depth = spec.scale * float(checkpoint.config["max_depth"])
+        return network.eval()
 
     @property
     def is_metric(self) -> bool:
@@ -161,15 +173,7 @@ def from_hugging_face(
 
     Args:
         name_or_dir: "owner/name" on the hub, or a directory with config.json and weights.
-        kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"
-            (DPT and MiDaS otherwise) or "affine" (depth up to scale and shift). None = as the configuration or the
-            architecture states, if it does.
-        scale: [m] length of one unit of metric depth.
-        size: (height, width) [px] of the input; None = that of preprocessor_config.json.
-        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
-        preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
-        allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
-            "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
+        kind, scale, size, keep_aspect, preprocess, allow_missing: see :class:`HuggingFaceSpec`.
         dtype: of the weights; what comes out is float32 in any case (float64 for float64).
         device: where they go; None = the CPU.
         revision: branch, tag or commit on the hub.
@@ -182,29 +186,9 @@ def from_hugging_face(
         FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
         ModuleNotFoundError: transformers is missing.
     """
+    spec = HuggingFaceSpec(kind, scale, size, keep_aspect, preprocess, tuple(allow_missing))
     checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
-    _kind(checkpoint, kind)  # before the weights are downloaded
-    if preprocess is None:
-        preprocess = own_preprocess(checkpoint, size, keep_aspect)
-    elif size is not None or keep_aspect is not None:
-        raise ValueError("preprocess excludes size and keep_aspect, which it contains")
-    network = HuggingFaceDepth.of_checkpoint(
-        checkpoint, preprocess, kind=kind, scale=scale, allow_missing=allow_missing, dtype=dtype
-    )
-    return network.to(device)
-
-
-@dataclass(frozen=True)
-class HuggingFaceSpec(Checked):
-    """Arguments of :func:`from_hugging_face` for configuration files, and the alignment of a relative network."""
-
-    kind: str | None = None
-    scale: float = 1.0
-    size: tuple[int, int] | None = None
-    keep_aspect: bool | None = None
-    preprocess: Preprocess | None = None
-    allow_missing: tuple[str, ...] = ()
-    alignment: Alignment | None = None
+    return HuggingFaceDepth.of_checkpoint(checkpoint, spec, dtype).to(device)
 
 
 def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
@@ -215,12 +199,12 @@ def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None
         spec: :class:`HuggingFaceSpec`, as plain values or a JSON file.
 
     Raises:
-        ValueError: an unknown option, or a relative checkpoint without an alignment; others as
+        ValueError: an unknown option, or a relative network without an alignment; others as
             :func:`from_hugging_face`.
     """
     declared = HuggingFaceSpec.read(spec or {})
-    options = {f.name: getattr(declared, f.name) for f in fields(declared) if f.name != "alignment"}
-    return with_alignment(from_hugging_face(weights, **options), declared.alignment)
+    network = HuggingFaceDepth.of_checkpoint(read_checkpoint(weights), declared)
+    return with_alignment(network, declared.alignment)
 
 
 def with_alignment(network: HuggingFaceDepth, alignment: Alignment | None) -> DepthNetwork:

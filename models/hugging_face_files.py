@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from ufmstar_torch.models.checkpoints import CheckpointError, some
+from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 
 _TO_DOWNLOAD = "with a connection, `hf download NAME --local-dir DIR` fetches it; a directory needs no connection"
 
@@ -44,8 +44,8 @@ class Checkpoint:
         return str(self.config.get("model_type"))
 
 
-def read_checkpoint(name_or_dir: str | Path, revision: str | None, local_files_only: bool) -> Checkpoint:
-    """The configuration of a checkpoint.
+def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_files_only: bool = False) -> Checkpoint:
+    """The configuration of a checkpoint; arguments as ``from_hugging_face``.
 
     Raises:
         FileNotFoundError: a directory is missing, or lacks config.json.
@@ -100,13 +100,12 @@ def load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: Sequen
     from safetensors import SafetensorError
     from transformers import AutoModelForDepthEstimation
 
-    damage = (OSError, ValueError, TypeError, LookupError, RuntimeError, AttributeError, EOFError)
     try:
         with _quiet(checkpoint.folder is not None):
             model, report = AutoModelForDepthEstimation.from_pretrained(
                 checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options
             )
-    except (*damage, UnpicklingError, SafetensorError, StrictDataclassError) as error:
+    except (*DAMAGE, UnpicklingError, SafetensorError, StrictDataclassError) as error:
         raise CheckpointError(
             f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}"
         ) from error

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 from torch import Tensor, nn
 
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, stated_range, takes_intrinsics
 
 
 class DepthNetwork(nn.Module, ABC):
@@ -20,14 +21,19 @@ class DepthNetwork(nn.Module, ABC):
     preprocess: Preprocess
 
     @property
+    def wrapped(self) -> Sequence[nn.Module]:
+        """The networks that this one calls; its declarations below are theirs."""
+        return ()
+
+    @property
     def takes_intrinsics(self) -> bool:
         """Whether it is called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
-        return False
+        return any(takes_intrinsics(network) for network in self.wrapped)
 
     @property
     def max_depth(self) -> float | None:
         """[m] The largest depth that it can predict; None where it is not bounded, or not known."""
-        return None
+        return stated_range(self.wrapped)
 
     @abstractmethod
     def forward(self, image: Tensor) -> DepthPrediction:
