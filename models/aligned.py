@@ -38,12 +38,8 @@ class AlignedNetwork(DepthNetwork):
         return self.alignment.max_depth
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; 0 (no prediction) where
-        the alignment is not possible.
-
-        Raises:
-            ValueError: the network returns another shape.
-        """
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; 0 (no prediction) where the
+        alignment is not possible. Raises ValueError: the network returns another shape."""
         relative = as_map(infer(self.network, image, intrinsics), "the network's relative depth")
         if relative.shape[-2:] != image.shape[-2:]:
             raise ValueError(f"network must return {tuple(image.shape[-2:])} px, got {tuple(relative.shape)}")

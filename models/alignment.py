@@ -93,34 +93,21 @@ class Alignment(Checked):
 
 @dataclass(frozen=True, eq=False)
 class AlignmentFit:
-    """An alignment with what supports it; [] instead of [B] where the images were pooled.
+    """An alignment with what supports it; [] instead of [B] where the images were pooled."""
 
-    Attributes:
-        alignment: the result.
-        points: [B] usable measurements.
-        inliers: [B] those that the final fit used.
-        residual: [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m].
-        sums: to which those of further images can be added.
-    """
-
-    alignment: Alignment
-    points: Tensor
-    inliers: Tensor
-    residual: Tensor
-    sums: AlignmentSums
+    alignment: Alignment  # the result
+    points: Tensor  # [B] usable measurements
+    inliers: Tensor  # [B] those that the final fit used
+    residual: Tensor  # [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m]
+    sums: AlignmentSums  # to which those of further images can be added
 
 
 @dataclass(frozen=True, eq=False)
 class AlignmentSums:
-    """Weighted sums over measurements (x, y), which add up over a stream: ``total = total + fit.sums``.
+    """Weighted sums over measurements (x, y), which add up over a stream: ``total = total + fit.sums``."""
 
-    Attributes:
-        kind: of the alignment.
-        values: [..., 5] sums of w, w x, w y, w x^2, w x y.
-    """
-
-    kind: str
-    values: Tensor
+    kind: str  # of the alignment
+    values: Tensor  # [..., 5] sums of w, w x, w y, w x^2, w x y
 
     def __add__(self, other: AlignmentSums) -> AlignmentSums:
         if self.kind != other.kind:
@@ -128,11 +115,8 @@ class AlignmentSums:
         return AlignmentSums(self.kind, self.values + other.values)
 
     def alignment(self, *, shift: float | None = None, max_depth: float | None = None) -> Alignment:
-        """The weighted least-squares alignment of everything summed; ``shift`` as :func:`fit_inverse_depth`.
-
-        Raises:
-            ValueError: the sums do not determine it, or the scale is not positive.
-        """
+        """The weighted least-squares alignment of everything summed; ``shift`` as :func:`fit_inverse_depth`. Raises
+        ValueError: the sums do not determine it, or the scale is not positive."""
         w, wx, wy, wxx, wxy = self.values.unbind(-1)
         if shift is None:
             gram = torch.stack([wxx, wx, wx, w], -1).unflatten(-1, (2, 2))

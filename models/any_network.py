@@ -49,15 +49,9 @@ class WrappedNetwork(DepthNetwork):
         return self.outputs.max_depth
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
-
-        Args:
-            image: see above.
-            intrinsics: [B, 3, 3] of ``image`` [px], for a network that takes them.
-
-        Raises:
-            ValueError: the network's output is not what was declared, or the intrinsics are missing.
-        """
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with ``intrinsics`` [B, 3, 3]
+        [px] for a network that takes them. Raises ValueError: the network's output is not what was declared, or the
+        intrinsics are missing."""
         result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
         if isinstance(result, DepthPrediction):
             return result
@@ -105,17 +99,9 @@ def wrap_network(
 
 
 def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
-    """A TorchScript file (``torch.jit.save``) as a network, on the CPU. Such a file is a program: load only
-    what you trust.
-
-    Args:
-        path: the file.
-        spec: a :class:`ProgramSpec`, its plain values or a JSON file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not a TorchScript file, or the spec is missing or impossible.
-    """
+    """A TorchScript file (``torch.jit.save``) as a network, on the CPU; ``spec``: a :class:`ProgramSpec`, its plain
+    values or a JSON file. Such a file is a program: load only what you trust. Raises FileNotFoundError: there is no
+    such file; ValueError: it is not a TorchScript file, or the spec is missing or impossible."""
     declared = ProgramSpec.required(spec)
     try:
         program = torch.jit.load(_existing(path), map_location="cpu")

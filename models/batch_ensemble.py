@@ -150,11 +150,7 @@ class BatchEnsemble(DepthNetwork):
         return combine(blocks[: self.members])
 
     def member(self, n: int) -> BatchEnsembleMember:
-        """Member n as a network, with the weights of this one: nothing is copied.
-
-        Raises:
-            IndexError: no such member.
-        """
+        """Member n as a network, with the weights of this one: nothing is copied. Raises IndexError: no such member."""
         return BatchEnsembleMember(self, self._checked(n))
 
     def all_members(self) -> list[BatchEnsembleMember]:
@@ -162,12 +158,8 @@ class BatchEnsemble(DepthNetwork):
         return [self.member(n) for n in range(self.members)]
 
     def folded(self, n: int) -> UncertaintyNetwork:
-        """Member n as a plain network with its own weights W_n: the same function up to rounding, as fast as
-        the network that was converted, and independent of this one.
-
-        Raises:
-            IndexError: no such member.
-        """
+        """Member n as a plain network with its own weights W_n: the same function up to rounding, as fast as the
+        network that was converted, and independent of this one. Raises IndexError: no such member."""
         self._checked(n)
         network = copy.deepcopy(self.network)
         return _replace(network, {layer: layer.plain(n) for layer in converted_layers(network)})
@@ -240,11 +232,8 @@ def _draw(factor: nn.Parameter, init: str, std: float, generator: torch.Generato
 
 
 def _replace(root: Network, new: Mapping[nn.Module, nn.Module]) -> Any:
-    """``root`` with modules replaced wherever its modules keep them, in place; or what replaces ``root``.
-
-    Raises:
-        ValueError: a layer that is no registered part of ``root`` is kept in a plain list or dict.
-    """
+    """``root`` with modules replaced wherever its modules keep them, in place; or what replaces ``root``. Raises
+    ValueError: a layer that is no registered part of ``root`` is kept in a plain list or dict."""
     modules = list(root.modules())
     known = {id(module): new.get(module, module) for module in modules}
     for module in modules:

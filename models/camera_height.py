@@ -29,17 +29,11 @@ _BELOW_HORIZON = math.radians(10)
 
 @dataclass(frozen=True, eq=False)
 class GroundFit:
-    """An alignment with the ground plane it comes from.
+    """An alignment with the ground plane it comes from."""
 
-    Attributes:
-        alignment: one for each image, or a single one if pooled.
-        down_cam: [B, 3] the ground's unit normal, downwards, in the camera frame (x right, y down, z forward).
-        ground: [B, H, W] bool, the pixels taken for ground.
-    """
-
-    alignment: Alignment
-    down_cam: Tensor
-    ground: Tensor
+    alignment: Alignment  # one for each image, or a single one if pooled
+    down_cam: Tensor  # [B, 3] the ground's unit normal, downwards, in the camera frame (x right, y down, z forward)
+    ground: Tensor  # [B, H, W] bool, the pixels taken for ground
 
 
 def align_to_camera_height(

@@ -56,11 +56,9 @@ def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict
 def load_weights(module: nn.Module, path: str | Path) -> None:
     """Fill a module from a file, in place; all keys and shapes have to match.
 
-    Types follow the module's (half-precision weights fill a float32 network).
-
-    Raises:
-        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also where
-            keys are missing or unexpected, shapes differ, or values are not finite. The module is unchanged then.
+    Types follow the module's (half-precision weights fill a float32 network). Raises FileNotFoundError,
+    CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also where keys are missing or unexpected,
+    shapes differ, or values are not finite. The module is unchanged then.
     """
     # A network may itself have a part called "model".
     fill(module, _without_prefixes(_read(Path(path)), keep=set(module.state_dict())), str(path))
@@ -74,14 +72,8 @@ def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str) 
 
 
 def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
-    """Fill a module from tensors, in place; all keys and shapes have to match.
-
-    Args:
-        source: where they come from, for the message.
-
-    Raises:
-        CheckpointError: as :func:`load_weights`.
-    """
+    """Fill a module from tensors, in place; all keys and shapes have to match. Raises CheckpointError as
+    :func:`load_weights`; the message names ``source``, where they come from."""
     expected = module.state_dict()
     shapes = {key: (tuple(state[key].shape), tuple(expected[key].shape)) for key in expected if key in state}
     faults = {
@@ -179,11 +171,8 @@ def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
 
 
 def read_tensors(file: BinaryIO, name: str | Path) -> Any:
-    """What ``torch.save`` wrote into an open file, without running code from it.
-
-    Raises:
-        CheckpointError: it is damaged, or holds more than tensors and plain values; the message has ``name``.
-    """
+    """What ``torch.save`` wrote into an open file, without running code from it. Raises CheckpointError: it is damaged,
+    or holds more than tensors and plain values; the message has ``name``."""
     beginning = file.read(max(map(len, _BEGINNINGS)))
     if not beginning.startswith(_BEGINNINGS):
         raise CheckpointError(f"{name} is damaged or not a file of torch.save: it begins with {beginning[:8]!r}")

@@ -100,16 +100,9 @@ class DepthAnythingSpec(Checked):
 
 
 def load_depth_anything(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
-    """The metric network in a directory, or of a hub name.
-
-    Args:
-        weights: directory or name.
-        spec: :class:`DepthAnythingSpec`, as plain values or a JSON file.
-
-    Raises:
-        ValueError: an unknown option, or a relative checkpoint without an alignment; others as
-            :meth:`DepthAnything.from_pretrained`.
-    """
+    """The metric network in a directory, or of a hub name; ``spec``: :class:`DepthAnythingSpec`, its plain values or a
+    JSON file. Raises ValueError: an unknown option, or a relative checkpoint without an alignment; others as
+    :meth:`DepthAnything.from_pretrained`."""
     declared = DepthAnythingSpec.read(spec or {})
     network = DepthAnything.from_pretrained(weights, size=declared.size, keep_aspect=declared.keep_aspect)
     return with_alignment(network, declared.alignment)

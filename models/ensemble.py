@@ -87,11 +87,8 @@ class LazyMember(DepthNetwork):
         return bool(self._held)
 
     def network(self) -> DepthNetwork:
-        """The network itself, loaded now if it has not been: on the device, or with ``offload`` on the CPU.
-
-        Raises:
-            CheckpointError: it cannot be loaded; the message has its name and the reason.
-        """
+        """The network itself, loaded now if it has not been: on the device, or with ``offload`` on the CPU. Raises
+        CheckpointError: it cannot be loaded; the message has its name and the reason."""
         with self._loading:  # a second thread waits instead of loading it twice
             if not self._held:
                 self._held["network"] = self._placed(self._loaded())
@@ -118,11 +115,8 @@ class LazyMember(DepthNetwork):
         return takes_intrinsics(self.network())
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """What the network returns; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them.
-
-        Raises:
-            CheckpointError: it cannot be loaded.
-        """
+        """What the network returns; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them. Raises
+        CheckpointError: it cannot be loaded."""
         network, device = self.network(), self._where.device
         if not self.offload or device.type == "cpu":
             prediction: DepthPrediction = infer(network, image, intrinsics)

@@ -47,11 +47,8 @@ _POSITIVE: dict[str, tuple[type[nn.Module], float]] = {
 
 @dataclass(frozen=True)
 class FastDepthWidths:
-    """Channels after the encoder's stem and 13 blocks, and after the decoder's 5 layers.
-
-    Raises:
-        ValueError: not 14 and 5 positive numbers, or the widths that a skip adds differ.
-    """
+    """Channels after the encoder's stem and 13 blocks, and after the decoder's 5 layers. Raises ValueError: not 14 and
+    5 positive numbers, or the widths that a skip adds differ."""
 
     encoder: tuple[int, ...]
     decoder: tuple[int, ...]
@@ -82,10 +79,7 @@ class FastDepthWidths:
     @classmethod
     def scaled(cls, multiplier: float) -> FastDepthWidths:
         """:meth:`full` times MobileNet's width multiplier: multiples of 8, never less than .9 of the exact width.
-
-        Raises:
-            ValueError: the multiplier is not positive.
-        """
+        Raises ValueError: the multiplier is not positive."""
         if not 0 < multiplier < float("inf"):
             raise ValueError(f"the width multiplier must be positive, got {multiplier}")
 
@@ -99,11 +93,8 @@ class FastDepthWidths:
 
     @classmethod
     def of_state_dict(cls, state: Mapping[str, Tensor]) -> FastDepthWidths:
-        """The widths of a :class:`FastDepth`'s own state_dict.
-
-        Raises:
-            ValueError: a weight of whose shape a width is read is missing.
-        """
+        """The widths of a :class:`FastDepth`'s own state_dict. Raises ValueError: a weight of whose shape a width is
+        read is missing."""
         count = len(_STRIDES)
         units = [*(f"encoder.{i}.pointwise" for i in range(1, count)), *(f"decoder.{i}.pointwise" for i in range(5))]
         widths = channels_of(state, [f"{unit}.conv.weight" for unit in ("encoder.0", *units)], "FastDepth")
@@ -206,17 +197,9 @@ class FastDepth(Backbone):
         return self.pyramid(image)[0]
 
     def pyramid(self, image: Tensor) -> list[Tensor]:
-        """The outputs of the decoder's layers, full resolution first.
-
-        Args:
-            image: [B, 3, H, W] RGB in [0, 1], H and W multiples of 32.
-
-        Returns:
-            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
-
-        Raises:
-            ValueError: the image has another shape or type.
-        """
+        """The outputs of the decoder's five layers, [B, pyramid_channels[s], H / 2^s, W / 2^s], full resolution first,
+        of ``image`` [B, 3, H, W], RGB in [0, 1]. Raises ValueError: another shape or type, or H or W no multiple of
+        32."""
         require_image(image, MULTIPLE)
         x, skips, maps = image, {}, []
         for i, block in enumerate(self.encoder):
@@ -293,12 +276,9 @@ class FastDepth(Backbone):
 def load_fastdepth(
     weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, positive: str = "relu"
 ) -> FastDepth:
-    """The network in an ONNX export or a state_dict file, with the widths of the file.
-
-    Raises:
-        ValueError: the file does not fit, or ``positive`` contradicts an ONNX export, which ends in a ReLU.
-        FileNotFoundError, ModuleNotFoundError: as :meth:`FastDepth.from_onnx` and ``load_state_dict_file``.
-    """
+    """The network in an ONNX export or a state_dict file, with the widths of the file. Raises ValueError: the file does
+    not fit, or ``positive`` contradicts an ONNX export, which ends in a ReLU; FileNotFoundError, ModuleNotFoundError:
+    as :meth:`FastDepth.from_onnx` and ``load_state_dict_file``."""
     if weights.suffix == ".onnx":
         if positive != "relu":
             raise ValueError(f"an ONNX export of FastDepth ends in a ReLU, got positive={positive!r}")

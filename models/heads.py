@@ -129,11 +129,7 @@ HEADS: dict[str, type[UncertaintyNetwork]] = {
 
 def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
     """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential"; ``scales`` as in
-    :class:`UncertaintyNetwork`.
-
-    Raises:
-        ValueError: another method, or more scales than the backbone has.
-    """
+    :class:`UncertaintyNetwork`. Raises ValueError: another method, or more scales than the backbone has."""
     if method not in HEADS:
         raise ValueError(f"method must be one of {list(HEADS)}, got {method!r}")
     return HEADS[method](backbone, scales)

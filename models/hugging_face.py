@@ -90,11 +90,8 @@ class HuggingFaceDepth(DepthNetwork):
             raise ValueError(f"scale must be positive metres per unit, got {scale}")
         if kind != METRIC and scale != 1:
             raise ValueError(f"scale goes with kind {METRIC!r} only; a relative network gets an Alignment")
-        self.raw = raw
-        self.preprocess = preprocess
-        self.kind = kind
-        self.scale = scale
-        self.source = source
+        self.raw, self.preprocess = raw, preprocess
+        self.kind, self.scale, self.source = kind, scale, source
 
     @classmethod
     def of_checkpoint(cls, checkpoint: Checkpoint, spec: HuggingFaceSpec, dtype: torch.dtype = torch.float32) -> Self:
@@ -119,19 +116,12 @@ class HuggingFaceDepth(DepthNetwork):
         return self.kind == METRIC
 
     def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m], float32, of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
-
-        Raises:
-            ValueError: the network is relative, or the image does not fit.
-        """
+        """Depth [B, H, W] [m], float32, of ``image`` [B, 3, H, W] as ``preprocess`` returns it. Raises ValueError: the
+        network is relative, or the image does not fit."""
         return DepthPrediction(self.required().raw(image) * self.scale)
 
     def required(self) -> Self:
-        """This network.
-
-        Raises:
-            ValueError: it is relative.
-        """
+        """This network. Raises ValueError: it is relative."""
         if not self.is_metric:
             what = "inverse depth" if self.kind == "inverse" else "depth"
             raise ValueError(
@@ -142,11 +132,8 @@ class HuggingFaceDepth(DepthNetwork):
         return self
 
     def aligned(self, alignment: Alignment) -> AlignedNetwork:
-        """The metric network that a relative one becomes by a fixed alignment; the weights are shared.
-
-        Raises:
-            ValueError: this network is metric, or the alignment is for the other kind of output.
-        """
+        """The metric network that a relative one becomes by a fixed alignment; the weights are shared. Raises
+        ValueError: this network is metric, or the alignment is for the other kind of output."""
         if alignment.kind != self.kind:
             raise ValueError(f"alignment must be of the network's kind {self.kind!r}, got {alignment.kind!r}")
         return AlignedNetwork(self.raw, alignment, self.preprocess)
@@ -192,27 +179,17 @@ def from_hugging_face(
 
 
 def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
-    """The metric network in a directory, or of a hub name.
-
-    Args:
-        weights: directory or name.
-        spec: :class:`HuggingFaceSpec`, as plain values or a JSON file.
-
-    Raises:
-        ValueError: an unknown option, or a relative network without an alignment; others as
-            :func:`from_hugging_face`.
-    """
+    """The metric network in a directory, or of a hub name; ``spec``: :class:`HuggingFaceSpec`, its plain values or a
+    JSON file. Raises ValueError: an unknown option, or a relative network without an alignment; others as
+    :func:`from_hugging_face`."""
     declared = HuggingFaceSpec.read(spec or {})
     network = HuggingFaceDepth.of_checkpoint(read_checkpoint(weights), declared)
     return with_alignment(network, declared.alignment)
 
 
 def with_alignment(network: HuggingFaceDepth, alignment: Alignment | None) -> DepthNetwork:
-    """The aligned network, or without an alignment the network itself.
-
-    Raises:
-        ValueError: the network is relative and has no alignment, or is metric and has one.
-    """
+    """The aligned network, or without an alignment the network itself. Raises ValueError: the network is relative and
+    has no alignment, or is metric and has one."""
     if alignment is not None:
         return network.aligned(alignment)
     try:
@@ -225,11 +202,8 @@ def with_alignment(network: HuggingFaceDepth, alignment: Alignment | None) -> De
 def own_preprocess(
     checkpoint: Checkpoint, size: tuple[int, int] | None = None, keep_aspect: bool | None = None
 ) -> Preprocess:
-    """The preprocessing that a checkpoint's image processor describes.
-
-    Raises:
-        ValueError: the description lacks what is needed, or contains what ``Preprocess`` cannot do.
-    """
+    """The preprocessing that a checkpoint's image processor describes. Raises ValueError: the description lacks what is
+    needed, or contains what ``Preprocess`` cannot do."""
     processor, name = checkpoint.processor, checkpoint.name
     unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if processor.get(option)]
     resample = processor.get("resample", _CUBIC)

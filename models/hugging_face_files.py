@@ -22,20 +22,13 @@ _TO_DOWNLOAD = "with a connection, `hf download NAME --local-dir DIR` fetches it
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint whose configuration has been read.
+    """A checkpoint whose configuration has been read."""
 
-    Attributes:
-        name: as given, for messages.
-        folder: None if it comes from the hub.
-        config: config.json.
-        processor: preprocessor_config.json, empty if there is none.
-        options: keyword arguments for every further call of ``transformers``.
-    """
-
-    name: str
-    folder: Path | None
-    config: dict[str, Any]
-    processor: dict[str, Any]
+    name: str  # as given, for messages
+    folder: Path | None  # None if it comes from the hub
+    config: dict[str, Any]  # config.json
+    processor: dict[str, Any]  # preprocessor_config.json, empty if there is none
+    # keyword arguments for every further call of ``transformers``
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -45,14 +38,9 @@ class Checkpoint:
 
 
 def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_files_only: bool = False) -> Checkpoint:
-    """The configuration of a checkpoint; arguments as ``from_hugging_face``.
-
-    Raises:
-        FileNotFoundError: a directory is missing, or lacks config.json.
-        CheckpointError: config.json or preprocessor_config.json cannot be read.
-        OSError: the hub cannot be reached, or has nothing of that name.
-        ModuleNotFoundError: transformers is missing.
-    """
+    """The configuration of a checkpoint; arguments as ``from_hugging_face``. Raises FileNotFoundError: a directory is
+    missing, or lacks config.json; CheckpointError: config.json or preprocessor_config.json cannot be read; OSError: the
+    hub cannot be reached, or has nothing of that name; ModuleNotFoundError: transformers is missing."""
     from transformers import PreTrainedConfig
     from transformers.image_processing_base import ImageProcessingMixin
 

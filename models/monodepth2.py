@@ -153,17 +153,9 @@ class MonodepthResNet(Backbone):
         return self.pyramid(image)[0]
 
     def pyramid(self, image: Tensor) -> list[Tensor]:
-        """The outputs of the decoder's levels, full resolution first.
-
-        Args:
-            image: [B, 3, H, W] normalised as ``preprocess`` does; H and W multiples of 32, at least 64.
-
-        Returns:
-            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
-
-        Raises:
-            ValueError: the image has another shape or type.
-        """
+        """The outputs of the decoder's five levels, [B, pyramid_channels[s], H / 2^s, W / 2^s], full resolution first,
+        of ``image`` [B, 3, H, W], normalised as ``preprocess`` does. Raises ValueError: another shape or type, or H or
+        W no multiple of 32 from 64 on."""
         require_image(image, MULTIPLE, SMALLEST)
         skips = self.encoder(image)
         x, maps = skips.pop(), []
@@ -211,10 +203,7 @@ class MonodepthResNet(Backbone):
 
 def shape_of_state_dict(state: Mapping[str, Tensor]) -> tuple[int, tuple[int, ...]]:
     """(layers, decoder) of the :class:`MonodepthResNet` that a state_dict belongs to; the strides do not show in it.
-
-    Raises:
-        ValueError: a tensor from which they are read is missing.
-    """
+    Raises ValueError: a tensor from which they are read is missing."""
     keys = ["encoder.layer1.0.conv2.weight", *(f"levels.{i}.before.weight" for i in range(LEVELS))]
     _, *decoder = channels_of(state, keys, "MonodepthResNet")
     # Two, or three, blocks of two convolutions in the first stage; or three of three.

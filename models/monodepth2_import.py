@@ -27,17 +27,11 @@ _CONVOLUTION = re.compile(r"decoder\.(\d+)(?:\.conv)?\.conv\.(weight|bias)")
 
 @dataclass(frozen=True)
 class Imported:
-    """What became of the tensors of two files.
+    """What became of the tensors of two files."""
 
-    Attributes:
-        loaded: keys of the network that were filled.
-        skipped: keys of the files that were not used, with the reason.
-        kept: keys of the network that stayed as they were; always its head, since disparity is not depth.
-    """
-
-    loaded: tuple[str, ...]
-    skipped: Mapping[str, str]
-    kept: tuple[str, ...]
+    loaded: tuple[str, ...]  # keys of the network that were filled
+    skipped: Mapping[str, str]  # keys of the files that were not used, with the reason
+    kept: tuple[str, ...]  # keys of the network that stayed as they were; always its head, since disparity is not depth
 
 
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:

@@ -163,16 +163,9 @@ class OnnxNetwork(DepthNetwork):
         return replace(preprocess, size=(height, width))
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] on the image's device.
-
-        Args:
-            image: [B, 3, H, W] RGB as ``preprocess`` returns it.
-            intrinsics: [B, 3, 3] of ``image`` [px], for a graph that takes them.
-
-        Raises:
-            ValueError: the image does not fit the graph's input, the intrinsics are missing, or an output is not as
-                declared.
-        """
+        """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with
+        ``intrinsics`` [B, 3, 3] [px] for a graph that takes them. Raises ValueError: the image does not fit the graph's
+        input, the intrinsics are missing, or an output is not as declared."""
         self._require_fit(image)
         if self.takes_intrinsics and intrinsics is None:
             raise ValueError(f"{self.path} takes intrinsics: call network(x, K), K [B, 3, 3] of its input x")
@@ -249,10 +242,7 @@ def open_session(path: str, threads: int, providers: tuple[str, ...]) -> Inferen
 
 def providers_for(device: torch.device) -> tuple[str, ...]:
     """ONNX Runtime's execution providers on a device, the preferred one first; the processor's where it has no other.
-
-    Raises:
-        ModuleNotFoundError: ``onnxruntime`` is not installed (extra ``models``).
-    """
+    Raises ModuleNotFoundError: ``onnxruntime`` is not installed (extra ``models``)."""
     here, cpu, gpu = _onnxruntime().get_available_providers(), "CPUExecutionProvider", "CUDAExecutionProvider"
     return (gpu, cpu) if device.type == "cuda" and gpu in here else (cpu,)
 

@@ -107,11 +107,8 @@ class Preprocess(Checked):
         return replace(self, resize_height=nyu.resize_height, crop=nyu.crop, size=size, aspect_multiple=None)
 
     def geometry(self, height: int, width: int) -> Geometry:
-        """The sizes of every step for an image of height x width [px].
-
-        Raises:
-            ValueError: the crop is larger than an image that is not resized.
-        """
+        """The sizes of every step for an image of height x width [px]. Raises ValueError: the crop is larger than an
+        image that is not resized."""
         if min(height, width) < 1:
             raise ValueError(f"an image must have at least one pixel, got {height} x {width}")
         ch, cw = self.crop or (0, 0)

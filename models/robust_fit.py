@@ -30,17 +30,11 @@ _RANK = 1e-10
 
 @dataclass(frozen=True)
 class LinearFit:
-    """target = design @ theta on the inliers.
+    """target = design @ theta on the inliers."""
 
-    Attributes:
-        theta: [B, p].
-        inlier: [B, P] points used.
-        determined: [B] whether the inliers fix all p values.
-    """
-
-    theta: Tensor
-    inlier: Tensor
-    determined: Tensor
+    theta: Tensor  # [B, p]
+    inlier: Tensor  # [B, P] points used
+    determined: Tensor  # [B] whether the inliers fix all p values
 
 
 def least_squares(design: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

@@ -56,21 +56,13 @@ class AugmentationConfig(Checked):
 
 @dataclass(frozen=True)
 class Change:
-    """One draw.
+    """One draw."""
 
-    Attributes:
-        scale: zoom factor s.
-        angle: [rad] by which the camera is rolled.
-        flip: mirrored or not.
-        shift: [px] (right, down) of the zoomed content.
-        colour: (kind, factor) in the order of application; kinds as in the config.
-    """
-
-    scale: float = 1.0
-    angle: float = 0.0
-    flip: bool = False
-    shift: tuple[float, float] = (0.0, 0.0)
-    colour: tuple[tuple[str, float], ...] = ()
+    scale: float = 1.0  # zoom factor s
+    angle: float = 0.0  # [rad] by which the camera is rolled
+    flip: bool = False  # mirrored or not
+    shift: tuple[float, float] = (0.0, 0.0)  # [px] (right, down) of the zoomed content
+    colour: tuple[tuple[str, float], ...] = ()  # (kind, factor) in the order of application; kinds as in the config
 
 
 class Augmentation:

@@ -59,11 +59,8 @@ class EpochBatches(Sampler[list[SampleKey]]):
         self.epoch = self.start_batch = 0
 
     def set_epoch(self, epoch: int, start_batch: int = 0) -> None:
-        """What the iterations from now on go over: the batches of ``epoch`` from ``start_batch`` on.
-
-        Raises:
-            ValueError: a number out of range.
-        """
+        """What the iterations from now on go over: the batches of ``epoch`` from ``start_batch`` on. Raises ValueError:
+        a number out of range."""
         if epoch < 0 or not 0 <= start_batch <= len(self):
             raise ValueError(f"epoch must be >= 0 and start_batch in [0, {len(self)}], got {epoch} and {start_batch}")
         self.epoch, self.start_batch = epoch, start_batch

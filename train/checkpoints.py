@@ -42,11 +42,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Replace ``path`` durably.
-
-        Raises:
-            OSError: for example a full disk; the checkpoint before it is kept.
-        """
+        """Replace ``path`` durably. Raises OSError: for example a full disk; the checkpoint before it is kept."""
         target = Path(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(target, lambda file: torch.save(checkpoint, file), durable=True)
@@ -124,11 +120,8 @@ class Stops(pl.Callback):
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint that :class:`Checkpoints` wrote.
-
-    Raises:
-        ResumeError: the file cannot be read, or is another program's.
-    """
+    """A checkpoint that :class:`Checkpoints` wrote. Raises ResumeError: the file cannot be read, or is another
+    program's."""
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, KeyError, UnpicklingError, zipfile.BadZipFile, ValueError) as error:

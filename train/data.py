@@ -52,12 +52,8 @@ class DepthDataModule(LightningDataModule):
             sources(self.config)
 
     def setup(self, stage: str | None = None) -> None:
-        """Opens both parts; every process does.
-
-        Raises:
-            OSError: a path does not exist, or cannot be written for rendered tours.
-            ValueError: a path holds nothing of the kind asked for, or the two parts overlap.
-        """
+        """Opens both parts; every process does. Raises OSError: a path does not exist, or cannot be written for
+        rendered tours; ValueError: a path holds nothing of the kind asked for, or the two parts overlap."""
         if self.train_set is not None:
             return
         c = self.config
@@ -96,11 +92,7 @@ class DepthDataModule(LightningDataModule):
 
 
 def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:
-    """The frames to train on and those to validate on.
-
-    Raises:
-        OSError, ValueError: see :meth:`DepthDataModule.setup`.
-    """
+    """The frames to train on, and those to validate on. Raises OSError, ValueError: as ``DepthDataModule.setup``."""
     c = config
     if c.kind == "nyu":
         return NyuFrames(c.paths[0], "train"), NyuFrames(c.paths[0], "val")

@@ -76,9 +76,7 @@ def _panel(network: torch.nn.Module | DepthNetwork, preprocess: Preprocess, name
     device = next(network.parameters()).device
     prediction = network(sample["image"][None].to(device))
     depth = prediction.depth[0].float().cpu().numpy()
-    variance = np.zeros_like(depth)
-    for part in (prediction.aleatoric_variance, prediction.epistemic_variance):
-        variance = variance if part is None else variance + part[0].float().cpu().numpy()
+    variance = np.zeros_like(depth) if prediction.variance is None else prediction.variance[0].float().cpu().numpy()
     truth, valid = sample["depth"].numpy(), sample["valid"].numpy()
     error = np.where(valid, np.abs(depth - truth), np.nan).astype(np.float32)
     image = camera_image(sample["image"], preprocess)

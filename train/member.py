@@ -79,11 +79,8 @@ def train_member(
 
 
 def make_data(job: Job, member: int, world: int) -> DepthDataModule:
-    """The member's data, opened, for ``world`` processes.
-
-    Raises:
-        ValueError: the batch cannot be divided among the processes.
-    """
+    """The member's data, opened, for ``world`` processes. Raises ValueError: the batch cannot be divided among the
+    processes."""
     if job.recipe.batch_size % world:
         raise ValueError(f"batch_size {job.recipe.batch_size} must be a multiple of the {world} processes")
     config = replace(job.data, batch_size=job.recipe.batch_size // world, seed=job.seed(member))
@@ -93,11 +90,8 @@ def make_data(job: Job, member: int, world: int) -> DepthDataModule:
 
 
 def training_length(job: Job, data: DepthDataModule) -> tuple[int, int]:
-    """Optimizer steps of the whole training, and the number of epochs that they begin.
-
-    Raises:
-        ValueError: an epoch has no full batch.
-    """
+    """Optimizer steps of the whole training, and the number of epochs that they begin. Raises ValueError: an epoch has
+    no full batch."""
     images, batch = len(data.train_set or ()), job.recipe.batch_size
     if data.clips is not None:
         images = len(data.clips) * job.recipe.clip_frames

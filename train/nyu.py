@@ -62,11 +62,8 @@ class NyuFrames:
         return []
 
     def load(self, index: int) -> RawSample:
-        """Reads a file; nothing stays open, so that worker processes share nothing.
-
-        Raises:
-            SampleError: it cannot be read, lacks ``rgb`` or ``depth``, or they have other types or shapes.
-        """
+        """Reads a file; nothing stays open, so that worker processes share nothing. Raises SampleError: it cannot be
+        read, lacks ``rgb`` or ``depth``, or they have other types or shapes."""
         path = self.files[index]
         try:
             rgb, depth = read_h5(path)

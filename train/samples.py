@@ -60,19 +60,12 @@ class SampleKey(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RawSample:
-    """A frame with depth registered to its image, at the size it is stored in.
+    """A frame with depth registered to its image, at the size it is stored in."""
 
-    Attributes:
-        image: [3, H, W] uint8 RGB.
-        depth: [H, W] float32 [m]; 0 or not finite = none.
-        intrinsics: [3, 3] float64 [px].
-        T_world_cam: [4, 4] float64 camera-to-world [m]; None = not known.
-    """
-
-    image: Tensor
-    depth: Tensor
-    intrinsics: Tensor
-    T_world_cam: Tensor | None = None
+    image: Tensor  # [3, H, W] uint8 RGB
+    depth: Tensor  # [H, W] float32 [m]; 0 or not finite = none
+    intrinsics: Tensor  # [3, 3] float64 [px]
+    T_world_cam: Tensor | None = None  # [4, 4] float64 camera-to-world [m]; None = not known
 
 
 class FrameSource(Protocol):
@@ -198,11 +191,8 @@ def make_sample(
 
 
 def clips(source: FrameSource, length: int) -> list[range]:
-    """The frames of a source in clips that do not overlap; what is left at the end of a path is in none.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """The frames of a source in clips that do not overlap; what is left at the end of a path is in none. Raises
+    ValueError: there is none."""
     found = [run[i : i + length] for run in source.runs() for i in range(0, len(run) - length + 1, length)]
     if not found:
         raise ValueError(f"clip_frames: the training part has no {length} frames with known poses one after the other")

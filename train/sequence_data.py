@@ -60,11 +60,7 @@ class SequenceFrames:
         return [range(of.index(number), of.index(number) + of.count(number)) for number in posed]
 
     def load(self, index: int) -> RawSample:
-        """Decodes a frame.
-
-        Raises:
-            SampleError: a file is missing, cannot be decoded, or has not the sequence's size.
-        """
+        """Decodes a frame. Raises SampleError: a file is missing, cannot be decoded, or has not the sequence's size."""
         number, i = self._frames[index]
         try:
             frame = self.sequences[number][i]
@@ -84,12 +80,8 @@ class SequenceFrames:
 
 
 def open_rgbd(source: str | Path) -> FrameSequence:
-    """A sequence as ``open_sequence`` detects it, or else a folder of images and depth maps without poses.
-
-    Raises:
-        FileNotFoundError: no such path.
-        ValueError: neither of them, with what was looked for.
-    """
+    """A sequence as ``open_sequence`` detects it, or else a folder of images and depth maps without poses. Raises
+    FileNotFoundError: no such path; ValueError: neither of them, with what was looked for."""
     path = Path(source)
     if has_images_and_depth(path):
         try:

@@ -105,11 +105,7 @@ class TourFrames:
         return [range(n, n + self.frames) for n in range(0, len(self), self.frames)]
 
     def load(self, index: int) -> RawSample:
-        """Reads a frame.
-
-        Raises:
-            SampleError: the tour's files are missing or truncated.
-        """
+        """Reads a frame. Raises SampleError: the tour's files are missing or truncated."""
         seed, frame = self.seeds[index // self.frames], index % self.frames
         try:
             image, depth, pose, camera = self._mapped(seed)
