@@ -91,20 +91,10 @@ def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
 
 
 def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[str, Tensor], Any]:
-    """A part of a .safetensors file, without reading the rest.
-
-    Args:
-        path: the file.
-        prefix: of the tensors that are read; None: of none.
-
-    Returns:
-        The tensors by their keys without the prefix, and the metadata of :func:`save_checkpoint` (None: none).
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        CheckpointError: it is no safetensors file, or cut off or damaged.
-        ModuleNotFoundError: safetensors is not installed.
-    """
+    """The tensors of a .safetensors file whose keys begin with ``prefix`` (None: none), by their keys without it, and
+    the metadata of :func:`save_checkpoint` (None: none); the rest is not read. Raises FileNotFoundError: there is no
+    such file; CheckpointError: it is no safetensors file, or cut off or damaged; ModuleNotFoundError: safetensors is
+    not installed."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no file of weights {path}")
     safetensors = _safetensors()

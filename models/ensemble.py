@@ -53,8 +53,8 @@ class Ensemble(DepthNetwork):
 class LazyMember(DepthNetwork):
     """A network that is loaded when it is first called. For inference.
 
-    ``.to()`` decides where and in which type it will run, before and after loading. Its weights are no part of
-    its state_dict, whether loaded or not: they are in its file. A copy loads them anew.
+    ``.to()`` decides where and in which type it will run, before and after loading. Its weights are in its file and no
+    part of its state_dict, whether loaded or not. A copy loads them anew.
 
     Args:
         load: returns the network, on the CPU; called once, again after it raised.
@@ -104,9 +104,8 @@ class LazyMember(DepthNetwork):
         if not isinstance(network, DepthNetwork):
             raise CheckpointError(f"{self.name} must be a DepthNetwork, got {type(network).__name__}")
         if network.preprocess != self.preprocess:
-            raise CheckpointError(
-                f"{self.name} has the preprocessing {network.preprocess}, declared was {self.preprocess}"
-            )
+            declared = f"declared was {self.preprocess}"
+            raise CheckpointError(f"{self.name} has the preprocessing {network.preprocess}, {declared}")
         return network.train(self.training)
 
     @property

@@ -14,13 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.distribution import (
-    DepthDistribution,
-    EvidentialDepth,
-    GaussianDepth,
-    PointDepth,
-    split_batch,
-)
+from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth, split_batch
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 

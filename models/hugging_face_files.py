@@ -75,14 +75,9 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
 def load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: Sequence[str] = ()) -> nn.Module:
     """The model with every weight from the checkpoint, on the CPU.
 
-    Args:
-        checkpoint: what to load.
-        dtype: of the weights, whatever the file has.
-        allow_missing: beginnings of names of weights that the file may lack.
-
-    Raises:
-        CheckpointError: not a depth model, damaged, or with missing, misshapen or non-finite weights; the message
-            names the directory.
+    ``dtype`` is that of the weights, whatever the file has; ``allow_missing`` are beginnings of names of weights that
+    the file may lack. Raises CheckpointError: not a depth model, damaged, or with missing, misshapen or non-finite
+    weights; the message names the directory.
     """
     from huggingface_hub.errors import StrictDataclassError
     from safetensors import SafetensorError

@@ -73,16 +73,8 @@ class Backbone(DepthNetwork):
 
 
 def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[int, int]:
-    """(H, W) [px] of a network's input.
-
-    Args:
-        image: what must be floating-point [B, 3, H, W].
-        multiple: [px] that H and W must be multiples of.
-        smallest: [px] allowed for H and W.
-
-    Raises:
-        ValueError: another shape, type or size.
-    """
+    """(H, W) [px] of a network's input. Raises ValueError unless it is floating-point [B, 3, H, W] with H and W
+    multiples of ``multiple`` and at least ``smallest``."""
     if image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
         shape = f"{image.dtype} {tuple(image.shape)}"
         raise ValueError(f"image must be floating-point [B, 3, H, W] as the network's preprocess makes it, got {shape}")

@@ -38,16 +38,9 @@ class LinearFit:
 
 
 def least_squares(design: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """argmin sum_i weight_i (target_i - design_i . theta)^2 by the normal equations.
-
-    Args:
-        design: [B, P, p]; use float64, the condition is squared.
-        target: [B, P].
-        weight: [B, P] >= 0.
-
-    Returns:
-        theta [B, p] (NaN where undetermined) and determined [B].
-    """
+    """theta [B, p] (NaN where undetermined) = argmin sum_i weight_i (target_i - design_i . theta)^2 by the normal
+    equations, and determined [B]; of design [B, P, p] in float64, as the condition is squared, target and weight [B,
+    P], not negative."""
     weighted = design * weight[..., None]
     return solve_normal(weighted.mT @ design, (weighted.mT @ target[..., None])[..., 0])
 

@@ -117,14 +117,12 @@ def load_trained(
         if not lazy and not offload:
             members += [file.member(n) for n in range(file.info.members)]
             continue
-        preprocess = file.info.spec.input()
-        later = [
-            LazyMember(partial(file.member, n), preprocess, name=f"{file.path}, member {n}", offload=offload)
-            for n in range(file.info.members)
-        ]
-        for member in later if not lazy else []:
-            member.network()
-        members += later
+        for n in range(file.info.members):
+            name = f"{file.path}, member {n}"
+            later = LazyMember(partial(file.member, n), file.info.spec.input(), name=name, offload=offload)
+            if not lazy:
+                later.network()
+            members.append(later)
     return members
 
 
@@ -149,29 +147,23 @@ class _TrainedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.info = _parse(path, read_safetensors(path, prefix=None)[1])
-        self._shared: dict[int, BatchEnsemble] = {}
+        self._shared: dict[int, Any] = {}  # a BatchEnsemble's members are of one network
         self._lock = threading.Lock()
 
     def member(self, n: int) -> DepthNetwork:
         """Network n of :func:`load_trained`, in eval mode. Raises CheckpointError: its weights are damaged or do not
         fit; names the file and the member."""
-        method = self.info.spec.method
-        if method == "batch_ensemble":
-            index, member = divmod(n, self.info.spec.members)
-            return self._batch_ensemble(index).member(member)
-        network = self.read(n)
-        return MonteCarloDropout(network).eval() if method == "mc_dropout" else network
+        index, member = divmod(n, self.info.spec.members)
+        if self.info.spec.method != "batch_ensemble":
+            network = self.read(index)
+            return MonteCarloDropout(network).eval() if self.info.spec.method == "mc_dropout" else network
+        with self._lock:
+            if index not in self._shared:
+                self._shared[index] = self.read(index)
+            return self._shared[index].member(member)
 
     def __reduce__(self) -> tuple[type[_TrainedFile], tuple[Path]]:
         return _TrainedFile, (self.path,)  # a copy reads the file again
-
-    def _batch_ensemble(self, index: int) -> BatchEnsemble:
-        with self._lock:
-            if index not in self._shared:
-                network = self.read(index)
-                assert isinstance(network, BatchEnsemble)
-                self._shared[index] = network
-            return self._shared[index]
 
     def read(self, index: int) -> UncertaintyNetwork | BatchEnsemble:
         """What is stored under an index, in eval mode. Raises CheckpointError: as :meth:`member`."""

@@ -56,15 +56,8 @@ class Examples(pl.Callback):
 def draw_examples(
     path: Path, network: torch.nn.Module, preprocess: Preprocess, samples: list[tuple[str, Sample]], title: str
 ) -> None:
-    """Write a sheet of a network's predictions for some samples.
-
-    Args:
-        path: of the PNG.
-        network: a ``DepthNetwork`` in eval mode.
-        preprocess: the network's, to show the image as it was.
-        samples: names and samples.
-        title: of the sheet.
-    """
+    """Write a sheet (PNG) of the predictions of a network in eval mode for some samples, given with their names;
+    ``preprocess`` is the network's, to show the image as it was."""
     panels = [_panel(network, preprocess, name, sample) for name, sample in samples]
     columns = map_columns(panels)
     if not any(panel.sigma.any() for panel in panels):

@@ -127,16 +127,9 @@ class SampleDataset(Dataset[Sample]):
         return len(self.source)
 
     def __getitem__(self, key: int | SampleKey) -> Sample:
-        """The sample of a frame.
-
-        Args:
-            key: (epoch, frame) as :class:`~ufmstar_torch.train.batches.EpochBatches` yields it; a frame's number
-                alone is of epoch 0.
-
-        Raises:
-            IndexError: no such frame.
-            SampleError: a broken file with ``on_bad_file="raise"``, or none that can be read.
-        """
+        """The sample of a frame, (epoch, frame) as ``EpochBatches`` yields it; a frame's number alone is of epoch 0.
+        Raises IndexError: no such frame; SampleError: a broken file with ``on_bad_file="raise"``, or none that can be
+        read."""
         epoch, index, counts = SampleKey(*key) if isinstance(key, tuple) else SampleKey(0, key)
         if not 0 <= index < len(self):
             raise IndexError(f"index must lie in [0, {len(self)}), got {index}")
@@ -171,14 +164,7 @@ class SampleDataset(Dataset[Sample]):
 def make_sample(
     raw: RawSample, preprocess: Preprocess, augmentation: Augmentation | None, seed: tuple[int, ...]
 ) -> Sample:
-    """A stored frame as the network sees it: augmented, then preprocessed.
-
-    Args:
-        raw: the frame.
-        preprocess: the network's.
-        augmentation: or None.
-        seed: of the augmentation: the same numbers give the same sample.
-    """
+    """A stored frame as the network sees it: augmented, then preprocessed; ``seed`` is the augmentation's."""
     image = raw.image.to(torch.float32) / 255
     depth = torch.where(raw.depth.isfinite() & (raw.depth > 0), raw.depth, 0.0).to(torch.float32)
     K = raw.intrinsics.to(torch.float64)

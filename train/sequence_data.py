@@ -19,16 +19,11 @@ from ufmstar_torch.train.samples import RawSample, SampleError
 
 
 class SequenceFrames:
-    """The frames with depth of the same part of several sequences, one after the other.
+    """The frames with depth of the same part of several sequences, one after the other. The part is counted over all
+    usable frames of a sequence, also those without a depth map.
 
-    Depth maps with a camera of their own are seen at the image's pixels (``eval.ground_truth``).
-
-    Args:
-        sequences: as the readers return them.
-        part: of each sequence; counted over all its usable frames, also those without a depth map.
-
-    Raises:
-        ValueError: no sequence, or one whose part has no frame with depth.
+    Depth maps with a camera of their own are seen at the image's pixels (``eval.sequences.ground_truth``). Raises
+    ValueError: no sequence, or one whose part has no frame with depth.
     """
 
     def __init__(self, sequences: Sequence[FrameSequence], part: str | Part = "0:100%") -> None:

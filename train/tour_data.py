@@ -77,13 +77,7 @@ class TourSettings(Checked):
 
 
 class TourFrames:
-    """The stored frames of some tours. Build one with :func:`tour_frames`.
-
-    Args:
-        folder: with the tours' files.
-        seeds: of the tours.
-        frames: of each tour.
-    """
+    """The stored frames of some tours, ``frames`` of each. Build one with :func:`tour_frames`."""
 
     def __init__(self, folder: Path, seeds: Iterable[int], frames: int) -> None:
         self.folder, self.seeds, self.frames = folder, tuple(seeds), frames
