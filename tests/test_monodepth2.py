@@ -322,12 +322,13 @@ def variance_misfit(strides: str, image: Tensor) -> float:
     return float(torch.stack(ratios).mean())
 
 
+@pytest.mark.slow
 def test_shared_weights_have_v1_strides() -> None:
     """Shapes cannot tell, statistics can: with the right strides and normalisation activations have the variances
     that training saw. Observed .17 with v1, .32 with v1.5, .40 with v1 and images in [-1, 1]."""
     folder = require_shared("data/rgbd_dataset_freiburg1_xyz/rgb")
-    files = sorted(folder.glob("*.png"))[::13]
-    files += sorted(require_shared("data/hololens_office/images").glob("*.png"))[::25]
+    files = sorted(folder.glob("*.png"))[::20]
+    files += sorted(require_shared("data/hololens_office/images").glob("*.png"))[::50]
     network = small()
     frames = [torch.from_numpy(np.array(Image.open(f))).permute(2, 0, 1)[None] for f in files]
     image = torch.cat([network.preprocess.apply_image(frame) for frame in frames])
