@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,17 +45,27 @@ def random_like(state: Mapping[str, Tensor], seed: int) -> dict[str, Tensor]:
     return result
 
 
-def small(**options: Any) -> MonodepthResNet:
+@cache
+def untrained(**options: Any) -> MonodepthResNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return MonodepthResNet(18, decoder=SMALL, **options).eval()
 
 
-def classifier_weights(layers: int = 18, seed: int = 1) -> dict[str, Tensor]:
-    """What torchvision publishes: a whole classifier's state_dict."""
+def small(**options: Any) -> MonodepthResNet:
+    return copy.deepcopy(untrained(**options))
+
+
+@cache
+def random_classifier(layers: int, seed: int) -> dict[str, Tensor]:
     import torchvision.models
 
     return random_like(getattr(torchvision.models, f"resnet{layers}")(weights=None).state_dict(), seed)
+
+
+def classifier_weights(layers: int = 18, seed: int = 1) -> dict[str, Tensor]:
+    """What torchvision publishes: a whole classifier's state_dict."""
+    return {name: value.clone() for name, value in random_classifier(layers, seed).items()}
 
 
 # --- the network -------------------------------------------------------------------------------------
