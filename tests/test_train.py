@@ -56,6 +56,7 @@ def frames(tmp_path_factory):
 # ---- trainings ----
 
 
+@pytest.mark.slow
 def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
     """Twelve scenes, the red half of each with noise of .9 m, twice for training and once more for validation.
 

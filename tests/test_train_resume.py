@@ -109,7 +109,7 @@ def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninter
     assert_same_result(tmp_path / "out", uninterrupted)
 
 
-@pytest.mark.parametrize("steps", [2, 3])
+@pytest.mark.parametrize("steps", [4, pytest.param(3, marks=pytest.mark.slow)])
 def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, steps):
     sessions = 0
     while True:
