@@ -176,7 +176,7 @@ def _match(
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchored else 1.0)
     reach = config.prior_weight, least if config.regression == "exact" else 0.0
-    given = (camera, before, after, mixture, segments[:3], array(frame.depth), thresholds, reach)
+    given = (camera, before, after, mixture, segments[:3], frame.size, thresholds, reach)
     return after, [_Pairs(*found) for found in each(match, [(b, *given) for b in range(len(frame.depth))])]
 
 

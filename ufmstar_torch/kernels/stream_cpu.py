@@ -30,7 +30,7 @@ def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, wei
 
 
 @kernel
-def match(b, camera, before, after, mixture, segments, depth, thresholds, reach):
+def match(b, camera, before, after, mixture, segments, size, thresholds, reach):
     """Step 3 of stream ``b``: what the frame can reach of M_(i-1) [B, K] in the camera frame, and its pairs with C_i
     [B, C].
 
@@ -39,7 +39,7 @@ def match(b, camera, before, after, mixture, segments, depth, thresholds, reach)
         before, after: of the state, camera-to-world [B, 4, 4] of the first camera, started, frames and skipped [B];
             ``after`` is written.
         mixture, segments: mean, covariance and weight.
-        depth: [B, H, W], 0 where there is none.
+        size: H, W of the image.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
         reach: prior weight and epsilon of :func:`reached`.
 
@@ -57,13 +57,13 @@ def match(b, camera, before, after, mixture, segments, depth, thresholds, reach)
     mean, covariance, weight = mixture[0][b], mixture[1][b], mixture[2][b]
     mean_c, cov_c, weight_c = segments[0][b], segments[1][b], segments[2][b]
     motion = relative(first, present)
-    near, occupied = reached(motion, mean, covariance, weight, K, depth.shape[1:], reach[0], reach[1], weight_c.size)
+    near, occupied = reached(motion, mean, covariance, weight, K, size, reach[0], reach[1], weight_c.size)
     here = np.empty((FIELDS, padded(near.size + weight_c.size)))
     segments_here = np.empty((FIELDS, padded(weight_c.size)))
     gather(near, near.size, mean, covariance, weight, here)
     turn(motion, padded(near.size), here.shape[1], here)
     gather(np.arange(weight_c.size), weight_c.size, mean_c, cov_c, weight_c, segments_here)
-    c, k, overlap = matches(here, near.size, segments_here, weight_c.size, K, *depth.shape[1:], *thresholds)
+    c, k, overlap = matches(here, near.size, segments_here, weight_c.size, K, *size, *thresholds)
     new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
         new[c[i]] = False
