@@ -248,7 +248,7 @@ def _with_more(state: UfMStarState, rows: Sequence[NDArray]) -> UfMStarState:
         for b, table in enumerate(rows):
             if len(table):
                 values = torch.from_numpy(table[:, at : at + width].copy()).to(new)
-                new[b, first[b] : first[b] + len(table)] = values.reshape(-1, *old.shape[2:])
+                new[b, first[b] : first[b] + len(table)] = values.reshape(len(table), *old.shape[2:])
         changed[name], at = new, at + width
     return replace(state, **changed)
 
