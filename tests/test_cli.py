@@ -33,21 +33,24 @@ def path(tmp_path_factory):
 
 @pytest.fixture
 def brightness(monkeypatch, tmp_path):
-    """Makes ``--model any --weights FILE`` load a network whose gain is the file's content; returns the files."""
+    """Makes ``--model any --weights FILE`` load a network whose gain is the file's content.
+
+    Returns the files, and what a test may set: what a network does at which call, and the width of its images.
+    """
+    fake = types.SimpleNamespace(
+        files=[tmp_path / "first.pt", tmp_path / "second.pt"], at=None, then=None, width=lambda: 32
+    )
+    for file, gain in zip(fake.files, ("1.0", "1.1"), strict=True):
+        file.write_text(gain)
 
     def load(name, weights, **options):
         assert (name, options) == ("any", {})
-        network = Brightness(float(weights.read_text()), spread=0.02)
-        network.preprocess = Preprocess(size=(24, 32))
-        loaded.append(network)
+        network = Brightness(float(weights.read_text()), spread=0.02, at=fake.at, then=fake.then)
+        network.preprocess = Preprocess(size=(24, fake.width()))
         return network
 
-    loaded = []
     monkeypatch.setattr(sources, "load_network", load)
-    files = [tmp_path / "first.pt", tmp_path / "second.pt"]
-    for file, gain in zip(files, ("1.0", "1.1"), strict=True):
-        file.write_text(gain)
-    return types.SimpleNamespace(files=files, loaded=loaded)
+    return fake
 
 
 QUICK = ("--no-video", "--no-sheet")
@@ -368,40 +371,26 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     assert ufmstar(*words, "--overwrite")[0] == 0
 
 
-def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness, monkeypatch):
-    load = sources.load_network
-
-    def other(name, weights, **options):
-        network = load(name, weights, **options)
-        network.preprocess = Preprocess(size=(24, 32 + len(brightness.loaded)))
-        return network
-
-    monkeypatch.setattr(sources, "load_network", other)
+def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness):
+    brightness.width = iter((32, 33)).__next__
     code, _, err = ufmstar("run", path, "--model", "any", "--weights", *brightness.files, "--out", tmp_path / "out")
     assert code == 2
     assert "same input" in err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, brightness, monkeypatch, number):
+def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, brightness, number):
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK)
     assert ufmstar(*words, "--out", tmp_path / "whole")[0] == 0
-    load = sources.load_network
-
-    def loaded(name, weights, **options):
-        network = load(name, weights, **options)
-        network.at, network.then = 1, lambda: os.kill(os.getpid(), number)
-        return network
-
     before = signal.getsignal(number)
-    monkeypatch.setattr(sources, "load_network", loaded)
+    brightness.at, brightness.then = 1, lambda: os.kill(os.getpid(), number)
     code, _, err = ufmstar(*words, "--out", tmp_path / "out")
     assert code == 130
     assert "stopping after this frame" in err
     assert "interrupted: stopped by the user after 3 of 6 frames; --resume goes on" in err
     assert signal.getsignal(number) is before
     assert read_summary(tmp_path / "out")["state"] == "interrupted"
-    monkeypatch.setattr(sources, "load_network", load)
+    brightness.at = None
     assert ufmstar(*words, "--out", tmp_path / "out", "--resume")[0] == 0
     whole, resumed = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
     for result in (whole, resumed):
@@ -409,18 +398,12 @@ def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, 
     assert whole == resumed
 
 
-def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness, monkeypatch):
+def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness):
     def twice():
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
-    def loaded(name, weights, **options):
-        network = load(name, weights, **options)
-        network.at, network.then = 1, twice
-        return network
-
-    load = sources.load_network
-    monkeypatch.setattr(sources, "load_network", loaded)
+    brightness.at, brightness.then = 1, twice
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out")
     assert ufmstar(*words)[0] == 130
     assert read_summary(tmp_path / "out")["frames"]["done"] == 2
@@ -437,17 +420,11 @@ def test_a_full_disk(ufmstar, path, tmp_path, monkeypatch):
     assert read_summary(tmp_path / "out")["state"] == "failed"
 
 
-def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness, monkeypatch):
+def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness):
     def fail():
         raise RuntimeError("two\nlines")
 
-    def loaded(name, weights, **options):
-        network = load(name, weights, **options)
-        network.at, network.then = 0, fail
-        return network
-
-    load = sources.load_network
-    monkeypatch.setattr(sources, "load_network", loaded)
+    brightness.at, brightness.then = 0, fail
     words = ("run", path, "--model", "any", "--weights", brightness.files[0], *QUICK, "--out", tmp_path / "out")
     code, _, err = ufmstar(*words)
     assert code == 1
