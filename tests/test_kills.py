@@ -152,12 +152,20 @@ def test_report(evaluation, tmp_path):
     assert not list(again.rglob(".*.tmp"))
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_train(tmp_path, seed):
-    frames = write_frames(tmp_path / "frames")
+@pytest.fixture(scope="module")
+def training(tmp_path_factory):
+    """Words of a training but for its folder, and that folder after an undisturbed one."""
+    place = tmp_path_factory.mktemp("training")
+    frames = write_frames(place / "frames")
     words = ["train", *TRAINING.split(), "--root", frames, "--threads", 1, "--out"]
-    whole, out = tmp_path / "whole", tmp_path / "out"
-    finish([*words, whole])
+    finish([*words, place / "whole"])
+    return words, place / "whole"
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_train(training, tmp_path, seed):
+    words, whole = training
+    out = tmp_path / "out"
     again = [*words, out, "--resume"]
     killed_and_finished([*words, out], again, out, whole, seed, lambda: content(out, f"member_*/{RESULT}"))
     for member in ("member_0", "member_1"):
