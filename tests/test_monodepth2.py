@@ -16,12 +16,17 @@ from PIL import Image
 from shared_data import require_shared
 from torch import Tensor, nn
 
-from ufmstar_torch.models.batch_ensemble import convert, converted_layers
-from ufmstar_torch.models.checkpoints import CheckpointError, save_checkpoint
-from ufmstar_torch.models.heads import with_head
-from ufmstar_torch.models.load import load_network
-from ufmstar_torch.models.monodepth2 import DECODER_WIDTHS, IMAGENET_MEAN, IMAGENET_STD, MonodepthResNet
-from ufmstar_torch.models.monodepth2_import import load_monodepth2
+from ufmstar_torch.models import (
+    CheckpointError,
+    MonodepthResNet,
+    convert,
+    load_monodepth2,
+    load_network,
+    save_checkpoint,
+    with_head,
+)
+from ufmstar_torch.models.batch_ensemble import converted_layers
+from ufmstar_torch.models.monodepth2 import DECODER_WIDTHS, IMAGENET_MEAN, IMAGENET_STD
 
 RESNET50 = "weights/resnet50_v1_imagenet_fp16_nofc.pth"
 SMALL = (4, 8, 8, 8, 16)

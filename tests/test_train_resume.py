@@ -17,7 +17,8 @@ from trainings import RECIPE, tiny_job, with_network, write_frames
 
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, ResumeError, read_checkpoint
+from ufmstar_torch.train import ResumeError
+from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, read_checkpoint
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.history import METRICS, STEPS, read_rows
 from ufmstar_torch.train.member import RESULT, WEIGHTS
