@@ -205,12 +205,14 @@ def test_an_empty_mixture_is_the_prior_everywhere():
             assert torch.equal(out[~out.isnan()].unique(), torch.tensor([0.3], dtype=torch.float64))
 
 
-def test_chunks_change_nothing():
-    m = mixture(1, 300, 4)
-    points = torch.rand(1, 20_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 4
-    whole = regress(m, points, EXACT).disagreement  # 6 million pairs, of which 4 million are computed at a time
-    parts = [regress(m, part, EXACT).disagreement for part in points.split(3000, dim=1)]
-    assert torch.equal(whole, torch.cat(parts, dim=1))
+def test_chunks_change_nothing(monkeypatch):
+    from ufmstar_torch import regress as module
+
+    m = mixture(1, 9, 4)
+    points = unproject(rendered(1).nan_to_num(1.0), K).flatten(1, 2)
+    whole = regress(m, points, EXACT).disagreement
+    monkeypatch.setattr(module, "_CHUNK", 9 * 100)
+    assert torch.equal(regress(m, points, EXACT).disagreement, whole)
     assert regress(m, points[:, :0], EXACT).disagreement.shape == (1, 0)
 
 
