@@ -177,7 +177,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_told_in_one_line(ufmstar, path, tmp_path, mistake):
+def test_a_mistake_is_reported_in_one_line(ufmstar, path, tmp_path, mistake):
     words, expected = MISTAKES[mistake]
     code, out, err = ufmstar(*[word.format(path=path, out=tmp_path / "out") for word in words])
     assert (code, out) == (2, "")
@@ -205,7 +205,7 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
     assert "Traceback" in err
 
 
-def test_an_unknown_key_in_a_file_is_told(ufmstar, path, tmp_path):
+def test_an_unknown_key_in_a_file_is_reported(ufmstar, path, tmp_path):
     for text, expected in (('{"ufm": {"etaa": 0.3}}', "etaa"), ('{"modell": "fastdepth"}', "modell")):
         (tmp_path / "c.json").write_text(text)
         words = ("run", path, "--depth", "self", "--config", tmp_path / "c.json", "--out", tmp_path / "out")
@@ -243,7 +243,7 @@ def test_poses_in_another_convention(ufmstar, path, tmp_path):
     assert mixtures[0]["components"] == mixtures[1]["components"]
 
 
-def test_settings_from_file_and_words(ufmstar, path, tmp_path):
+def test_settings_come_from_a_file_and_options(ufmstar, path, tmp_path):
     (tmp_path / "c.yaml").write_text("ufm:\n  eta: 0.4\n  ema_alpha: 1\n  segment:\n    min_rows: 2\nframes: '1:5:2'\n")
     words = ("--config", tmp_path / "c.yaml", "--ufm.eta", "0.3", "--preset", "tartanair_indoor")
     assert ufmstar("run", path, "--depth", "self", *words, *QUICK, "--out", tmp_path / "out")[0] == 0
@@ -306,7 +306,7 @@ def test_threads(ufmstar, path, tmp_path):
 
 
 @pytest.mark.parametrize("write", [write_tum, write_tartanair])
-def test_layouts_are_found(ufmstar, tmp_path, write):
+def test_layouts_are_detected(ufmstar, tmp_path, write):
     path, _ = write(tmp_path, frames=2)
     code, _, err = ufmstar("run", path, "--depth", "ground-truth", *QUICK, "--out", tmp_path / "out")
     assert code == 0, err
@@ -329,7 +329,7 @@ def test_options_of_every_command_are_read_before_anything_starts(ufmstar):
 # ---- runs ----
 
 
-def test_a_run_says_what_came_out(ufmstar, path, tmp_path, brightness):
+def test_a_run_prints_its_table_and_outputs(ufmstar, path, tmp_path, brightness):
     code, out, err = ufmstar(
         "run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out"
     )
@@ -432,7 +432,7 @@ def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness):
     assert "Traceback" not in err
 
 
-def test_skipped_frames_are_told(ufmstar, tmp_path):
+def test_skipped_frames_are_reported(ufmstar, tmp_path):
     path, _ = write_generic(tmp_path, frames=3)
     truncate(path / "images" / "8.png")
     code, out, _ = ufmstar("run", path, "--depth", "self", *QUICK, "--out", tmp_path / "out")
