@@ -14,8 +14,8 @@ from tiny_suite import CPU, row
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, make_estimator
-from ufmstar_torch.eval.engine.evaluate import ProgressSink
 from ufmstar_torch.eval.engine.maps import own_depth
+from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import Setting
@@ -152,7 +152,10 @@ def test_it_stops_between_frames_and_goes_on(sequence):
     calls, seen = [], []
     stream = FrameStream(sequence, range(FRAMES), [in_turn()])
     with pytest.raises(Stopped):
-        stream.drive([Recorded("sink", calls), ProgressSink(lambda *at: seen.append(at))], stop=lambda: len(seen) > 2)
+        stream.drive(
+            [Recorded("sink", calls), ProgressSink(lambda now: seen.append((now.done, now.total)))],
+            stop=lambda: len(seen) > 2,
+        )
     assert calls == [("sink", "begin", 0), ("sink", "take", 0), ("sink", "take", 1)]
     assert seen == [(0, FRAMES), (1, FRAMES), (2, FRAMES)]
     sink = Recorded("sink", calls)

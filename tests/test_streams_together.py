@@ -17,7 +17,6 @@ from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped, drive_together
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.work import failures
 from ufmstar_torch.eval.sequences import FrameError
 from ufmstar_torch.eval.tour.open import open_tour
 from ufmstar_torch.models import Preprocess
@@ -226,5 +225,5 @@ def test_a_folder_is_the_same_and_what_was_stopped_goes_on(tmp_path):
     ended, lines = go(job, evaluate_sequences, resume=True)
     assert ended
     assert kept(job.out) == kept(whole.out)
-    assert not failures(EvalFolder(job.out, {}), job.items)
+    assert not EvalFolder(job.out).failures(job.items)
     assert [line.split(":")[0] for line in lines] == [f"rooms/{name}" for name in NAMES]

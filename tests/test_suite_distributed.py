@@ -35,7 +35,8 @@ from ufmstar_torch.eval.results.launch import (
     run_slurm,
     tasks_of,
 )
-from ufmstar_torch.eval.results.worker import WorkerTask
+from ufmstar_torch.eval.results.work import WorkerTask
+from ufmstar_torch.eval.results.worklist import Shard
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
 
@@ -101,9 +102,10 @@ SCRIPT = """
 import os, pickle, signal, sys, time
 task = pickle.load(sys.stdin.buffer)
 folder = task.job.out
-signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{task.index}", "w").close(), sys.exit(130)))
-open(f"{folder}/started{task.index}", "w").write(str(os.getpid()))
-os.rename(f"{folder}/started{task.index}", f"{folder}/pid{task.index}")
+signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{task.shard.index}", "w").close(), sys.exit(130)))
+number = task.shard.index
+open(f"{folder}/started{number}", "w").write(str(os.getpid()))
+os.rename(f"{folder}/started{number}", f"{folder}/pid{number}")
 while True:
     time.sleep(0.02)
 """
@@ -112,7 +114,7 @@ while True:
 def scripted(tmp_path, text, stop, count=3):
     """Processes that run a script: whether all came to their end, and the lines that were reported."""
     lines: list[str] = []
-    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), n + 1, count, n, "abc", 1) for n in range(count)]
+    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), Shard(n + 1, count), n, threads=1) for n in range(count)]
     return run_processes(tasks, stop=stop, report=lines.append, command=(sys.executable, "-c", text)), lines
 
 
@@ -140,7 +142,7 @@ def test_a_pool_whose_starter_fails_leaves_no_process(tmp_path):
 
 @pytest.mark.slow
 def test_a_pool_tells_of_a_process_that_was_killed_and_lets_the_others_finish(tmp_path):
-    text = "import os, pickle, sys\nif pickle.load(sys.stdin.buffer).index == 2: os.kill(os.getpid(), 9)"
+    text = "import os, pickle, sys\nif pickle.load(sys.stdin.buffer).shard.index == 2: os.kill(os.getpid(), 9)"
     assert scripted(tmp_path, text, lambda: False) == (False, ["process 2/3 ended early (signal 9)"])
     assert scripted(tmp_path, "import sys; sys.stdin.buffer.read()", lambda: False) == (True, [])
 
@@ -148,7 +150,7 @@ def test_a_pool_tells_of_a_process_that_was_killed_and_lets_the_others_finish(tm
 def test_threads_are_divided_and_devices_go_round(rooms, tmp_path, monkeypatch):
     monkeypatch.setattr(launch, "available_cores", lambda: 7)
     tasks = tasks_of(job_on(rooms, tmp_path), LaunchOptions(processes=3))
-    assert [(t.index, t.count, t.local, t.threads) for t in tasks] == [(1, 3, 0, 2), (2, 3, 1, 2), (3, 3, 2, 2)]
+    assert [(str(t.shard), t.local, t.threads) for t in tasks] == [("1/3", 0, 2), ("2/3", 1, 2), ("3/3", 2, 2)]
     assert len({t.launch for t in tasks}) == 1
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
@@ -226,7 +228,7 @@ def test_what_contradicts_torchrun(rooms, tmp_path, monkeypatch, words):
 def test_the_first_waits_for_a_sequence_that_another_is_at(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
     go(replace(job, items=job.items[1:]))
-    claim, stub = EvalFolder(job.out, {}).claim(job.items[0], "other"), Stub()
+    claim, stub = EvalFolder(job.out).claim(job.items[0], "other"), Stub()
     waiter = threading.Thread(target=go, args=(job, stub), kwargs={"resume": True, "waits": True})
     waiter.start()
     time.sleep(0.5)
@@ -290,7 +292,7 @@ def test_what_slurm_is_told():
 
 
 def test_a_job_is_queued_again_with_the_same_task():
-    job = ClusterTask(WorkerTask(SimpleNamespace(out="x"), 1, 2, 0, "abc"))
+    job = ClusterTask(WorkerTask(SimpleNamespace(out="x"), Shard(1, 2)))
     again = job.checkpoint()
     assert again.function == job
 
@@ -311,7 +313,7 @@ class Submitted:
         return nullcontext()
 
     def submit(self, task):
-        end, number = self.ends.pop(0), task.task.index
+        end, number = self.ends.pop(0), task.task.shard.index
         return SimpleNamespace(
             job_id=str(number),
             done=lambda: end is not None,
@@ -335,7 +337,7 @@ def test_jobs_that_fail_are_reported_and_stopping_cancels_all(
 ):
     cluster, lines = Submitted(*ends), []
     monkeypatch.setitem(sys.modules, "submitit", cluster)
-    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), n + 1, 2, 0, "abc") for n in range(2)]
+    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), Shard(n + 1, 2)) for n in range(2)]
     assert run_slurm(Slurm.parse(["jobs=2"]), tasks, stop=lambda: stops, report=lines.append) == finished
     assert lines == [f"jobs 1, 2; their output is in {tmp_path}/slurm", *failed]
     assert cluster.cancelled == cancelled
@@ -354,7 +356,9 @@ def test_without_submitit_the_error_names_what_to_install(rooms, tmp_path, monke
 @pytest.mark.slow
 def test_a_worker_reads_its_task_and_its_code_is_how_it_ended(rooms, tmp_path):
     def run(out, debug=False, **changes):
-        task = pickle.dumps(WorkerTask(job_on(rooms, out, **changes), 1, 2, 0, "abc", 1, debug))
+        task = pickle.dumps(
+            WorkerTask(job_on(rooms, out, **changes), Shard(1, 2), helps=True, launch="abc", threads=1, debug=debug)
+        )
         command = (sys.executable, "-P", "-m", "ufmstar_torch.eval.results.worker")
         ended = subprocess.run(command, input=task, capture_output=True, check=False)
         return ended.returncode, ended.stderr.decode()

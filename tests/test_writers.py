@@ -181,7 +181,7 @@ class TestFullDisk:
     ) -> None:
         writer = FrameWriter(tmp_path)
         writer.write("a", **frame(0))
-        writer.write_summary({"frames": 1})
+        write_json_atomic(tmp_path / "summary.json", {"frames": 1})
         before, calls, replace = tree(tmp_path), [0], os.replace
 
         def replace_until_full(source: Path, target: Path) -> None:
@@ -195,7 +195,7 @@ class TestFullDisk:
             with pytest.raises(OSError, match="No space left"):
                 writer.write("b", **frame(1))
             with pytest.raises(OSError, match="No space left"):
-                writer.write_summary({"frames": 2})
+                write_json_atomic(tmp_path / "summary.json", {"frames": 2})
         after = tree(tmp_path)
         assert {name: after[name] for name in before} == before
         assert not writer.finished("b")

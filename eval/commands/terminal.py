@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.commands.run import Progress
+    from ufmstar_torch.eval.engine.progress import Progress
 
 
 class Bars:

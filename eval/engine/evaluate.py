@@ -24,6 +24,7 @@ from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import Estimator, Gaussians, make_estimator
 from ufmstar_torch.eval.engine.judge import RowMetrics, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
+from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, drive_together
 from ufmstar_torch.eval.methods.method import ALONE
@@ -74,8 +75,7 @@ class SequenceTask:
     sequence: FrameSequence  # posed frames with ground truth
     rows: Sequence[Row]  # different ones
     sinks: Sequence[FrameSink] = ()  # take the frames after the metrics; a row's key is its slug
-    # called with the frames that are done and all of them, at the start and after every one.
-    progress: Callable[[int, int], None] = lambda done, total: None
+    progress: Callable[[Progress], object] = lambda _: None  # called at the start and after every frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,20 +199,6 @@ def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) 
     checked = check_frame(one, pose, K, None, None, None, None, feature_count=0, rotation_tolerance=_TOLERANCE)
     if int(checked.fault[0]):
         raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
-
-
-class ProgressSink(FrameSink):
-    """Calls ``progress`` with the frames that are done and all of them, at the start and after every frame."""
-
-    def __init__(self, progress: Callable[[int, int], None]) -> None:
-        self._progress, self._total = progress, 0
-
-    def begin(self, stream: FrameStream) -> None:
-        self._total = len(stream.indices)
-        self._progress(stream.position, self._total)
-
-    def take(self, result: FrameResult) -> None:
-        self._progress(result.number + 1, self._total)
 
 
 @dataclass

@@ -20,7 +20,7 @@ from torch import Tensor
 from ufmstar_torch.eval.engine.ahead import FramesAhead
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
-from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner, Update
+from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.together import Inference, infer_together, update_together
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
@@ -173,13 +173,14 @@ class FrameStream:
         skipped: dict[str, str] = {}
         for one in updates:
             try:
-                taken[one.row.key] = one.row.finish(frame, one)
+                one.row.finish(one, name)
+                taken[one.row.key] = one
             except FrameError as error:
                 skipped[one.row.key] = error.reason
         return FrameResult(number, index, name, frame, taken, skipped, ms)
 
 
-_Frame = Generator[Sequence[Inference | Update], None, FrameResult]
+_Frame = Generator[Sequence[Inference | RowFrame], None, FrameResult]
 
 
 def drive_together(
@@ -242,7 +243,7 @@ class _Lane:
         done = self._frame is None and self.stream.position >= len(self.stream.indices)
         return done or self.error is not None
 
-    def advance(self) -> Sequence[Inference | Update]:
+    def advance(self) -> Sequence[Inference | RowFrame]:
         """Bring the frame in hand, or the next one, to its next stop: what it needs there. At its end the sinks get
         what came of it."""
         if self.over:
@@ -287,7 +288,7 @@ def _one_frame_of_each(lanes: Sequence[_Lane]) -> None:
     wanted = [one for lane in lanes for one in lane.advance()]
     while any(lane.waits for lane in lanes):
         infer_together([one for one in wanted if isinstance(one, Inference)])
-        update_together([one for one in wanted if isinstance(one, Update)])
+        update_together([one for one in wanted if isinstance(one, RowFrame)])
         wanted = [one for lane in lanes if lane.waits for one in lane.advance()]
 
 

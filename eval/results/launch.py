@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import torch
@@ -25,8 +25,8 @@ import torch
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.machine import available_cores
-from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerContext, failures, run_job
-from ufmstar_torch.eval.results.worker import DONE, STOPPED, WorkerTask, device_of, work
+from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerTask
+from ufmstar_torch.eval.results.worker import DONE, STOPPED, work
 from ufmstar_torch.eval.results.worklist import Shard
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
@@ -126,8 +126,7 @@ def evaluate_suite(
     progress: Callable[[str, int, int], None],
     evaluate: Evaluate = evaluate_sequences,
 ) -> EvalOutcome:
-    """Evaluate a job; ``progress`` (see ``WorkerContext``) and ``evaluate`` (see ``evaluate_sequences``) are of this
-    process's own work.
+    """Evaluate a job; ``progress`` and ``evaluate`` (see ``Worker``) are of this process's own work.
 
     Raises:
         FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
@@ -137,9 +136,10 @@ def evaluate_suite(
     if rank is not None:
         _require_plain(options, rank)
         # No common launch: torchrun starts all processes again when one was killed, and the sequence is tried again.
-        task = WorkerTask(job, rank.rank + 1, rank.world, rank.local, "", options.threads)
-        finished = work(task, stop=stop, report=report, waits=rank.rank == 0, evaluate=evaluate)
-        return _outcome(job, finished, stop(), reports=rank.rank == 0)
+        shard, first = Shard(rank.rank + 1, rank.world), rank.rank == 0
+        task = WorkerTask(job, shard, rank.local, helps=True, waits=first, threads=options.threads)
+        finished = work(task, stop=stop, report=report, evaluate=evaluate)
+        return _outcome(job, finished, stop(), reports=first)
     if options.slurm or options.processes > 1:
         slurm = Slurm.parse(options.slurm) if options.slurm else None
         # Opened once before any process starts, which reports mistakes once.
@@ -150,21 +150,19 @@ def evaluate_suite(
         else:
             finished = run_slurm(slurm, tasks_of(job, options, slurm.jobs), stop=stop, report=report)
         return _outcome(job, finished, stop())
-    job = replace(job, device=device_of(job.device, 0))
     shard = Shard.parse(options.shard or "1/1")
-    networks = job.load(torch.device(job.device))
     # The parts of a divided evaluation begin in any order: whichever is first makes the folder.
-    resume = options.resume or shard.count > 1
-    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=options.overwrite)
-    context = WorkerContext(shard, stop=stop, report=report, progress=progress, evaluate=evaluate)
-    return _outcome(job, run_job(job, folder, networks, context), stop())
+    how = {"resume": options.resume or shard.count > 1, "overwrite": options.overwrite}
+    own = {"stop": stop, "report": report, "progress": progress, "evaluate": evaluate}
+    return _outcome(job, work(WorkerTask(job, shard), **how, **own), stop())
 
 
 def tasks_of(job: EvalJob, options: LaunchOptions, jobs: int | None = None) -> list[WorkerTask]:
     """The tasks of processes that share a job: ``options.processes`` on this computer, or ``jobs`` on a cluster."""
     launch, count = secrets.token_hex(8), jobs or options.processes
     threads = options.threads if jobs else options.threads or max(1, available_cores() // count)
-    return [WorkerTask(job, n + 1, count, 0 if jobs else n, launch, threads, options.debug) for n in range(count)]
+    how: dict[str, Any] = {"helps": True, "launch": launch, "threads": threads, "debug": options.debug}
+    return [WorkerTask(job, Shard(n + 1, count), 0 if jobs else n, **how) for n in range(count)]
 
 
 def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = _WORKER) -> bool:
@@ -175,7 +173,7 @@ def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, co
         for task in tasks:
             # In a session of its own, so that Ctrl-C reaches this process alone, which passes it on.
             child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
-            running.append(_Process(task.label, child))
+            running.append(_Process(str(task.shard), child))
             assert child.stdin is not None
             pickle.dump(task, child.stdin)
             child.stdin.close()
@@ -306,7 +304,7 @@ def _require_plain(options: LaunchOptions, rank: Rank) -> None:
 
 
 def _outcome(job: EvalJob, finished: bool, stopped: bool, *, reports: bool = True) -> EvalOutcome:
-    folder = EvalFolder(job.out, {})
-    failed = failures(folder, job.items)
+    folder = EvalFolder(job.out)
+    failed = folder.failures(job.items)
     open_items = [item for item in job.items if item.label not in failed and folder.missing(item, job.suite.rows)]
     return EvalOutcome(job, finished, stopped, failed, len(open_items), reports)

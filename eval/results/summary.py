@@ -8,8 +8,11 @@ from collections.abc import Mapping, Sequence
 from statistics import mean, median
 from typing import Any, NamedTuple
 
-from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
+from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
 from ufmstar_torch.eval.results import machine
+from ufmstar_torch.eval.results.files import to_json
+from ufmstar_torch.eval.results.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.results.run_job import RunJob
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 
@@ -27,31 +30,25 @@ class Ending(NamedTuple):
     reason: str
 
 
-def summarise(
-    *,
-    ending: Ending,
-    settings: Mapping[str, Any],
-    sequence: FrameSequence,
-    selected: int,
-    source: Mapping[str, Any],
-    runtime: Mapping[str, Any] | None,
-    records: Sequence[Mapping[str, Any]],
-    sessions: Sequence[Mapping[str, float]],
-    mixture: GaussianMixture,
-    figures: Mapping[str, Mapping[str, float]],
-    outputs: Mapping[str, str | None],
+GOING_ON = Ending(INTERRUPTED, "no orderly end: the program was killed, or is still running")
+
+
+def write_summary(
+    job: RunJob, folder: RunFolder, ending: Ending, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
-    """The content of summary.json, from what the run has stored: ``records`` are the lines of frames.jsonl, ``mixture``
-    that at the end; ``outputs`` holds for each file None if it exists, or why it does not."""
+    """Write summary.json from what is on disk, so that a continued run has the same, and return its content as plain
+    values; ``outputs`` holds for each file None if it exists, or why it does not."""
+    checkpoint, records = folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
-    return {
-        "program": "ufmstar run",
+    figures = RunMetrics(UFM, checkpoint.metrics).figures.figures()
+    summary = {
+        "program": RUN.program,
         "state": ending.state,
         "reason": ending.reason,
-        "sequence": _sequence(sequence),
-        "frames": _frames(records, selected),
-        "source": source,
-        "runtime": runtime,
+        "sequence": _sequence(job.sequence),
+        "frames": _frames(records, len(job.indices)),
+        "source": job.source_identity,
+        "runtime": job.source.runtime,
         "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
         "metrics": figures.get(UFM),
         "metrics_reason": None if UFM in figures else "no ground truth",
@@ -60,13 +57,16 @@ def summarise(
         **_posterior(done, figures.get(POSTERIOR)),
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
-        "mixture": _mixture(done, mixture),
+        "mixture": _mixture(done, job.ufm(checkpoint).mixture),
         "rotation_deviation_max": max((record["rotation_deviation"] for record in done), default=None),
-        "time": _time(done, sessions),
-        "outputs": outputs,
-        "settings": settings,
+        "time": _time(done, checkpoint.sessions),
+        "outputs": outputs or {},
+        "settings": job.settings,
         "versions": versions(),
     }
+    plain: dict[str, Any] = to_json(summary)
+    folder.write_summary(plain)
+    return plain
 
 
 def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:

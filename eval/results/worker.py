@@ -7,56 +7,37 @@ import pickle
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.machine import require_device
-from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerContext, run_job
-from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.eval.results.work import Worker, WorkerTask
 
 DONE, FAILED, STOPPED = 0, 1, 130
 
 
-@dataclass(frozen=True)
-class WorkerTask:
-    """What one process does; pickled for it."""
-
-    job: EvalJob  # what is evaluated; the output folder exists already
-    # index, count: which part it begins with, from 1, of how many.
-    index: int
-    count: int
-    local: int  # number of the process on its computer, from 0, which decides its GPU
-    launch: str  # the same for all processes that were started together; "" = one of its own
-    threads: int | None = None  # of the CPU; None = torch's own choice
-    debug: bool = False  # show tracebacks
-
-    @property
-    def label(self) -> str:
-        """For people."""
-        return f"{self.index}/{self.count}"
-
-
 def work(
-    task: WorkerTask,
-    *,
-    stop: Callable[[], bool],
-    report: Callable[[str], None],
-    waits: bool = False,
-    evaluate: Evaluate = evaluate_sequences,
+    task: WorkerTask, *, resume: bool = True, overwrite: bool = False, stop: Callable[[], bool], **context: Any
 ) -> bool:
-    """Take part; True when nothing is left to do. Raises FolderError, OSError, ValueError, ImportError: the work cannot
-    be begun, or nothing can be written."""
+    """Take part; True when nothing is left to do.
+
+    Args:
+        task: which part.
+        resume, overwrite: as ``EvalFolder.open`` takes them.
+        stop, **context: as :class:`Worker` takes them.
+
+    Raises:
+        FolderError, OSError, ValueError, ImportError: the work cannot be begun, or nothing can be written.
+    """
     if task.threads is not None:
         torch.set_num_threads(task.threads)
     job = replace(task.job, device=device_of(task.job.device, task.local))
     networks = job.load(torch.device(job.device))
-    folder = EvalFolder.open(job.out, job.about(networks), resume=True, overwrite=False)
-    shard = Shard(task.index, task.count)
-    context = WorkerContext(shard, True, waits, task.launch, stop=stop, report=report, evaluate=evaluate)
-    return run_job(job, folder, networks, context)
+    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
+    return Worker(replace(task, job=job), folder, networks, stop=stop, **context).run()
 
 
 def device_of(name: str, local: int) -> str:
@@ -79,7 +60,7 @@ def main() -> int:
         return bool(received) or os.getppid() != parent
 
     def report(line: str) -> None:
-        print(f"[{task.label}] {line}", file=sys.stderr, flush=True)
+        print(f"[{task.shard}] {line}", file=sys.stderr, flush=True)
 
     try:
         return DONE if work(task, stop=stop, report=report) else STOPPED

@@ -1,4 +1,4 @@
-"""What ``ufmstar run`` leaves on disk: per frame an npz and two 16-bit PNGs, and summary.json.
+"""What ``ufmstar run`` leaves of every frame: an npz and two 16-bit PNGs.
 
 ```
 OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with
@@ -6,7 +6,6 @@ OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and 
                       posterior also posterior_depth [m] and posterior_variance [m^2]
 OUT/depth/NAME.png    depth, 16 bit, 0 = invalid; metres per count in the PNG's text
 OUT/sigma/NAME.png    standard deviation, likewise
-OUT/summary.json
 ```
 Every file is complete or absent. Nothing here keeps more than one frame in memory.
 """
@@ -14,7 +13,6 @@ Every file is complete or absent. Nothing here keeps more than one frame in memo
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.results.files import write_json_atomic, write_together
+from ufmstar_torch.eval.results.files import write_together
 from ufmstar_torch.eval.sequences.images import read_map
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
@@ -102,10 +100,6 @@ class FrameWriter:
             }
         )
         return WrittenFrame(lost_d, lost_s)
-
-    def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Replace summary.json; the one before stays if that fails. See ``write_json_atomic``."""
-        write_json_atomic(self.out_dir / "summary.json", summary)
 
     def _depth_unit(self, depth: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
         """Metres per count of the depth PNGs, settled by the first frame of the run."""
