@@ -22,7 +22,7 @@ from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import load_results
-from ufmstar_torch.eval.results import launch, worker
+from ufmstar_torch.eval.results import launch, machine
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.launch import (
@@ -84,7 +84,7 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     given = {"network": network, "suite": str(tmp_path / "some.toml")}
     before = torch.get_num_threads()
     ended, message = quiet(options_for(rooms, tmp_path / "two", "--processes", "2", "--threads", "1", **given))
-    assert (ended.finished, ended.stopped, dict(ended.failed), ended.left) == (True, False, {}, 0), message
+    assert (ended.finished, ended.stopped, dict(ended.failed)) == (True, False, {}), message
     try:
         torch.set_num_threads(1)
         quiet(options_for(rooms, tmp_path / "one", **given))
@@ -154,9 +154,9 @@ def test_threads_are_divided_and_devices_go_round(rooms, tmp_path, monkeypatch):
     assert len({t.launch for t in tasks}) == 1
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(worker, "require_device", lambda name: name)
-    assert [worker.device_of("cuda", t.local) for t in tasks] == ["cuda:0", "cuda:1", "cuda:0"]
-    assert worker.device_of("cuda:1", 0) == "cuda:1"
+    monkeypatch.setattr(machine, "require_device", lambda name: name)
+    assert [machine.device_of("cuda", t.local) for t in tasks] == ["cuda:0", "cuda:1", "cuda:0"]
+    assert machine.device_of("cuda:1", 0) == "cuda:1"
 
 
 def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
@@ -170,7 +170,7 @@ def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
 
 def test_a_device_that_is_not_there():
     with pytest.raises(ValueError, match="--device abacus is not available"):
-        worker.device_of("abacus", 0)
+        machine.device_of("abacus", 0)
 
 
 # ---- torchrun ----
@@ -181,7 +181,7 @@ def as_rank(rank, world, options, result):
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(world), "LOCAL_RANK": str(rank)}
     stub = Stub(lambda *_: time.sleep(0.02))
     ended, _ = quiet(options, stub)
-    result.put((rank, ended.finished, ended.left, ended.reports, [name for name, _ in stub.asked]))
+    result.put((rank, ended.finished, ended.reports, [name for name, _ in stub.asked]))
 
 
 @pytest.mark.slow
@@ -197,9 +197,8 @@ def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(roo
     for child in children:
         child.join(60)
     assert [rank[:2] for rank in result] == [(0, True), (1, True)]
-    assert result[0][2:4] == (0, True)
-    assert not result[1][3]
-    assert sorted(result[0][4] + result[1][4]) == list(NAMES)
+    assert [rank[2] for rank in result] == [True, False]
+    assert sorted(result[0][3] + result[1][3]) == list(NAMES)
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")))
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
@@ -247,8 +246,8 @@ def test_parts_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path):
     ends = []
     for part in ("2/2", "1/2"):
         ended, _ = quiet(options_for(rooms, tmp_path / "out", "--shard", part), Stub())
-        ends.append((ended.finished, ended.left))
-    assert ends == [(True, 2), (True, 0)]
+        ends.append((ended.finished, len(list((tmp_path / "out" / "records").glob("*/*")))))
+    assert ends == [(True, 1), (True, 3)]
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")))
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
     with pytest.raises(FolderError, match=r"other input: settings\.confident was 0\.5"):
@@ -267,7 +266,7 @@ def test_jobs_through_submitit(rooms, tmp_path):
         rooms, tmp_path / "out", "--slurm", "cluster=debug", "jobs=2", "partition=gpu", "timeout_min=5"
     )
     ended, message = quiet(options)
-    assert (ended.finished, ended.left) == (True, 0)
+    assert ended.finished
     assert message[0].startswith("jobs ")
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")), evaluate_sequences)
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
@@ -359,18 +358,17 @@ def test_a_worker_reads_its_task_and_its_code_is_how_it_ended(rooms, tmp_path):
         task = pickle.dumps(
             WorkerTask(job_on(rooms, out, **changes), Shard(1, 2), helps=True, launch="abc", threads=1, debug=debug)
         )
-        command = (sys.executable, "-P", "-m", "ufmstar_torch.eval.results.worker")
-        ended = subprocess.run(command, input=task, capture_output=True, check=False)
+        ended = subprocess.run(launch._WORKER, input=task, capture_output=True, check=False)
         return ended.returncode, ended.stderr.decode()
 
     code, text = run(tmp_path / "out")
-    assert code == worker.DONE, text
+    assert code == launch.DONE, text
     assert "[1/2] rooms/ash: 4 rows, 4 frames" in text
     assert len(kept(tmp_path / "out")) == 12
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("x")
     code, text = run(tmp_path / "home")
-    assert code == worker.FAILED
+    assert code == launch.FAILED
     assert text.startswith("[1/2] failed: --out")
     assert "Traceback" in run(tmp_path / "home", debug=True)[1]
 

@@ -37,15 +37,7 @@ _TOLERANCE = UfMStarConfig().rotation_tolerance
 
 
 class SequenceError(Exception):
-    """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth.
-
-    Attributes:
-        reason: why.
-    """
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason)
-        self.reason = reason
+    """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth."""
 
 
 # Errors of a sequence that cannot be used. Any other error is a mistake in this program, and ends it.
@@ -153,9 +145,8 @@ class _Evaluation:
     def __init__(self, task: SequenceTask, judge: Judge, shared: dict[Row, Gaussians], slot: int) -> None:
         self.task, self.slot = task, slot
         sequence, rows = task.sequence, task.rows
-        _check_rows(rows, judge.networks)
         indices = range(len(sequence))[judge.limit]
-        _check_sequence(sequence, rows, indices)
+        _check(sequence, rows, indices, judge.networks)
         expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
         sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
         anchors = anchor_sources(rows, sequence.folder)
@@ -179,11 +170,29 @@ class _Evaluation:
 
     def outcome(self) -> list[RowResult] | Exception:
         """After the last frame: a result for each row, or why there is none."""
-        rows = self._accounts.rows
         try:
-            return [_result(row, rows[row.slug], self._metrics, self.task.sequence) for row in self.task.rows]
+            return [self._result(row) for row in self.task.rows]
         except BROKEN as error:
             return error
+
+    def _result(self, row: Row) -> RowResult:
+        """What a row leaves behind. Raises SequenceError: it has judged nothing."""
+        key, metrics, account = row.slug, self._metrics, self._accounts.rows[row.slug]
+        frames = account.frames(metrics.judged[key])
+        if not frames["judged"]:
+            reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
+            none = "none of those that were read has ground truth"
+            raise SequenceError(f"no frame could be judged: {reasons or none}")
+        opened = Counter(skipped.reason for skipped in self.task.sequence.skipped)
+        return RowResult(
+            row=row,
+            frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
+            figures=metrics.figures(key),
+            curves=metrics.curves(key),
+            state=account.state(),
+            ms=account.median_ms(),
+            sums=metrics.sums(key),
+        )
 
 
 def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
@@ -248,17 +257,14 @@ class _Accounts(FrameSink):
             self.rows[key].memory.append(self._runners[key].estimator.memory())
 
 
-def _check_rows(rows: Sequence[Row], networks: Mapping[str, DepthSource]) -> None:
-    """Raises ValueError for rows that cannot be judged, whatever the sequence."""
+def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range, networks: Mapping[str, DepthSource]) -> None:
+    """Raises ValueError for rows that cannot be judged on any sequence, and SequenceError where no frame of this one
+    can be judged, or the poses that rows compare views by are not known."""
     if not rows or len({row.slug for row in rows}) < len(rows):
         raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
     missing = sorted({row.method.base for row in rows} - networks.keys())
     if missing:
         raise ValueError(f"networks must hold one for each base of the rows, {', '.join(missing)} is missing")
-
-
-def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range) -> None:
-    """Raises SequenceError where no frame can be judged, or the poses that rows compare views by are not known."""
     if not indices:
         raise SequenceError(f"no frame is selected of {len(sequence)}")
     if all(sequence.entries[index].load_depth is None for index in indices):
@@ -266,21 +272,3 @@ def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range
     comparing = [row.method.name for row in rows if row.method.fusion != ALONE]
     if comparing and not sequence.posed:
         raise SequenceError(f"single images without poses, on which {', '.join(comparing)} cannot compare views")
-
-
-def _result(row: Row, account: _Account, metrics: RowMetrics, sequence: FrameSequence) -> RowResult:
-    """What a row leaves behind. Raises SequenceError: it has judged nothing."""
-    key, frames = row.slug, account.frames(metrics.judged[row.slug])
-    if not frames["judged"]:
-        reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
-        raise SequenceError(f"no frame could be judged: {reasons or 'none of those that were read has ground truth'}")
-    opened = Counter(skipped.reason for skipped in sequence.skipped)
-    return RowResult(
-        row=row,
-        frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
-        figures=metrics.figures(key),
-        curves=metrics.curves(key),
-        state=account.state(),
-        ms=account.median_ms(),
-        sums=metrics.sums(key),
-    )

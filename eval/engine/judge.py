@@ -200,28 +200,30 @@ class RegionMetrics(FrameSink):
 
     def by_region(self) -> dict[str, dict[str, dict[str, float]]]:
         """By region and row: "rmse" [m], "rms_sigma" (root of the mean variance) [m] and the other figures."""
-        return {
-            region: {
-                row: {**self._figures.of((row, region)).compute(), "rms_sigma": self._rms_sigma(row, region)}
-                for row in self._rows
-            }
-            for region in self._regions
-        }
 
-    def _rms_sigma(self, row: str, region: str) -> float:
-        total, pixels = self._variance[row, region]
-        return (total / pixels) ** 0.5 if pixels else float("nan")
+        def figures(*pair: str) -> dict[str, float]:
+            total, pixels = self._variance[pair]
+            return {**self._figures.of(pair).compute(), "rms_sigma": (total / pixels) ** 0.5 if pixels else math.nan}
+
+        return {region: {row: figures(row, region) for row in self._rows} for region in self._regions}
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     """Whose confidence a row is judged by: its base alone, and behind UfM with the fewest points that are among
     ``rows`` and see the same frames; of several settings the row's own, or else the default."""
-    same = [other for other in rows if other.method.base == row.method.base and _frames(other) == _frames(row)]
+
+    def seen(other: Row) -> tuple[str, int, str]:  # from which frames, and which part of them
+        return other.method.base, other.setting.skip, other.setting.preprocess
+
+    def points(other: Row) -> float:
+        return math.inf if other.method.max_points is None else other.method.max_points
+
+    same = [other for other in rows if seen(other) == seen(row)]
     alone = [other for other in same if other.method.fusion == method.ALONE and other.method.uses_aleatoric]
     pointwise = [other for other in same if other.method.fusion == method.UFM and not other.method.full]
-    fewest = min((_points(other) for other in pointwise), default=0)
+    fewest = min((points(other) for other in pointwise), default=0)
     chosen = []
-    for kind in (alone, [other for other in pointwise if _points(other) == fewest]):
+    for kind in (alone, [other for other in pointwise if points(other) == fewest]):
         if kind:
             chosen.append(
                 min(kind, key=lambda other: (other.setting.pose_noise != row.setting.pose_noise, other.setting.slug))
@@ -239,12 +241,3 @@ def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
         return judged
     threshold = values.kthvalue(max(1, math.ceil(share * len(values)))).values
     return judged & (torch.where(judged, estimate.variance, torch.inf) <= threshold)
-
-
-def _frames(row: Row) -> tuple[int, str]:
-    """What decides which frames a row sees, and which part of them."""
-    return row.setting.skip, row.setting.preprocess
-
-
-def _points(row: Row) -> float:
-    return math.inf if row.method.max_points is None else row.method.max_points

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ class NetworkChoice:
             raise ValueError(f"model must be one of {known}, got {self.model!r}; expected {_FORM}")
         if not self.weights:
             raise ValueError(f"{self.base}={self.model} needs the file of its weights: {_FORM}")
-        if len([file for file in self.files if _is_spec(file)]) > 1:
+        if len(self.files) - len(self.weights) > 1:
             raise ValueError(f"{self.base}={self.model} takes one spec, got {self.files}")
 
     @classmethod
@@ -77,12 +77,12 @@ class NetworkChoice:
     @property
     def weights(self) -> tuple[str, ...]:
         """The files without the spec."""
-        return tuple(file for file in self.files if not _is_spec(file))
+        return tuple(file for file in self.files if not file.endswith(".json"))
 
     @property
     def spec(self) -> str | None:
         """The file that declares what the weights do not say."""
-        return next((file for file in self.files if _is_spec(file)), None)
+        return next((file for file in self.files if file.endswith(".json")), None)
 
     @property
     def size(self) -> Size | None:
@@ -114,12 +114,13 @@ class NetworkChoice:
             return own_depth(self.size, identity, label=label, digest=_digest(identity))
         members, sampling = self._members(inference, device), self.base == "mc_dropout"
         check_members(self.base, members, device)
-        files = [_identity(file) for file in self.weights]
+        named = [(Path(path), member) for path, member in map(_path, self.weights)]
+        files = [{"name": path.name, "sha256": sha256(path), "member": member} for path, member in named]
         spec = None if self.spec is None else sha256(Path(self.spec))
         run_by = _run_by(members, inference)
         made_of = {"model": self.model, "files": [file | {"name": None} for file in files], "spec": spec}
         drawn = {"samples": samples} if sampling else {}
-        label = self.label or _label(self.model, Path(_path(self.weights[0])[0]), members[0])
+        label = self.label or _label(self.model, named[0][0], members[0])
         identity = {
             "model": self.model, "label": label, "files": files, "spec": spec, "members": len(members),
             **run_by, **drawn,
@@ -216,23 +217,18 @@ def load_members(
     for file in [*(paths if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
         if not file.is_file():
             raise FileNotFoundError(f"no such file: {file}")
-    options = {} if spec is None else {"spec": spec}
+    options: dict[str, Any] = {} if spec is None else {"spec": spec}
     members: list[DepthNetwork] = []
     for path in paths:
-        loaded = _loaded(model, path, options | inference.options(model, device), offload)
+        how = options | inference.options(model, device)
+        try:
+            trained = model == "trained" and not how
+            loaded = load_trained([path], offload=offload) if trained else [load_network(model, path, **how)]
+        except TypeError as error:
+            raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
         members += [inference.ready(network, path, device) for network in loaded]
     _require_same_input(members)
     return members
-
-
-def _loaded(model: str, file: Path, options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
-    """The networks in a file. Raises ValueError, as :func:`network_source`."""
-    if model == "trained" and not options:
-        return load_trained([file], offload=offload)
-    try:
-        return [load_network(model, file, **options)]
-    except TypeError as error:
-        raise ValueError(f"model {model!r} does not take {sorted(options)}: {error}") from error
 
 
 def _run_by(members: Iterable[DepthNetwork], inference: Inference) -> dict[str, str]:
@@ -288,15 +284,6 @@ def _path(file: str) -> tuple[str, int | None]:
     if mark and path and number.isdecimal() and not Path(file).exists():
         return path, int(number)
     return file, None
-
-
-def _identity(file: str) -> dict[str, Any]:
-    path, member = _path(file)
-    return {"name": Path(path).name, "sha256": sha256(Path(path)), "member": member}
-
-
-def _is_spec(file: str) -> bool:
-    return file.endswith(".json")
 
 
 def _digest(values: dict[str, Any]) -> str:
