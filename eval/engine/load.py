@@ -221,11 +221,13 @@ def load_members(
     members: list[DepthNetwork] = []
     for path in paths:
         how = options | inference.options(model, device)
-        try:
-            trained = model == "trained" and not how
-            loaded = load_trained([path], offload=offload) if trained else [load_network(model, path, **how)]
-        except TypeError as error:
-            raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
+        if model == "trained" and not how:
+            loaded = load_trained([path], offload=offload)
+        else:
+            try:
+                loaded = [load_network(model, path, **how)]
+            except TypeError as error:
+                raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
         members += [inference.ready(network, path, device) for network in loaded]
     _require_same_input(members)
     return members

@@ -56,11 +56,6 @@ class Prediction:
         return {name: value for name, value in named.items() if value is not None}
 
     @classmethod
-    def of(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> Prediction:
-        """What a network returned for one image, [1, h, w]; ``intrinsics`` [3, 3]."""
-        return cls.each(prediction, intrinsics[None], ms)[0]
-
-    @classmethod
     def each(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> list[Prediction]:
         """What a network returned for B images, [B, h, w]; ``intrinsics`` [B, 3, 3], ``ms`` of all together."""
         share = None if ms is None else ms / len(intrinsics)
@@ -82,7 +77,8 @@ def combined(predictions: Sequence[Prediction]) -> Prediction:
 
     joint = combine([DepthPrediction(p.depth[None], batch(p.aleatoric), batch(p.epistemic)) for p in predictions])
     times = [p.ms for p in predictions if p.ms is not None]
-    return Prediction.of(joint, predictions[0].intrinsics, sum(times) if len(times) == len(predictions) else None)
+    ms = sum(times) if len(times) == len(predictions) else None
+    return Prediction.each(joint, predictions[0].intrinsics[None], ms)[0]
 
 
 class DepthSource(ABC):

@@ -44,7 +44,7 @@ class FrameResult:
     # "truth", and the stages of the sinks that came before [ms].
     ms: dict[str, float] = field(default_factory=dict)
     # the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
-    state: Mapping[str, Tensor] = field(default_factory=dict)
+    state: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
 
 class FrameSink(ABC):
@@ -115,16 +115,9 @@ class FrameStream:
         for _ in drive_together(iter([(self, sinks)]), stop=stop):
             pass
 
-    def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame depends, by row: "KEY/NAME"."""
-        return {f"{row.key}/{name}": value for row in self.rows for name, value in row.state().items()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Bring the rows to where ``state`` was taken; :attr:`position` is the caller's. Raises ValueError: it is the
-        state of other rows."""
-        for row in self.rows:
-            prefix = f"{row.key}/"
-            row.load_state({name[len(prefix) :]: v for name, v in state.items() if name.startswith(prefix)})
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """All tensors on which the next frame depends, by row."""
+        return {row.key: row.state() for row in self.rows}
 
     def needed(self) -> list[int]:
         """Of the frames that are left, those that a row selects; without rows all."""

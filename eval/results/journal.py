@@ -8,7 +8,6 @@ from typing import Any
 
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.anchors import FrameAnchors
 from ufmstar_torch.eval.engine.estimators import Estimate
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.rows import RowFrame
@@ -42,7 +41,7 @@ class Journal(FrameSink):
         session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
         checkpoint = Checkpoint(
             position=result.number + 1,
-            module=saved_state(result.state, bare=not self._job.source.needs_image),
+            module=saved_state(result.state[UFM], bare=not self._job.source.needs_image),
             metrics=self._metrics.figures.state(),
             sessions=[*self._earlier, session],
         )
@@ -65,8 +64,7 @@ class Journal(FrameSink):
             return {**about, "state": "skipped", "reason": result.skipped[UFM]}
         row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row.estimate, name) for name in _MAPS}
-        lost = self._folder.writer.write(result.name, valid=row.estimate.valid, **maps)
-        saturated = {"saturated": {"depth": lost.depth_saturated, "sigma": lost.sigma_saturated}}
+        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.estimate.valid, **maps)}
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
         return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
 
@@ -117,11 +115,13 @@ def _anchor_figures(row: RowFrame) -> dict[str, Any]:
     with a depth, and ``used`` agree with others. Without any used, ``without`` is the reason. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
-    anchors, estimate = row.anchors, row.estimate
-    if anchors is None or estimate.anchored is None or estimate.bias is None:
+    anchors, estimate, statistics = row.anchors, row.estimate, row.estimate.statistics
+    if anchors is None or statistics is None or estimate.anchored is None or estimate.bias is None:
         return {}
+    used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
+    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
     return {
-        "anchors": _corners(anchors, estimate),
+        "anchors": {**counts, "without": None if used else why_none(anchors.triangulated, usable, anchors.none)},
         "mean_anchored": _mean(estimate.anchored, estimate.valid),
         "mean_bias": _mean(estimate.bias, estimate.valid),
         **_posterior_figures(estimate),
@@ -140,14 +140,6 @@ def _posterior_figures(estimate: Estimate) -> dict[str, Any]:
         "unseen": float(statistics.unseen[0]),
     }
     return {"posterior": figures}
-
-
-def _corners(anchors: FrameAnchors, estimate: Estimate) -> dict[str, Any]:
-    assert estimate.statistics is not None
-    used, usable = int(estimate.statistics.anchors_used[0]), int(estimate.statistics.anchors[0])
-    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
-    why = None if used else why_none(anchors.triangulated, usable, anchors.none)
-    return {**counts, "without": why}
 
 
 def why_none(triangulated: int, usable: int, none: str) -> str:

@@ -107,9 +107,8 @@ class RunJob:
 
 
 def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
-    """The state of a run's row (part of ``FrameStream.state``) as state.pt holds it; ``bare``: of a run on maps."""
-    own = {name.removeprefix(f"{UFM}/"): value for name, value in state.items()}
-    return {k.removeprefix(_UFM): v for k, v in own.items() if k != _TURN} if bare else own
+    """The state of a run's row as state.pt holds it; ``bare``: of a run on maps."""
+    return {k.removeprefix(_UFM): v for k, v in state.items() if k != _TURN} if bare else dict(state)
 
 
 def row_state(saved: Mapping[str, Tensor], *, bare: bool, images: Tensor) -> dict[str, Tensor]:

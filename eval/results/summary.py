@@ -115,14 +115,16 @@ def _why_not_alone(done: Sequence[Mapping[str, Any]], judged: bool) -> str:
 
 def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Means over all valid pixels of all frames. With perfect depth, they are the method's floor."""
+    pixels = sum(record["valid_pixels"] for record in done)
     saturated = {kind: sum(record["saturated"][kind] for record in done) for kind in ("depth", "sigma")}
     return {
         "mean_disagreement": _pixel_mean(done, "mean_disagreement"),
         "mean_sigma": _pixel_mean(done, "mean_sigma"),
         "mean_network_sigma": _pixel_mean(done, "mean_network_sigma"),
         "units": "disagreement m^2, sigma m",
-        "near_zero_share": _near_zero_share(done),
-        "valid_pixels": sum(record["valid_pixels"] for record in done),
+        # Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0.
+        "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
+        "valid_pixels": pixels,
         "saturated_png_pixels": saturated,
     }
 
@@ -142,12 +144,6 @@ def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
         "mean_bias": _pixel_mean(done, "mean_bias"),
         "units": "mean_anchored m^2 (B), mean_bias 1 (r: true depth over predicted, less 1)",
     }
-
-
-def _near_zero_share(done: Sequence[Mapping[str, Any]]) -> float | None:
-    """Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0."""
-    pixels = sum(record["valid_pixels"] for record in done)
-    return sum(record["near_zero"] for record in done) / pixels if pixels else None
 
 
 def _pixel_mean(done: Sequence[Mapping[str, Any]], key: str) -> float | None:

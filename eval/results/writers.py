@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,6 @@ FULL = 65535
 # the row above, takes six tenths of the time of a choice for every row, and the files are as large.
 PNG_LEVEL = 1
 _AFTER_HEADER = 33  # bytes: signature and IHDR
-
-
-class WrittenFrame(NamedTuple):
-    """Valid pixels of a frame that lie beyond the PNGs' range and are stored as its largest value."""
-
-    depth_saturated: int
-    sigma_saturated: int
 
 
 class FrameWriter:
@@ -70,9 +63,10 @@ class FrameWriter:
         names = sorted(path.stem for path in (self.out_dir / "frames").glob("[!.]*.npz"))
         return [name for name in names if self.finished(name)]
 
-    def write(self, name: str, *, valid: Tensor, **given: Tensor | None) -> WrittenFrame:
+    def write(self, name: str, *, valid: Tensor, **given: Tensor | None) -> dict[str, int]:
         """Write one frame; none of its files appears before all are written. The maps are [H, W]; those that are None
-        are left out, and ``valid`` is True where the pixel was used.
+        are left out, and ``valid`` is True where the pixel was used. Returns how many valid pixels of "depth" and
+        "sigma" lie beyond the PNGs' range and are stored as its largest value.
 
         Raises:
             ValueError: shapes or types disagree.
@@ -99,7 +93,7 @@ class FrameWriter:
                 paths["frames"]: lambda file: np.savez(file, allow_pickle=False, **maps),
             }
         )
-        return WrittenFrame(lost_d, lost_s)
+        return {"depth": lost_d, "sigma": lost_s}
 
     def _depth_unit(self, depth: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
         """Metres per count of the depth PNGs, settled by the first frame of the run."""
