@@ -192,8 +192,8 @@ def test_a_state_taken_at_any_frame_gives_the_same_bits(tour):
     whole.drive([sink, States()])
     for start in range(1, FRAMES):
         rows = rows_with_memory()
-        for row in rows:
-            row.load_state(states[start - 1][row.key])
+        for one in rows:
+            one.load_state(states[start - 1][one.key])
         stream = FrameStream(tour, range(FRAMES), rows, start=start)
         again = Recorded("again", [])
         stream.drive([again])
