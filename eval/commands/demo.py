@@ -233,15 +233,10 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
         compiled.result()
     progress(Progress("kernels", 1, 1))
     entries = [
-        replace(entry, load_image=partial(_same, frame.image), load_depth=partial(_same, frame.depth))
+        replace(entry, load_image=partial(np.asarray, frame.image), load_depth=partial(np.asarray, frame.depth))
         for entry, frame in zip(sequence.entries, frames, strict=True)
     ]
     return replace(sequence, entries=tuple(entries))
-
-
-def _same(array: np.ndarray | None) -> np.ndarray:
-    assert array is not None
-    return array
 
 
 def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from ufmstar_torch.eval.results.journal import Journal
 from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.results.run_folder import RunFolder
 from ufmstar_torch.eval.results.run_job import RunJob
-from ufmstar_torch.eval.results.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, Ending, write_summary
+from ufmstar_torch.eval.results.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.tour.open import open_sequence
@@ -71,21 +71,21 @@ def run(
         Exception: whatever else the network or UfM* raise, after the summary was written.
     """
     with RunFolder.open(out, job.identity(), resume=resume, overwrite=overwrite) as folder:
-        write_summary(job, folder, GOING_ON)
-        ending, outputs = Ending(FAILED, "an error in the program"), {}
+        write_summary(job, folder, *GOING_ON)
+        ending, outputs = (FAILED, "an error in the program"), {}
         try:
             _frames(job, folder, progress, stop)
             ending = _ending(job, folder)
             outputs = _outputs(job, folder, progress, stop)
         except (KeyboardInterrupt, Stopped):
-            ending = Ending(INTERRUPTED, f"stopped by the user after {_counts(folder, job)}; --resume goes on")
+            ending = INTERRUPTED, f"stopped by the user after {_counts(folder, job)}; --resume goes on"
         except OSError as error:
-            ending = Ending(FAILED, f"{error}; stopped after {_counts(folder, job)}; --resume goes on")
+            ending = FAILED, f"{error}; stopped after {_counts(folder, job)}; --resume goes on"
         except BaseException as error:
-            ending = Ending(FAILED, f"{type(error).__name__}: {error}")
+            ending = FAILED, f"{type(error).__name__}: {error}"
             raise
         finally:
-            summary = write_summary(job, folder, ending, outputs)
+            summary = write_summary(job, folder, *ending, outputs)
     return summary
 
 
@@ -103,12 +103,12 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
         stream.drive([behind, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
-def _ending(job: RunJob, folder: RunFolder) -> Ending:
+def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:
     """Of a run that went through all frames."""
     if any(record["state"] == "done" for record in folder.records):
-        return Ending(FINISHED, _counts(folder, job))
+        return FINISHED, _counts(folder, job)
     reasons = sorted({record["reason"] for record in folder.records})
-    return Ending(FAILED, f"no frame could be used: {'; '.join(reasons[:3])}")
+    return FAILED, f"no frame could be used: {'; '.join(reasons[:3])}"
 
 
 def _skipped(folder: RunFolder) -> int:

@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from ufmstar_torch.eval.engine.ahead import FramesAhead
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
-from ufmstar_torch.eval.engine.together import Inference, infer_together, update_together
+from ufmstar_torch.eval.engine.together import infer_together, update_together
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 
@@ -135,8 +136,9 @@ class FrameStream:
                 row.source.prepare(frame)
 
     def next(self, frames: FramesAhead) -> _Frame:
-        """The way of the next frame: yields the inferences, which may be made meanwhile, and then the updates, which
-        must be answered; returns what came of the frame. Raises FrameError: without rows, the frame cannot be read."""
+        """The way of the next frame: yields (predictions, row) whose inferences may be made meanwhile, and then the
+        rows' frames, which must be answered; returns what came of it. Raises FrameError: without rows, the frame cannot
+        be read."""
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
         active = [row for row in self.rows if row.selects(number)]
@@ -150,7 +152,7 @@ class FrameStream:
                 if self._check is not None:
                     self._check(frame)
             known = FramePredictions(frame, self._device, self._store, self._digest)
-            yield [Inference(known, row) for row in active]
+            yield [(known, row) for row in active]
             with self.timer.stage("predict"):
                 predictions = {row.key: row.predict(known) for row in active}
             with self.timer.stage("truth"):
@@ -173,7 +175,7 @@ class FrameStream:
         return FrameResult(number, index, name, frame, taken, skipped, ms)
 
 
-_Frame = Generator[Sequence[Inference | RowFrame], None, FrameResult]
+_Frame = Generator[Sequence[Any], None, FrameResult]
 
 
 def drive_together(
@@ -236,7 +238,7 @@ class _Lane:
         done = self._frame is None and self.stream.position >= len(self.stream.indices)
         return done or self.error is not None
 
-    def advance(self) -> Sequence[Inference | RowFrame]:
+    def advance(self) -> Sequence[Any]:
         """Bring the frame in hand, or the next one, to its next stop: what it needs there. At its end the sinks get
         what came of it."""
         if self.over:
@@ -278,11 +280,11 @@ class _Lane:
 
 def _one_frame_of_each(lanes: Sequence[_Lane]) -> None:
     """All frames to their first stop, there the inferences; to their second stop, there the updates; to their end."""
-    wanted = [one for lane in lanes for one in lane.advance()]
-    while any(lane.waits for lane in lanes):
-        infer_together([one for one in wanted if isinstance(one, Inference)])
-        update_together([one for one in wanted if isinstance(one, RowFrame)])
-        wanted = [one for lane in lanes if lane.waits for one in lane.advance()]
+    infer_together([one for lane in lanes for one in lane.advance()])
+    update_together([one for lane in lanes if lane.waits for one in lane.advance()])
+    for lane in lanes:
+        if lane.waits:
+            lane.advance()
 
 
 def hand_over(result: FrameResult, sinks: Sequence[FrameSink], timer: StageTimer) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput, Gaussians
@@ -12,19 +11,11 @@ from ufmstar_torch.eval.engine.predictions import FramePredictions
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 
 
-class Inference(NamedTuple):
-    """A frame's predictions, and the row that needs one of them."""
-
-    predictions: FramePredictions
-    row: RowRunner
-
-
-def infer_together(wanted: Sequence[Inference]) -> None:
-    """Make the inferences of several frames, as one batch of every network; those of one frame are left to it.
-
-    Inferences that fail together are left to each frame as well, which then meets its own error.
+def infer_together(wanted: Sequence[tuple[FramePredictions, RowRunner]]) -> None:
+    """Make the inferences of several frames, each of which a row needs, as one batch of every network; those of one
+    frame are left to it. Inferences that fail together are left to each frame as well, which then meets its own error.
     """
-    if len({one.predictions for one in wanted}) < 2:
+    if len({predictions for predictions, _ in wanted}) < 2:
         return
     frames: dict[tuple[object, int], dict[FramePredictions, NetworkSource]] = {}
     for predictions, row in wanted:

@@ -58,11 +58,6 @@ class FolderKind:
     # of (the manifest in the folder, the new one): what the folder contains from then on.
     merge: Callable[[Manifest, Manifest], Manifest] = lambda then, _: then
 
-    @property
-    def indefinite(self) -> str:
-        """The noun with its article."""
-        return f"{'an' if self.noun[0] in 'aeiou' else 'a'} {self.noun}"
-
     def new_manifest(self, content: Manifest) -> dict[str, Any]:
         """The manifest of new work, as plain values; ``content`` is what the kind keeps beside program and format."""
         own = {"state": _UNFINISHED} if self.format is None else {"format": self.format}
@@ -78,7 +73,9 @@ class FolderKind:
                 raise ValueError(f"made by {manifest['program']}, format {manifest['format']}")
             return dict(manifest)
         except (ValueError, KeyError, TypeError) as error:
-            raise FolderError(f"--resume: {path} is not {self.indefinite}'s that can be continued ({error})") from error
+            article = "an" if self.noun[0] in "aeiou" else "a"
+            text = f"--resume: {path} is not {article} {self.noun}'s that can be continued ({error})"
+            raise FolderError(text) from error
 
     def occupied(self, out: Path) -> bool:
         """Whether the folder contains earlier work of the program. Raises FolderError: it is a file, or contains files
@@ -212,19 +209,13 @@ def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
         lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
     except Timeout:
         return None
-    except NotImplementedError as error:  # filelock's form of ENOSYS
-        raise _no_locks(path, errno.ENOSYS) from error
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
+    except (NotImplementedError, OSError) as error:
+        code = error.errno if isinstance(error, OSError) else errno.ENOSYS  # filelock's form of it
+        if code not in _NO_LOCKS:
             raise
-        raise _no_locks(path, error.errno) from error
+        text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
+        raise OSError(code, text, str(path)) from error
     return lock
-
-
-def _no_locks(path: Path, code: int) -> OSError:
-    """The error of a file system that does not support locks."""
-    text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
-    return OSError(code, text, str(path))
 
 
 def differences(then: Manifest, now: Manifest) -> str:

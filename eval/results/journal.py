@@ -50,7 +50,7 @@ class Journal(FrameSink):
         after = perf_counter()
         self._saving = 1000 * (after - before)
         if after - self._summarised > _SUMMARY_EVERY:
-            write_summary(self._job, self._folder, GOING_ON)
+            write_summary(self._job, self._folder, *GOING_ON)
             self._summarised = perf_counter()
 
     def end(self) -> None:

@@ -6,7 +6,7 @@ import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import mean, median
-from typing import Any, NamedTuple
+from typing import Any
 
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
 from ufmstar_torch.eval.results import machine
@@ -23,28 +23,23 @@ STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "s
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 
 
-class Ending(NamedTuple):
-    """How a run ended: "finished", "interrupted" or "failed", and why."""
-
-    state: str
-    reason: str
-
-
-GOING_ON = Ending(INTERRUPTED, "no orderly end: the program was killed, or is still running")
+# How a run ended, or not: the state, and why.
+GOING_ON = INTERRUPTED, "no orderly end: the program was killed, or is still running"
 
 
 def write_summary(
-    job: RunJob, folder: RunFolder, ending: Ending, outputs: Mapping[str, str | None] | None = None
+    job: RunJob, folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
     """Write summary.json from what is on disk, so that a continued run has the same, and return its content as plain
-    values; ``outputs`` holds for each file None if it exists, or why it does not."""
+    values. ``state`` and ``reason``: how the run ended; ``outputs`` holds for each file None if it exists, or why it
+    does not."""
     checkpoint, records = folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
     figures = RunMetrics(UFM, checkpoint.metrics).figures.figures()
     summary = {
         "program": RUN.program,
-        "state": ending.state,
-        "reason": ending.reason,
+        "state": state,
+        "reason": reason,
         "sequence": _sequence(job.sequence),
         "frames": _frames(records, len(job.indices)),
         "source": job.source_identity,
