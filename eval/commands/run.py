@@ -130,7 +130,7 @@ def _outputs(
         return {}
     for name, write in mixture_writers(job.ufm(folder.checkpoint)).items():
         write(folder.path / name)
-    write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).figures.curves())
+    write_json_atomic(folder.path / "curves.json", RunMetrics(UFM, folder.checkpoint.metrics).curves())
     made: dict[str, str | None] = dict.fromkeys(("mixture.ply", "ellipsoids.ply", "mixture.npz", "curves.json"))
     with_error = any(record["ground_truth"] for record in done) and not job.source.is_truth
     finished = Finished(folder.path, job.sequence, done, with_error)

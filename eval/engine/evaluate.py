@@ -177,8 +177,8 @@ class _Evaluation:
 
     def _result(self, row: Row) -> RowResult:
         """What a row leaves behind. Raises SequenceError: it has judged nothing."""
-        key, metrics, account = row.slug, self._metrics, self._accounts.rows[row.slug]
-        frames = account.frames(metrics.judged[key])
+        key, metrics, accounts = row.slug, self._metrics, self._accounts
+        frames = accounts.frames(key, metrics.judged[key])
         if not frames["judged"]:
             reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
             none = "none of those that were read has ground truth"
@@ -189,8 +189,8 @@ class _Evaluation:
             frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
             figures=metrics.figures(key),
             curves=metrics.curves(key),
-            state=account.state(),
-            ms=account.median_ms(),
+            state=accounts.state(key),
+            ms=accounts.median_ms(key),
             sums=metrics.sums(key),
         )
 
@@ -210,51 +210,45 @@ def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) 
         raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
 
 
-@dataclass
-class _Account:
-    """Counts, times and memory of a row over a sequence."""
+class _Accounts(FrameSink):
+    """Counts, times and memory of every row over a sequence, by key."""
 
-    reasons: Counter[str] = field(default_factory=Counter)
-    ms: list[Mapping[str, float]] = field(default_factory=list)
-    memory: list[Mapping[str, float]] = field(default_factory=list)
+    def begin(self, stream: FrameStream) -> None:
+        self._rows = {row.key: row for row in stream.rows}
+        self._reasons: dict[str, Counter[str]] = {key: Counter() for key in self._rows}
+        self._ms: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
+        self._memory: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
 
-    def frames(self, judged: int) -> dict[str, Any]:
+    def take(self, result: FrameResult) -> None:
+        for key, reason in result.skipped.items():
+            self._reasons[key][reason] += 1
+        for key, row in result.rows.items():
+            self._ms[key].append(row.ms)
+            self._memory[key].append(self._rows[key].estimator.memory())
+
+    def frames(self, key: str, judged: int) -> dict[str, Any]:
         """Counts, as ``Record`` has them."""
-        skipped, done = sum(self.reasons.values()), len(self.ms)
+        reasons, done = self._reasons[key], len(self._ms[key])
+        skipped = sum(reasons.values())
         counts = {"selected": done + skipped, "done": done, "judged": judged, "skipped": skipped}
-        return {**counts, "reasons": dict(sorted(self.reasons.items()))}
+        return {**counts, "reasons": dict(sorted(reasons.items()))}
 
-    def state(self) -> dict[str, float]:
+    def state(self, key: str) -> dict[str, float]:
         """What the method kept over the sequence, as ``Record`` has it."""
         state: dict[str, float] = {}
-        for name, end in (self.memory[-1] if self.memory else {}).items():
-            values = [kept[name] for kept in self.memory]
+        for name, end in (self._memory[key][-1] if self._memory[key] else {}).items():
+            values = [kept[name] for kept in self._memory[key]]
             if name in ("bytes", "count"):
                 state |= {f"{name}_mean": sum(values) / len(values), f"{name}_max": max(values), f"{name}_end": end}
             else:
                 state |= {"anchors_mean": sum(values) / len(values)} if name == "anchors" else {name: end}
         return state
 
-    def median_ms(self) -> dict[str, float]:
+    def median_ms(self, key: str) -> dict[str, float]:
         """Of the typical frame, by stage [ms]."""
         stages = ("network", "anchors", "uncertainty")
-        times = {stage: [ms[stage] for ms in self.ms if stage in ms] for stage in stages}
+        times = {stage: [ms[stage] for ms in self._ms[key] if stage in ms] for stage in stages}
         return {stage: median(values) for stage, values in times.items() if values}
-
-
-class _Accounts(FrameSink):
-    """The account of every row, by key."""
-
-    def begin(self, stream: FrameStream) -> None:
-        self._runners = {row.key: row for row in stream.rows}
-        self.rows = {key: _Account() for key in self._runners}
-
-    def take(self, result: FrameResult) -> None:
-        for key, reason in result.skipped.items():
-            self.rows[key].reasons[reason] += 1
-        for key, row in result.rows.items():
-            self.rows[key].ms.append(row.ms)
-            self.rows[key].memory.append(self._runners[key].estimator.memory())
 
 
 def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range, networks: Mapping[str, DepthSource]) -> None:

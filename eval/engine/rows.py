@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.anchors import AnchorSource, FrameAnchors
 from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput
-from ufmstar_torch.eval.engine.predictions import DepthSource, FramePredictions, Prediction
-from ufmstar_torch.eval.methods.perturb import Drift, perturbed, selects
+from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
+from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.frame import FRAME_FAULTS
@@ -86,15 +86,6 @@ class RowRunner:
         self.images = 0
         self.device = device or torch.device("cpu")
         self._drift = Drift(setting)
-
-    def selects(self, number: int) -> bool:
-        """Whether the row uses image ``number`` of those that the stream selects."""
-        return selects(self.setting, number)
-
-    def predict(self, predictions: FramePredictions) -> Prediction:
-        """The prediction that the row gets for the next frame. Raises FrameError: the frame has nothing to predict
-        from."""
-        return predictions.of(self.source, self.images, self.every)
 
     def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowFrame:
         """The next frame as the row sees it; its ground truth is for anchors of it alone."""

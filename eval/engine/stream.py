@@ -23,6 +23,7 @@ from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.together import infer_together, update_together
+from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 
@@ -123,7 +124,7 @@ class FrameStream:
     def needed(self) -> list[int]:
         """Of the frames that are left, those that a row selects; without rows all."""
         left = range(self.position, len(self.indices))
-        return [self.indices[n] for n in left if not self.rows or any(row.selects(n) for row in self.rows)]
+        return [self.indices[n] for n in left if not self.rows or any(selects(row.setting, n) for row in self.rows)]
 
     def prepare(self, frame: Frame) -> None:
         """The networks' input, unless a store may have all predictions; in the thread that reads ahead.
@@ -141,7 +142,7 @@ class FrameStream:
         be read."""
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
-        active = [row for row in self.rows if row.selects(number)]
+        active = [row for row in self.rows if selects(row.setting, number)]
         self.timer.take()
         self.position += 1
         if self.rows and not active:
@@ -154,7 +155,7 @@ class FrameStream:
             known = FramePredictions(frame, self._device, self._store, self._digest)
             yield [(known, row) for row in active]
             with self.timer.stage("predict"):
-                predictions = {row.key: row.predict(known) for row in active}
+                predictions = {row.key: known.of(row.source, row.images, row.every) for row in active}
             with self.timer.stage("truth"):
                 truths = _truths(frame, predictions)
         except FrameError as error:

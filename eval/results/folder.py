@@ -122,12 +122,11 @@ class OutputFolder:
 
     Attributes:
         path: the folder.
-        manifest: its content.
         resumed: whether it contained earlier work that goes on.
     """
 
-    def __init__(self, path: Path, manifest: Manifest, *, resumed: bool, held: ExitStack) -> None:
-        self.path, self.manifest, self.resumed, self._held = path, manifest, resumed, held
+    def __init__(self, path: Path, *, resumed: bool, held: ExitStack) -> None:
+        self.path, self.resumed, self._held = path, resumed, held
 
     @classmethod
     def open(
@@ -174,7 +173,7 @@ class OutputFolder:
                 kind.clear(out)
             if not resumed or manifest != earlier:
                 write_json_atomic(out / kind.manifest, manifest)
-            return cls(out, manifest, resumed=resumed, held=held.pop_all() if kind.held == "life" else ExitStack())
+            return cls(out, resumed=resumed, held=held.pop_all() if kind.held == "life" else ExitStack())
 
     def close(self) -> None:
         """Release the lock."""

@@ -42,7 +42,7 @@ class Journal(FrameSink):
         checkpoint = Checkpoint(
             position=result.number + 1,
             module=saved_state(result.state[UFM], bare=not self._job.source.needs_image),
-            metrics=self._metrics.figures.state(),
+            metrics=self._metrics.sums(),
             sessions=[*self._earlier, session],
         )
         before = perf_counter()

@@ -35,7 +35,7 @@ def write_summary(
     does not."""
     checkpoint, records = folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
-    figures = RunMetrics(UFM, checkpoint.metrics).figures.figures()
+    figures = RunMetrics(UFM, checkpoint.metrics).figures()
     summary = {
         "program": RUN.program,
         "state": state,
