@@ -162,7 +162,9 @@ def job_from(chosen: RunOptions) -> RunJob:
     """
     options, config = chosen.settings(), chosen.config
     device = require_device(options["device"])
-    sequence = _sequence(chosen)
+    sequence = open_sequence(chosen.sequence, **chosen.opening.given())
+    if not sequence.posed:
+        raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
     landmarks = _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchored else LandmarkTracker
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
@@ -200,13 +202,6 @@ def _recalibration(chosen: RunOptions, source: DepthSource) -> str:
     except ValueError as error:
         raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
     return named(file)
-
-
-def _sequence(chosen: RunOptions) -> FrameSequence:
-    sequence = open_sequence(chosen.sequence, **chosen.opening.given())
-    if not sequence.posed:
-        raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
-    return sequence
 
 
 def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], LandmarkSource]:

@@ -104,9 +104,7 @@ class NetworkChoice:
             inference: runtime and precision.
 
         Raises:
-            FileNotFoundError: a file is missing.
-            ValueError: files that do not fit, or a network that does not predict what its base is about; see
-                ``check_members``.
+            FileNotFoundError, ValueError: as :func:`load_members`, or as ``check_members``.
         """
         if self.model == TRUTH:
             label = self.label or "ground truth"
@@ -156,45 +154,43 @@ def network_source(
     model: str,
     weights: Iterable[str | Path],
     *,
-    spec: str | Path | None = None,
     mode: str = "alternate",
     samples: int | None = None,
-    offload: bool = False,
+    spec: str | Path | None = None,
     inference: Inference = _AS_USERS,
     device: str = "cpu",
+    **how: Any,
 ) -> NetworkSource:
     """One network, or the members of an ensemble, from files, as ``ufmstar run`` runs them.
 
     Args:
-        model: a name that ``load_network`` accepts.
-        weights: one file for each member (a directory for networks of ``transformers``); those of "trained" may hold
-            several.
-        spec: declares what an ONNX file or saved program does not say.
+        model, weights, spec, inference, **how: as :func:`load_members` takes them.
         mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
             passes of a network that samples).
         samples: None: as many as the paper's baseline.
-        offload: of "trained": weights stay in host memory and come to the device for their turn only.
-        inference: runtime, precision and threads.
         device: "cpu", "cuda", ...
 
     Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: unknown model, files that do not fit it, members that want different inputs, mode "full"
-            of one network that does not sample, ``samples`` for any other.
+        FileNotFoundError, ValueError: as :func:`load_members`; mode "full" of one network that does not sample, or
+            ``samples`` for any other.
     """
-    files = [Path(file) for file in weights]
-    where = torch.device(device)
-    members = load_members(model, files, spec=spec, offload=offload, inference=inference, device=where)
-    samples = _passes(members, mode, samples)
+    files, where = [Path(file) for file in weights], torch.device(device)
+    members = load_members(model, files, spec=spec, inference=inference, device=where, **how)
+    alone = len(members) == 1 and mode == "full"
+    if alone and not stochastic(members):
+        raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
+    if samples is not None and not alone:
+        raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
+    passes = (samples or SAMPLES) if alone else None
     identity = {
         "model": model,
         "weights": [{"name": file.name, "sha256": sha256(file)} for file in files],
         "mode": mode,
-        "samples": samples,
+        "samples": passes,
         "spec": None if spec is None else sha256(Path(spec)),
         **_run_by(members, inference),
     }
-    turns = NetworksInTurn(members, samples=samples, preprocess=members[0].preprocess)
+    turns = NetworksInTurn(members, samples=passes, preprocess=members[0].preprocess)
     return NetworkSource(turns, where, identity, precision=inference.precision)
 
 
@@ -207,8 +203,20 @@ def load_members(
     inference: Inference = _AS_USERS,
     device: torch.device = _CPU,
 ) -> list[DepthNetwork]:
-    """The networks in the files, in their order, in eval mode and on the CPU, for a device. They want the same input.
-    Arguments and errors as :func:`network_source`."""
+    """The networks in files, in their order, in eval mode and on the CPU.
+
+    Args:
+        model: a name that ``load_network`` accepts.
+        files: one for each member (a directory for networks of ``transformers``); those of "trained" may hold several.
+        spec: declares what an ONNX file or saved program does not say.
+        offload: of "trained": weights stay in host memory and come to the device for their turn only.
+        inference: runtime, precision and threads.
+        device: where they will run.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: unknown model, files that do not fit it, members that want different inputs.
+    """
     paths = [Path(file) for file in files]
     for folder in paths if model in DIRECTORIES else []:
         if not folder.is_dir():
@@ -244,17 +252,6 @@ def _require_same_input(members: Iterable[DepthNetwork]) -> None:
     expected = [member.preprocess for member in members]
     if any(other != expected[0] for other in expected[1:]):
         raise ValueError(f"weights: the members of an ensemble must want the same input, got {expected}")
-
-
-def _passes(members: list[DepthNetwork], mode: str, samples: int | None) -> int | None:
-    """Passes per image of a network that samples, None of others. Raises ValueError: mode or samples ask for what the
-    members cannot do."""
-    alone = len(members) == 1 and mode == "full"
-    if alone and not stochastic(members):
-        raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
-    if samples is not None and not alone:
-        raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
-    return (samples or SAMPLES) if alone else None
 
 
 def sha256(file: Path) -> str:

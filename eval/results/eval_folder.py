@@ -46,12 +46,8 @@ class EvalFolder:
     def open(cls, out: Path, about: Mapping[str, Any], *, resume: bool, overwrite: bool) -> EvalFolder:
         """Make the folder, or go on in it; see ``OutputFolder.open``. When going on, rows, sequences and networks of
         ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the same
-        base must be the same. The cache of predictions is never removed.
-
-        Raises:
-            FolderError: the folder cannot be used as asked, or a process is at one of its sequences.
-            OSError: the folder cannot be made.
-        """
+        base must be the same. The cache of predictions is never removed. Raises FolderError also where a process is at
+        one of the sequences."""
         with OutputFolder.open(out, EVALUATION, about, resume=resume, overwrite=overwrite):
             return cls(out)
 

@@ -198,12 +198,8 @@ def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, co
 
 def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: Report) -> bool:
     """Submit a job for every task, and wait for all of them; whether every one came to its end. OUT/slurm has their
-    output; stopping cancels them.
-
-    Raises:
-        ImportError: submitit is missing.
-        ValueError: a parameter that submitit does not take, or no SLURM here.
-    """
+    output; stopping cancels them. Raises ImportError: submitit is missing; ValueError: a parameter that submitit does
+    not take, or no SLURM here."""
     try:
         import submitit
     except ImportError as error:
@@ -242,16 +238,9 @@ class ClusterTask:
 
 
 def work(task: WorkerTask, *, resume: bool = True, overwrite: bool = False, **context: Any) -> bool:
-    """Take part; True when nothing is left to do.
-
-    Args:
-        task: which part.
-        resume, overwrite: as ``EvalFolder.open`` takes them.
-        **context: as ``Worker`` takes it.
-
-    Raises:
-        FolderError, OSError, ValueError, ImportError: the work cannot be begun, or nothing can be written.
-    """
+    """Take part; True when nothing is left to do. ``resume`` and ``overwrite`` are as ``EvalFolder.open`` takes them,
+    ``context`` as ``Worker`` does. Raises FolderError, OSError, ValueError, ImportError: the work cannot be begun, or
+    nothing can be written."""
     if task.threads is not None:
         torch.set_num_threads(task.threads)
     job = replace(task.job, device=device_of(task.job.device, task.local))

@@ -85,12 +85,7 @@ class RunFolder:
     @classmethod
     def open(cls, path: str | Path, identity: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
         """Prepare the folder; see ``OutputFolder.open``. ``identity`` holds plain values that must be those of the run
-        that is to be continued.
-
-        Raises:
-            FolderError: the folder cannot be used as asked, or the state in it cannot be read.
-            OSError: the folder cannot be made.
-        """
+        that is to be continued. Raises FolderError also where the state in the folder cannot be read."""
         folder = OutputFolder.open(Path(path), RUN, {"identity": identity}, resume=resume, overwrite=overwrite)
         with ExitStack() as held:
             held.enter_context(folder)
