@@ -240,23 +240,21 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
 
 
 def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict[str, Any]:
-    """The rows of the table: figures, times and memory."""
-    overall = metrics.overall()
-    return {
-        row.key: {
+    """The rows of the table: figures, times, and the bytes on which the next frame depends, but for the map kept for
+    smoothing."""
+    overall, methods = metrics.overall(), {}
+    for row in rows:
+        kept, evidence = (
+            row.estimator.memory(),
+            row.anchors.tracks.state() if row.anchors and row.anchors.tracks else {},
+        )
+        methods[row.key] = {
             "figures": overall[row.key].compute(),
             "network_ms": walk.median_ms(row.key, "network"),
-            "uncertainty_ms": walk.median_ms(row.key, "anchors", "uncertainty") if row.estimator.memory() else None,
-            "state_bytes": _state_bytes(row),
+            "uncertainty_ms": walk.median_ms(row.key, "anchors", "uncertainty") if kept else None,
+            "state_bytes": int(kept.get("bytes", 0)) + sum(value.nbytes for value in evidence.values()),
         }
-        for row in rows
-    }
-
-
-def _state_bytes(row: RowRunner) -> int:
-    """What the next frame depends on, but for the map kept for smoothing."""
-    evidence = {} if row.anchors is None or row.anchors.tracks is None else row.anchors.tracks.state()
-    return int(row.estimator.memory().get("bytes", 0)) + sum(value.nbytes for value in evidence.values())
+    return methods
 
 
 @contextmanager

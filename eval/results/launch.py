@@ -64,7 +64,6 @@ class LaunchOptions:
 class EvalOutcome:
     """How an evaluation ended."""
 
-    job: EvalJob  # what was evaluated
     finished: bool  # False: it was stopped, or a process ended early
     stopped: bool  # by the caller
     failed: Mapping[str, str]  # why a sequence is broken, by its label
@@ -326,4 +325,4 @@ def _require_plain(options: LaunchOptions, rank: Rank) -> None:
 
 
 def _outcome(job: EvalJob, finished: bool, stopped: bool, *, reports: bool = True) -> EvalOutcome:
-    return EvalOutcome(job, finished, stopped, EvalFolder(job.out).failures(job.items), reports)
+    return EvalOutcome(finished, stopped, EvalFolder(job.out).failures(job.items), reports)
