@@ -415,7 +415,9 @@ def test_asked_to_stop_it_stops_between_frames(networks, sequence):
         return stop.asked > 3
 
     with pytest.raises(Stopped):
-        evaluate(sequence, [row("Aleatoric")], networks, stop=asked, progress=lambda *at: seen.append(at))
+        evaluate(
+            sequence, [row("Aleatoric")], networks, stop=asked, progress=lambda now: seen.append((now.done, now.total))
+        )
     assert seen == [(n, FRAMES) for n in range(4)]
 
 

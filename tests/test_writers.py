@@ -146,7 +146,7 @@ class TestFrames:
         lost = writer.write("far", **maps)
         assert lost["depth"] == int((maps["depth"].double() > (FULL + 0.5) * 1e-3).sum()) > 0
         sigma = maps["variance"].double().sqrt()
-        assert lost.sigma_saturated == int((sigma > (FULL + 0.5) * 1e-4).sum()) > 0
+        assert lost["sigma"] == int((sigma > (FULL + 0.5) * 1e-4).sum()) > 0
 
     def test_finished_needs_every_file(self, tmp_path: Path) -> None:
         writer = FrameWriter(tmp_path)
