@@ -106,3 +106,28 @@ def results(evaluation: Path):
     from ufmstar_torch.eval.report.data import load_results
 
     return load_results(evaluation)
+
+
+@pytest.fixture
+def ufmstar(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """Calls the program: (exit code, stdout, stderr)."""
+    from ufmstar_torch import cli
+
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+
+    def call(*words):
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        printed = capfd.readouterr()
+        return code, printed.out, printed.err
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three sequences of 4 frames. Nobody may change them."""
+    from suite_runs import write_rooms
+
+    return write_rooms(tmp_path_factory.mktemp("rooms"))

@@ -414,10 +414,11 @@ def test_asked_to_stop_it_stops_between_frames(networks, sequence):
         stop.asked += 1
         return stop.asked > 3
 
+    def progress(now):
+        seen.append((now.done, now.total))
+
     with pytest.raises(Stopped):
-        evaluate(
-            sequence, [row("Aleatoric")], networks, stop=asked, progress=lambda now: seen.append((now.done, now.total))
-        )
+        evaluate(sequence, [row("Aleatoric")], networks, stop=asked, progress=progress)
     assert seen == [(n, FRAMES) for n in range(4)]
 
 

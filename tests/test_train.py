@@ -41,19 +41,6 @@ def frames(tmp_path_factory):
     return write_frames(tmp_path_factory.mktemp("frames") / "walk")
 
 
-@pytest.fixture
-def ufmstar(capfd):
-    """Calls the program: (exit code, stdout, stderr)."""
-
-    def call(*words):
-        capfd.readouterr()
-        code = cli.main([str(word) for word in words])
-        printed = capfd.readouterr()
-        return code, printed.out, printed.err
-
-    return call
-
-
 # ---- trainings ----
 
 

@@ -51,9 +51,8 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
     assert hidden > 0
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("streams", [1, 4])
-def test_thirty_frames_agree_with_the_oracle(truth, backend, streams):
+@pytest.mark.parametrize(("backend", "streams"), [("torch", 2), ("numba", 1), ("numba", 4)])
+def test_a_walk_agrees_with_the_oracle(truth, backend, streams):
     depths, poses, K, aleatoric, maps, matches, mixture, sizes = truth
     config = UfMStarConfig(segment=SPGF, backend=backend, features=2, initial_capacity=8)
     ufm = UfMStar(config, dtype=torch.float64)

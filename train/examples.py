@@ -67,7 +67,7 @@ def draw_examples(
     """
     panels = [_panel(network, preprocess, name, sample) for name, sample in samples]
     columns = map_columns(panels)
-    if not any(panel.sigma.any() for panel in panels):
+    if not any(panel.maps["sigma"].any() for panel in panels):
         columns = [column for column in columns if column.field != "sigma"]
     contact_sheet(panels, path, title=title, columns=columns)
 
@@ -82,7 +82,8 @@ def _panel(network: torch.nn.Module | DepthNetwork, preprocess: Preprocess, name
     truth, valid = sample["depth"].numpy(), sample["valid"].numpy()
     error = np.where(valid, np.abs(depth - truth), np.nan).astype(np.float32)
     image = camera_image(sample["image"], preprocess)
-    return FramePanel(Path(name).name[-24:], image, depth, np.sqrt(variance), error)
+    maps = {"depth": depth, "sigma": np.sqrt(variance), "error": error}
+    return FramePanel(Path(name).name[-24:], image, maps)
 
 
 def camera_image(image: Tensor, preprocess: Preprocess) -> np.ndarray:

@@ -244,10 +244,8 @@ def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict
     smoothing."""
     overall, methods = metrics.overall(), {}
     for row in rows:
-        kept, evidence = (
-            row.estimator.memory(),
-            row.anchors.tracks.state() if row.anchors and row.anchors.tracks else {},
-        )
+        kept = row.estimator.memory()
+        evidence = {} if row.anchors is None or row.anchors.tracks is None else row.anchors.tracks.state()
         methods[row.key] = {
             "figures": overall[row.key].compute(),
             "network_ms": walk.median_ms(row.key, "network"),
