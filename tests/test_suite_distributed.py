@@ -352,7 +352,7 @@ def test_a_worker_reads_its_task_and_its_code_is_how_it_ended(rooms, tmp_path):
         task = pickle.dumps(
             WorkerTask(job_on(rooms, out, **changes), Shard(1, 2), helps=True, launch="abc", threads=1, debug=debug)
         )
-        ended = subprocess.run(launch._WORKER, input=task, capture_output=True, check=False)
+        ended = subprocess.run(launch.WORKER, input=task, capture_output=True, check=False)
         return ended.returncode, ended.stderr.decode()
 
     code, text = run(tmp_path / "out")

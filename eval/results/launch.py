@@ -32,12 +32,7 @@ from ufmstar_torch.eval.results.worklist import Shard
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.05
 _PATIENCE_SECONDS = 10.0  # for a process that was killed
-_WORKER = (
-    sys.executable,
-    "-P",
-    "-c",
-    f"from {__name__} import main; raise SystemExit(main())",
-)
+WORKER = (sys.executable, "-P", "-c", f"from {__name__} import main; raise SystemExit(main())")
 DONE, FAILED, STOPPED = 0, 1, 130  # exit codes of a process
 # submitit's own names of parameters; others are SLURM's, as partition, account, constraint.
 _SUBMITIT = ("name", "timeout_min", "mem_gb", "nodes", "cpus_per_task", "gpus_per_node", "tasks_per_node")
@@ -169,7 +164,7 @@ def tasks_of(job: EvalJob, options: LaunchOptions, jobs: int | None = None) -> l
     return [WorkerTask(job, Shard(n + 1, count), 0 if jobs else n, **how) for n in range(count)]
 
 
-def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = _WORKER) -> bool:
+def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = WORKER) -> bool:
     """Start a process for every task by ``command``, which runs :func:`main`, and wait for all; whether every one came
     to its end. One that ends early loses only the sequence in hand: the others do the rest."""
     children: list[subprocess.Popen[bytes]] = []
