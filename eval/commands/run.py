@@ -29,7 +29,6 @@ from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.eval.results.journal import Journal
-from ufmstar_torch.eval.results.machine import require_device
 from ufmstar_torch.eval.results.run_folder import RunFolder
 from ufmstar_torch.eval.results.run_job import RunJob
 from ufmstar_torch.eval.results.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
@@ -160,8 +159,7 @@ def job_from(chosen: RunOptions) -> RunJob:
         FileNotFoundError, NotADirectoryError: something that was named does not exist.
         ModuleNotFoundError: an optional package is missing.
     """
-    options, config = chosen.settings(), chosen.config
-    device = require_device(options["device"])
+    options, config, device = chosen.settings(), chosen.config, chosen.device
     sequence = open_sequence(chosen.sequence, **chosen.opening.given())
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
