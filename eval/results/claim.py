@@ -114,8 +114,8 @@ def _holds(path: Path, holder: dict[str, Any] | None) -> bool:
         now, then = _started(int(holder["pid"])), holder.get("started")
         return now is None or then is None or now == then
     try:
-        with tempfile.TemporaryFile(dir=path.parent) as now:  # the clock of the file system, not of this computer
-            return os.fstat(now.fileno()).st_mtime - path.stat().st_mtime < ABANDONED_SECONDS
+        with tempfile.TemporaryFile(dir=path.parent) as new:  # the clock of the file system, not of this computer
+            return os.fstat(new.fileno()).st_mtime - path.stat().st_mtime < ABANDONED_SECONDS
     except FileNotFoundError:
         return True  # replaced meanwhile
 
