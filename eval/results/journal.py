@@ -95,7 +95,7 @@ def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) ->
     """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
     this frame's is not known yet. "cycle" is the time since the frame before: stages overlap."""
     ms = result.ms
-    optional = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
+    optional: dict[str, float] = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
     return {
         "read": ms["read"],
         **optional,

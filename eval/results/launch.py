@@ -152,7 +152,7 @@ def evaluate_suite(
     shard = Shard.parse(options.shard or "1/1")
     # The parts of a divided evaluation begin in any order: whichever is first makes the folder.
     how = {"resume": options.resume or shard.count > 1, "overwrite": options.overwrite}
-    own = {"stop": stop, "report": report, "progress": progress, "evaluate": evaluate}
+    own: dict[str, Any] = {"stop": stop, "report": report, "progress": progress, "evaluate": evaluate}
     return _outcome(job, work(WorkerTask(job, shard), **how, **own), stop())
 
 

@@ -272,8 +272,8 @@ class Worker:
     def _store(self, one: _InHand, results: Iterable[RowResult]) -> None:
         """Store rows with what they were computed from."""
         item, landmarks = one.item, one.landmarks
-        common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": one.digest}
-        common |= {"streams": self.job.streams} if self.job.streams > 1 else {}
+        common: dict[str, Any] = {"versions": versions(), "machine": hardware(), "device": self.job.device}
+        common |= {"sequence": one.digest, **({"streams": self.job.streams} if self.job.streams > 1 else {})}
         for result in results:
             row, network = result.row, self.networks[result.row.method.base]
             made_of = {"network": network.digest, "runtime": network.runtime, "threads": torch.get_num_threads()}
