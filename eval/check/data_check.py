@@ -76,9 +76,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         sequence = open_sequence(path, **options)
     except (FrameError, FileNotFoundError, ImportError, ValueError) as error:
         return DataReport(name or Path(path).name, str(path), problems=(f"cannot be opened: {error}",))
-    depth_range, filled = _depth_statistics(sequence)
     positions = np.array([entry.T_world_cam[:3, 3] for entry in sequence.entries])
-    problems, remedies, undecided, checked = _verdict(sequence, path, pairs, options)
     return DataReport(
         name=name or sequence.name,
         path=str(path),
@@ -93,19 +91,13 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         depth_size=sequence.depth_size,
         intrinsics=_pinhole(sequence.intrinsics),
         depth_intrinsics=None if sequence.depth_intrinsics is None else _pinhole(sequence.depth_intrinsics),
-        depth_range=depth_range,
-        filled=filled,
-        checked=checked,
-        problems=tuple(problems),
-        remedies=tuple(remedies),
-        undecided=tuple(undecided),
+        **_depth_statistics(sequence),
+        **_verdict(sequence, path, pairs, options),
     )
 
 
-def _verdict(
-    sequence: FrameSequence, path: str | Path, pairs: int, options: Mapping[str, Any]
-) -> tuple[list[str], list[str], list[str], dict[str, Any]]:
-    """Problems, remedies, what is undecided, and the check's figures."""
+def _verdict(sequence: FrameSequence, path: str | Path, pairs: int, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The last four fields of the report."""
     problems: list[str] = []
     remedies: list[str] = []
     if len(sequence) < _FEW * len(sequence.names_on_disk):
@@ -114,7 +106,8 @@ def _verdict(
     try:
         outcome = check_sequence(sequence, pairs)
     except ValueError as error:
-        return problems, remedies, [f"nothing was compared: {error}"], {}
+        undecided = (f"nothing was compared: {error}",)
+        return {"problems": tuple(problems), "remedies": tuple(remedies), "undecided": undecided}
     read, broken = _read_frames(sequence)
     if broken:
         problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
@@ -122,8 +115,10 @@ def _verdict(
     problems += outcome.problems
     remedies += _remedies(outcome, sequence, path, options)
     figures = ("pairs", "gap", "error", "poses", "scale", "best_error", "registration")
-    measured = {name: value for name, value in asdict(outcome).items() if name in figures}
-    return problems, remedies, list(outcome.undecided), {**measured, "read": read, "unreadable": broken}
+    checked = {name: value for name, value in asdict(outcome).items() if name in figures}
+    checked |= {"read": read, "unreadable": broken}
+    words = {"problems": tuple(problems), "remedies": tuple(remedies), "undecided": outcome.undecided}
+    return {"checked": checked, **words}
 
 
 def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
@@ -195,8 +190,8 @@ def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
     return len(chosen), broken
 
 
-def _depth_statistics(sequence: FrameSequence) -> tuple[tuple[float, ...] | None, float]:
-    """Quantiles of depth [m] and the share of valid pixels, over evenly spaced frames."""
+def _depth_statistics(sequence: FrameSequence) -> dict[str, Any]:
+    """Quantiles of depth [m] and the share of valid pixels, over evenly spaced frames; {} without any."""
     with_depth = [entry for entry in sequence.entries if entry.load_depth is not None]
     values, pixels = [], 0
     for i in np.unique(np.linspace(0, len(with_depth) - 1, min(_SAMPLED, len(with_depth))).astype(int)):
@@ -210,8 +205,9 @@ def _depth_statistics(sequence: FrameSequence) -> tuple[tuple[float, ...] | None
             pixels += depth.size
     depths = np.concatenate(values) if values else np.zeros(0)
     if depths.size == 0:
-        return None, 0.0
-    return tuple(float(q) for q in np.quantile(depths, _QUANTILES)), depths.size / pixels
+        return {}
+    low_high = tuple(float(q) for q in np.quantile(depths, _QUANTILES))
+    return {"depth_range": low_high, "filled": depths.size / pixels}
 
 
 def _pinhole(K: np.ndarray) -> tuple[float, ...]:
