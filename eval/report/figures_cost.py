@@ -42,7 +42,7 @@ def draw_latency(results: Results) -> Any | None:
     for y, (row, network, uncertainty) in enumerate(timed):
         n, u = (mean.value if mean.sequences else 0.0 for mean in (network, uncertainty))
         axes.barh(y, n, color=NETWORK_COLOUR, height=0.66)
-        axes.barh(y, u, left=n, color=style.style_of(row.method).colour, height=0.66)
+        axes.barh(y, u, left=n, color=style.look_of(row.method).colour, height=0.66)
         words = f"  {f'{n:.1f}' if network.sequences else 'network not timed'} + {u:.1f} ms"
         axes.text(n + u, y, words, size=style.TICK, va="center", color=INK)
         longest = max(longest, n + u)
@@ -104,7 +104,7 @@ def draw_tradeoff(results: Results) -> Any | None:
         for row, x in panel.items():
             mean = points[row]
             axes.errorbar(
-                x, mean.value, yerr=np.nan_to_num(mean.half), color=style.style_of(row.method).colour, markersize=6,
+                x, mean.value, yerr=np.nan_to_num(mean.half), color=style.look_of(row.method).colour, markersize=6,
                 marker=_BASE_MARKERS[row.method.base], linewidth=1, elinewidth=0.5, capsize=0,
             )  # fmt: skip
         # Methods alone keep nothing: there is room for 0 at the left.
@@ -125,12 +125,12 @@ def _legend(rows: Sequence[Row]) -> list[Any]:
     """Colours are methods, marks are networks."""
     from matplotlib.lines import Line2D
 
-    look: dict[str, Any] = {"linestyle": "", "markersize": 6}
-    methods = {style.short_name(row.method): style.style_of(row.method).colour for row in rows}
+    how: dict[str, Any] = {"linestyle": "", "markersize": 6}
+    looks = {look.name: look for look in (style.look_of(row.method) for row in rows)}.values()
     bases = dict.fromkeys(row.method.base for row in rows)
     return [
-        *(Line2D([], [], marker="o", color=colour, label=name, **look) for name, colour in methods.items()),
-        *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **look) for base in bases),
+        *(Line2D([], [], marker="o", color=look.colour, label=look.name, **how) for look in looks),
+        *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **how) for base in bases),
     ]
 
 
@@ -140,10 +140,11 @@ def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:
     high = axes.get_ylim()[1]
     places = style.spread_apart([y / high for _, y, _ in points], 1.2 * style.TICK / 72 / height, 0, 1)
     for (x, y, row), place in zip(points, places, strict=True):
-        name = f"{BASES[row.method.base][1]} {style.short_name(row.method)}"
+        look = style.look_of(row.method)
+        name = f"{BASES[row.method.base][1]} {look.name}"
         axes.annotate(
             name, (x, y), (1.04, place), textcoords="axes fraction", size=style.TICK, va="center",
-            color=style.style_of(row.method).colour,
+            color=look.colour,
             arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.4, "relpos": (0, 0.5), "shrinkB": 3},
         )  # fmt: skip
 
@@ -168,7 +169,8 @@ def draw_growth(runs: Sequence[Mapping[str, Any]]) -> Any:
                 panel.plot([row["frames"][1] for row in run["rows"]], values, color=colour, linewidth=1.6)
                 merge = f"merge {run['merge']:g}" if run["merge"] else ""
                 most = f"at most {run['max_components']}" if run["max_components"] else ""
-                ends.append((values[-1], ", ".join(filter(None, (merge, most))) or "off", colour))
+                look = style.Look(", ".join(filter(None, (merge, most))) or "off", colour)
+                ends.append((values[-1], look))
             panel.set_ylim(bottom=0)
             style.finish(panel, x=f"frames, {world}", y=words)
             style.label_ends(panel, ends)

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.report.colours import FAINT, INK
 from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.names import count
-from ufmstar_torch.eval.report.style import Style
+from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.results.record import Record
 
 Curves = Mapping[str, Sequence[float]]
@@ -57,9 +57,8 @@ def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any 
     figure = _draw_columns(title, panels, 4, (0.4, 2.45, 0.7, 4.9), ends=False)
     from matplotlib.lines import Line2D
 
-    rows = {style.short_name(row.method): row for row in results.default_rows(base)}
-    judged = {name: row for name, row in rows.items() if any(_has_curves(r.curves) for r in results.of(row))}
-    handles = [Line2D([], [], label=name, **style.style_of(row.method).line) for name, row in judged.items()]
+    judged = [row for row in results.default_rows(base) if any(_has_curves(r.curves) for r in results.of(row))]
+    handles = [Line2D([], [], **style.look_of(row.method).line) for row in judged]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8)
     return figure
 
@@ -100,7 +99,7 @@ def _draw_columns(
     for number, (titles, curves) in enumerate(panels):
         line, column = divmod(number, columns)
         ordered = sorted(curves.items(), key=lambda item: (item[0].method.fusion == UFM_STAR, item[0].method.full))
-        drawn = {style.short_name(row.method): (style.style_of(row.method), values) for row, values in ordered}
+        drawn = {style.look_of(row.method): values for row, values in ordered}
         named = ends or column == 0
         for below, (words, own) in enumerate(zip((DELTA, QUANTILE), titles, strict=True)):
             _draw_shares(axes[2 * line + below, column], words, drawn, own, named, ends)
@@ -110,7 +109,7 @@ def _draw_columns(
 def _draw_shares(
     axes: Any,
     words: tuple[str, str],
-    lines: Mapping[str, tuple[Style, Curves]],
+    lines: Mapping[Look, Curves],
     title: str,
     named: bool,
     ends: bool,
@@ -120,14 +119,14 @@ def _draw_shares(
     axes.set_visible(True)
     axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT)
     last = []
-    for name, (look, values) in lines.items():
+    for look, values in lines.items():
         x, y = _confidence(values) if words is DELTA else (values["ece_q_levels"], values["ece_q_observed"])
-        axes.plot(x, y, label=name, clip_on=False, **look.line)
-        last += [(float(y[-1]), name, look.colour)] if len(y) else []
+        axes.plot(x, y, clip_on=False, **look.line)
+        last += [(float(y[-1]), look)] if len(y) else []
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
     style.finish(axes, title=title, x=words[0], y=words[1] if named else "")
     if ends:
-        style.label_ends(axes, [*last, (1.0, "exactly right", FAINT)])
+        style.label_ends(axes, [*last, (1.0, Look("exactly right", FAINT))])
 
 
 def _confidence(values: Curves) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -160,10 +159,10 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
         raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
     figure = style.new_figure(12.6, 4.6, title)
     delta, quantiles, sparse = figure.subplots(1, 3)
-    lines = {name: (Style(*look), curves[name]) for name, look in zip(curves, _BY_ORDER, strict=False)}
+    lines = {Look(name, *look): curves[name] for name, look in zip(curves, _BY_ORDER, strict=False)}
     _draw_shares(delta, DELTA, lines, "δ calibration", named=True, ends=False)
     _draw_shares(quantiles, QUANTILE, lines, "quantile calibration", named=True, ends=False)
-    for look, values in lines.values():
+    for look, values in lines.items():
         x = np.arange(len(values["sparsification_rmse"])) / len(values["sparsification_rmse"])
         sparse.plot(x, values["sparsification_rmse"], markevery=10, **look.line)
         sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=look.colour)
@@ -197,18 +196,15 @@ def draw_error(results: Results, dataset: str) -> Any | None:
             axes.set_visible(True)
             for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
                 x = (np.arange(len(values)) + 0.5) * 100 / len(values)
-                axes.plot(x, np.array(values, float), label=row.method.name, **style.style_of(row.method).line)
+                axes.plot(x, np.array(values, float), **style.look_of(row.method).line)
             axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
             method = Method.parse(reference)
-            title = (
-                f"{BASES[base][0]}: where {'it' if method.fusion == ALONE else style.short_name(method)} is confident"
-            )
+            judge = "it" if method.fusion == ALONE else style.look_of(method).name
+            title = f"{BASES[base][0]}: where {judge} is confident"
             style.finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
             # At the last group that had a pixel.
-            ends = {row: next(value for value in reversed(values) if value == value) for row, values in curves.items()}
-            style.label_ends(
-                axes, [(y, style.short_name(row.method), style.style_of(row.method).colour) for row, y in ends.items()]
-            )
+            last = {row: next(y for y in reversed(values) if y == y) for row, values in curves.items()}
+            style.label_ends(axes, [(y, style.look_of(row.method)) for row, y in last.items()])
     return figure
 
 
@@ -271,18 +267,20 @@ def density(merged: Merged) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _draw_histograms(axes: Any, rows: Mapping[Row, Merged]) -> None:
     """Histograms, and the mean of each as a dashed line with its name beside."""
     for number, (row, merged) in enumerate(rows.items()):
-        colour = style.style_of(row.method).colour
+        look = style.look_of(row.method)
         heights, edges = density(merged)
-        axes.stairs(heights, edges, color=colour, linewidth=1.5, label=style.short_name(row.method))
+        axes.stairs(heights, edges, color=look.colour, linewidth=1.5, label=look.name)
         if row.method.fusion == UFM_STAR and not row.method.full:
-            axes.stairs(heights, edges, color=colour, alpha=0.15, fill=True)
+            axes.stairs(heights, edges, color=look.colour, alpha=0.15, fill=True)
         mean, counts = merged.figures["entropy"], merged.curves["entropy_counts"]
-        axes.axvline(mean, color=colour, linestyle="--", linewidth=1.1)
+        axes.axvline(mean, color=look.colour, linestyle="--", linewidth=1.1)
         # Pixels below the histogram: V = 0 above all.
         below = counts[0] / sum(counts)
         remark = "" if below < 0.005 else f"\n({100 * below:.0f} % with hardly any V)"
-        words = f"{style.short_name(row.method)}: mean {mean:.2f}{remark}"
-        axes.text(1.02, 0.95 - 0.13 * number, words, color=colour, size=style.TICK, va="top", transform=axes.transAxes)
+        words = f"{look.name}: mean {mean:.2f}{remark}"
+        axes.text(
+            1.02, 0.95 - 0.13 * number, words, color=look.colour, size=style.TICK, va="top", transform=axes.transAxes
+        )
     axes.set_ylim(bottom=0)
 
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
+from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from ufmstar_torch.eval.report import names, style
 from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
-from ufmstar_torch.eval.report.style import Style
+from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.results.record import Record
 
 COUNT = "anchor_count"
@@ -125,17 +126,12 @@ def _changed(row: Row) -> list[str]:
 # ---- figures ----
 
 SHOWN = (names.NLL, names.ECE_DELTA, names.ECE_Q)
-# Lines of the same method by what is fixed; they differ from all of ``style_of``'s.
-_FIXED: dict[Rest, Style] = {
-    (("anchors", TRACKED),): Style("#882255", "d"),
-    (("anchors", TRUTH),): Style("#222222", "*"),
+# Colours and marks of lines of the same method by what is fixed; they differ from all of ``look_of``'s.
+_FIXED: dict[Rest, tuple[str, str]] = {
+    (("anchors", TRACKED),): ("#882255", "d"),
+    (("anchors", TRUTH),): ("#222222", "*"),
 }
-_OTHERS = (
-    Style("#117733", "h"),
-    Style("#88CCEE", "p"),
-    Style("#999933", "<"),
-    Style("#AA4499", ">"),
-)
+_OTHERS = (("#117733", "h"), ("#88CCEE", "p"), ("#999933", "<"), ("#AA4499", ">"))
 # Beyond this an axis of NLLs is logarithmic: pixels of nearly no variance take their mean to any height.
 _HIGH = 50.0
 
@@ -149,10 +145,10 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     lines = [line for line in sweep_lines(results, base, name) if len(line.points) > 1 or not line.rest]
     alone = [line for line in lines if line.method == Method(base)][:1]
     drawn = [line for line in lines if line.method.fusion != ALONE]
-    others = cycle(_OTHERS)
-    styles = [_FIXED.get(line.rest) or next(others) if line.rest else style.style_of(line.method) for line in drawn]
-    looks = dict.fromkeys(alone, (style.ALONE_STYLE, True))
-    looks |= {line: (look, len(line.points) == 1) for line, look in zip(drawn, styles, strict=True)}
+    looks, others = {line: style.look_of(line.method) for line in [*alone, *drawn]}, cycle(_OTHERS)
+    for line in drawn:
+        if line.rest:
+            looks[line] = Look(line.words or looks[line].name, *(_FIXED.get(line.rest) or next(others)))
     to, below = _compared(drawn, alone[0] if alone else None, name)
     shown = (*SHOWN, names.SPEARMAN) if any("anchors" in dict(line.rest) for line in drawn) else SHOWN
     word, unit = names.SETTINGS.get(name, (names.setting_name(name), ""))
@@ -189,7 +185,7 @@ def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) ->
     if alone is not None and len(alone.points) > 1:
         to, reference = "alone", lambda line, value: alone.at(value)
     elif fixed := [line for line in swept if line.rest and line.method in plain]:
-        methods, swept = {style.short_name(line.method) for line in fixed}, fixed
+        methods, swept = {style.look_of(line.method).name for line in fixed}, fixed
         words = methods.pop() if len(methods) == 1 else "the method as it is"
         to, reference = words, lambda line, value: plain[line.method].at(value)
     else:
@@ -199,10 +195,10 @@ def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) ->
 
 
 def _draw(
-    axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, tuple[Style, bool]]
-) -> tuple[list[float], list[tuple[float, str, str]]]:
-    """Means over the values of a setting with their bands, by line; dashed and level lines for reference, as ``looks``
-    has it. The values reached, and what stands at the ends."""
+    axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, Look]
+) -> tuple[list[float], list[tuple[float, Look]]]:
+    """Means over the values of a setting with their bands, by line; dashed without a band for reference. The values
+    reached, and what stands at the ends."""
     reached: list[float] = []
     ends = []
     for line, means in curves.items():
@@ -210,22 +206,21 @@ def _draw(
         if not kept:
             continue
         x, y, half = np.array(kept).T
-        (look, dashed), short = looks[line], style.short_name(line.method)
-        label = short if look is style.ALONE_STYLE else " ".join(filter(None, (line.method.name, line.words)))
-        how: dict[str, Any] = {"color": look.colour, "linestyle": "--", "linewidth": 1.4, "label": label}
-        if not dashed:
-            axes.plot(x, y, label=label, **look.line)
+        look = looks[line]
+        dashed: dict[str, Any] = {"color": look.colour, "linestyle": "--", "linewidth": 1.4, "label": look.name}
+        if line.method.fusion != ALONE and len(line.points) > 1:
+            axes.plot(x, y, **look.line)
             axes.fill_between(x, y - half, y + half, color=look.colour, alpha=0.15, linewidth=0)
         elif len(means) == 1:
-            axes.axhline(y[0], **how)
+            axes.axhline(y[0], **dashed)
         else:
-            axes.plot(x, y, **how)
+            axes.plot(x, y, **dashed)
         reached += [value for value in y.tolist() if math.isfinite(value)]
-        ends.append((float(y[-1]), short if look is style.ALONE_STYLE else line.words or short, look.colour))
+        ends.append((float(y[-1]), look))
     return reached, ends
 
 
-def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[float, str, str]]) -> None:
+def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[float, Look]]) -> None:
     """Mark the default, and name the lines.
 
     Logarithmic beyond 1 where values are so high that the others would lie on one line, and cut to the values:
@@ -265,7 +260,7 @@ def draw_changes(results: Results, base: str) -> Any | None:
         for y, (row, reference) in enumerate(lines):
             mean = difference(results.of(row), results.of(reference), quantity)
             if not math.isnan(mean.value):
-                look = style.style_of(row.method)
+                look = style.look_of(row.method)
                 place.errorbar(
                     mean.value, y, xerr=np.nan_to_num(mean.half), color=look.colour, marker=look.marker,
                     markersize=4.5, linewidth=1.4, markerfacecolor=look.colour if mean.beyond else "white", capsize=0,
@@ -273,10 +268,9 @@ def draw_changes(results: Results, base: str) -> Any | None:
         style.finish(place, title=f"Δ {quantity.heading}", x="less the default")
     axes[0].set_ylim(len(lines) - 0.5, -0.5)
     one = len({row.method for row, _ in lines}) == 1  # the method is named where there are several
-    labels = [
-        ("" if one else f"{style.short_name(r.method)}, ") + names.setting_label(r.setting.to_dict()) for r, _ in lines
-    ]
-    axes[0].set_yticks(range(len(lines)), map(plain, labels), size=style.TICK)
+    methods = ["" if one else f"{style.look_of(row.method).name}, " for row, _ in lines]
+    settings = [names.setting_label(row.setting.to_dict()) for row, _ in lines]
+    axes[0].set_yticks(range(len(lines)), map(plain, map(add, methods, settings)), size=style.TICK)
     figure.supxlabel("filled: the 95 % interval leaves out 0", size=style.TICK, color=FAINT, x=0.99, ha="right")
     return figure
 
