@@ -107,12 +107,7 @@ def _draw_columns(
 
 
 def _draw_shares(
-    axes: Any,
-    words: tuple[str, str],
-    lines: Mapping[Look, Curves],
-    title: str,
-    named: bool,
-    ends: bool,
+    axes: Any, words: tuple[str, str], lines: Mapping[Look, Curves], title: str, named: bool, ends: bool
 ) -> None:
     """Confidence that the depth is within 25 %, and how often it is (``DELTA``), or predicted quantiles and the share
     of the truth below them (``QUANTILE``), in the unit square with its diagonal."""
