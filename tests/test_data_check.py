@@ -15,10 +15,10 @@ from shared_data import require_shared
 
 from ufmstar_torch.cli import main
 from ufmstar_torch.eval.check.data_check import check_data
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS
+from ufmstar_torch.eval.tour import export_tour
 from ufmstar_torch.eval.tour.open import open_sequence, open_tour
-from ufmstar_torch.eval.tour.sequence import export_tour
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data.md"
 SIZE = (120, 160)
@@ -121,7 +121,7 @@ def test_unregistered_depth(tour):
     assert any("--depth-intrinsics" in remedy for remedy in result.remedies)
 
 
-def test_broken_and_missing_frames_are_told(tour, capsys):
+def test_broken_and_missing_frames_are_reported(tour, capsys):
     layouts.truncate(tour / "images" / "000000.png")
     layouts.truncate(sorted((tour / "depth").iterdir())[13])
     lines = (tour / "poses.txt").read_text().splitlines()

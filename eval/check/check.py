@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_fit
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000

@@ -13,8 +13,8 @@ import numpy as np
 
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
 from ufmstar_torch.eval.results.files import to_json
-from ufmstar_torch.eval.sequences.conventions import OURS
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.poses import OURS
 from ufmstar_torch.eval.tour.open import open_sequence
 
 _SAMPLED = 12  # frames whose depth is looked at for its range

@@ -61,7 +61,7 @@ class Shard:
 
     def __post_init__(self) -> None:
         if not 1 <= self.index <= self.count:
-            raise ValueError(f"--shard must be 1/n to n/n, got {self.index}/{self.count}")
+            raise ValueError(f"--shard must be 1/n to n/n, got {self}")
 
     @classmethod
     def parse(cls, text: str) -> Shard:
@@ -70,6 +70,9 @@ class Shard:
         if match is None:
             raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
         return cls(int(match[1]), int(match[2]))
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
 
     def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
         """Its items: every n-th, so that all parts get neighbours of each."""
@@ -143,7 +146,7 @@ def _below(root: str) -> list[WorkItem]:
     dataset, path = (match["dataset"], match["path"]) if match else (None, root)
     if path.startswith(f"{TOUR}:"):
         return [WorkItem(dataset or TOUR, path, path, "auto")]
-    from ufmstar_torch.eval.sequences.find import find_sequences
+    from ufmstar_torch.eval.sequences.layout import find_sequences
 
     sequences = find_sequences(path)
     if not sequences:
