@@ -12,8 +12,8 @@ from scenes import look
 from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.check.depth_image_fit import depth_edges, depth_image_fit
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 
 SIZE = (120, 160)
 
