@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
 
@@ -17,21 +18,13 @@ _LOG = logging.getLogger(__name__)
 _UNKNOWN = torch.full((4, 4), torch.nan, dtype=torch.float64)  # a pose
 
 
-class SampleError(Exception):
-    """A sample's file is missing, truncated, or does not hold what it should.
+class SampleError(FrameError):
+    """A sample's file is missing, truncated, or does not hold what it should."""
 
-    Attributes:
-        name: the file.
-        reason: what is wrong with it.
-    """
-
-    def __init__(self, name: str, reason: str) -> None:
-        super().__init__(name, reason)  # both in args, so that it survives pickling by a worker
-        self.name = name
-        self.reason = reason
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.reason}"
+    @property
+    def name(self) -> str:
+        """The file."""
+        return str(self.path)
 
 
 class Sample(TypedDict):
