@@ -28,6 +28,7 @@ from ufmstar_torch.eval.results.machine import available_cores
 from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerContext, failures, run_job
 from ufmstar_torch.eval.results.worker import DONE, STOPPED, WorkerTask, device_of, work
 from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.optional import optional
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.05
@@ -195,10 +196,7 @@ def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: 
         ImportError: submitit is missing.
         ValueError: a parameter that submitit does not take, or no SLURM here.
     """
-    try:
-        import submitit
-    except ImportError as error:
-        raise ImportError("--slurm needs submitit: pip install 'ufmstar-torch[cluster]'") from error
+    submitit = optional("submitit", "--slurm needs submitit", "'ufmstar-torch[cluster]'")
     folder = f"{tasks[0].job.out}/slurm"
     try:
         executor = submitit.AutoExecutor(folder=folder, cluster=slurm.cluster)
