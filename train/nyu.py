@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.sequences.frame import FrameError
@@ -59,11 +58,7 @@ class NyuFrames:
             rgb, depth = read_h5(path)
         except FrameError as error:
             raise SampleError(str(path), error.reason) from error
-        return RawSample(
-            image=torch.from_numpy(rgb),
-            depth=torch.from_numpy(depth.astype(np.float32)),
-            intrinsics=_intrinsics(path, depth.shape[0], depth.shape[1]),
-        )
+        return RawSample(rgb, depth.astype(np.float32), _intrinsics(path, depth.shape[0], depth.shape[1]))
 
 
 def convert_labelled(
@@ -116,10 +111,10 @@ def convert_labelled(
     return {"train": len(scenes) - len(validation), "val": len(validation)}
 
 
-def _intrinsics(path: Path, height: int, width: int) -> torch.Tensor:
+def _intrinsics(path: Path, height: int, width: int) -> np.ndarray:
     """[3, 3] of images of that size; files that were cropped have none."""
     try:
-        return torch.from_numpy(scale_intrinsics(pinhole(*INTRINSICS), NATIVE_SIZE, (height, width)))
+        return scale_intrinsics(pinhole(*INTRINSICS), NATIVE_SIZE, (height, width))
     except ValueError as error:
         reason = f"is {width} x {height}, not a resized 640 x 480: its intrinsics are not known"
         raise SampleError(str(path), reason) from error
