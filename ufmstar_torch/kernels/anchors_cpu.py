@@ -32,10 +32,10 @@ from ufmstar_torch.anchors.hook import learn as learn_reference
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.compile_cpu import kernel, part
+from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
 from ufmstar_torch.kernels.regress_cpu import EPSILON
 from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
-from ufmstar_torch.kernels.regress_vectors_cpu import add_shares
+from ufmstar_torch.kernels.regress_vectors_cpu import add_shares, count_less, square_distances
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.mixture import GaussianMixture
@@ -45,6 +45,7 @@ _LOG2_E = math.log2(math.e)
 
 # Anchors of a cell, on average, where neighbours are searched and where components are.
 _FEW, _SOME = 3, 32
+_TRIALS = 100  # of a radius: distances differ by so little only where rounding makes them equal
 
 
 def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
@@ -134,6 +135,22 @@ def learn(
     each(_learn, [(*slots, *arguments, *settings, *into) for slots, arguments, into in calls])
     learnt = Evidence(torch.from_numpy(component).to(dtype), torch.from_numpy(overall).to(dtype))
     return Learnt(learnt, torch.from_numpy(used[:, 0]), torch.from_numpy(beyond), torch.from_numpy(stream))
+
+
+def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`ufmstar_torch.anchors.hook.anchored_term`, for CPU tensors, in one pass."""
+    d, e, M = (array(value) for value in (depth, excess, disagreement))
+    term, both = np.empty_like(M), np.empty_like(M)
+    _add_term(*(value.reshape(-1) for value in (d, e, M, term, both)))
+    return torch.from_numpy(term), torch.from_numpy(both)
+
+
+@kernel
+def _add_term(depth, excess, disagreement, term, both):
+    for i in range(term.size):
+        beyond = depth[i] * depth[i] * excess[i] - disagreement[i]
+        term[i] = term.dtype.type(0) if beyond < 0 else beyond
+        both[i] = disagreement[i] + term[i]
 
 
 @kernel
@@ -248,12 +265,33 @@ def _grid(pixel, chosen, mean_count):
 @part
 def _supported(pixel, predicted, depth, variance, valid, out):
     """Which of N anchors are valid and supported by their neighbours (``evidence.inliers``), into ``out`` [N]."""
-    n = valid.size
-    most = max(min(NEIGHBOURS, n - 1), 0)
-    neighbour, count, ratio = np.empty((n, most), np.int64), np.empty(n, np.int64), np.empty(n)
-    differ = np.empty(n * most)
-    total = _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ)
-    _support(variance, depth, valid, ratio, neighbour, count, _lower_quartile(differ, total), out)
+    grid = _grid(pixel, valid, _FEW)
+    order = grid[5]
+    n = order.size
+    for a in range(valid.size):
+        out[a] = valid[a]
+    if n <= SUPPORT:
+        return
+    most, room = min(NEIGHBOURS, n - 1), n + LANES
+    # In the order of the grid: pixel, what breaks a tie, log g/d, and the variance of log g.
+    u, v, tie, ratio, noise = np.empty(room), np.empty(room), np.empty(room), np.empty(n), np.empty(n)
+    for i in range(n):
+        a = order[i]
+        u[i], v[i], tie[i] = pixel[a, 0], pixel[a, 1], TIE * a
+        ratio[i], noise[i] = math.log(depth[a] / predicted[a]), variance[a] / (depth[a] * depth[a])
+    neighbour, differ = np.empty((n, most), np.int64), np.empty(n * most)
+    distance, place, work = np.empty(room), np.empty(n, np.int64), np.empty(4)
+    for i in range(n):
+        _nearest(grid, u, v, tie, i, distance, place, work, neighbour[i])
+        for j in range(most):
+            differ[i * most + j] = abs(ratio[i] - ratio[neighbour[i, j]])
+    sigma = _lower_quartile(differ.copy(), differ.size) / LOWER_QUARTILE
+    for i in range(n):
+        support = 0
+        for j in range(most):
+            allowed = sigma * sigma + 2 * LEAST_SIGMA**2 + noise[i] + noise[neighbour[i, j]]
+            support += differ[i * most + j] <= SIMILAR_SIGMAS * math.sqrt(allowed)
+        out[order[i]] = support >= SUPPORT
 
 
 @part
@@ -283,76 +321,69 @@ def _lower_quartile(values, n):
     return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
 
 
-@part
-def _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ):
-    """Write log g/d of the valid anchors of N, their nearest ones [N, most] and how many these are; return the number
-    of differences of log g/d that are written to ``differ``."""
-    low, side, columns, rows, start, order = _grid(pixel, valid, _FEW)
-    ordered, distance, total = np.empty((order.size, 2)), np.empty(neighbour.shape[1]), 0
-    for place in range(order.size):
-        a = order[place]
-        ordered[place, 0], ordered[place, 1] = pixel[a, 0], pixel[a, 1]
-        ratio[a] = math.log(depth[a] / predicted[a])
-    if order.size <= SUPPORT:
-        return 0
-    for a in order:
-        count[a] = _nearest(
-            ordered, pixel[a, 0], pixel[a, 1], a, low, side, columns, rows, start, order, distance, neighbour
-        )
-        for i in range(count[a]):
-            differ[total] = abs(ratio[a] - ratio[neighbour[a, i]])
-            total += 1
-    return total
+@leaf
+def _nearest(grid, u, v, tie, i, distance, place, work, neighbour):
+    """Write the anchors nearest to anchor i to ``neighbour`` [most], of more than so many in the order of the grid.
 
-
-@part
-def _support(variance, depth, valid, ratio, neighbour, count, quartile, out):
-    """Which of the valid anchors enough of their neighbours support; all of a few."""
-    sigma2, few = (quartile / LOWER_QUARTILE) * (quartile / LOWER_QUARTILE) + 2 * LEAST_SIGMA**2, 0
-    for a in range(valid.size):
-        few += valid[a]
-    for a in range(valid.size):
-        out[a] = valid[a]
-        if not valid[a] or few <= SUPPORT:
-            continue
-        support, noise = 0, variance[a] / (depth[a] * depth[a])
-        for i in range(count[a]):
-            b = neighbour[a, i]
-            allowed = sigma2 + noise + variance[b] / (depth[b] * depth[b])
-            support += abs(ratio[a] - ratio[b]) <= SIMILAR_SIGMAS * math.sqrt(allowed)
-        out[a] = support >= SUPPORT
-
-
-@part
-def _nearest(ordered, u_a, v_a, a, low, side, columns, rows, start, order, distance, neighbour):
-    """The anchors nearest to anchor a at (u_a, v_a), and how many there are: ring after ring of cells around its own,
-    until all beyond the ring are farther than the farthest of them. ``ordered`` [N, 2] are pixels in the grid's order.
+    They are among those in rings of cells around its own if so many lie within the circle that the rings contain.
     """
-    u, v = (u_a - low[0]) / side, (v_a - low[1]) / side
-    column, row = min(int(u), columns - 1), min(int(v), rows - 1)
+    low, side, columns, rows = grid[:4]
+    work[0], work[1], most = u[i], v[i], neighbour.size
+    x, y = (u[i] - low[0]) / side, (v[i] - low[1]) / side
+    column, row = min(int(x), columns - 1), min(int(y), rows - 1)
     # [cells] From the anchor to the border of its cell; a billionth less for rounding.
-    margin = max(min(min(u - column, column + 1 - u), min(v - row, row + 1 - v)) - 1e-9, 0.0)
-    n, most = 0, neighbour.shape[1]
-    for ring in range(max(columns, rows)):
-        for y in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-            step = 1 if abs(y - row) == ring else 2 * ring  # all of the first and the last row, else both ends
-            for x in range(column - ring, column + ring + 1, max(step, 1)):
-                if x < 0 or x >= columns:
-                    continue
-                for place in range(start[y * columns + x], start[y * columns + x + 1]):
-                    du, dv, b = u_a - ordered[place, 0], v_a - ordered[place, 1], order[place]
-                    apart = du * du + dv * dv + TIE * b
-                    if b != a and (n < most or apart < distance[n - 1]):
-                        n = min(n + 1, most)
-                        i = n - 1
-                        while i > 0 and distance[i - 1] > apart:
-                            distance[i], neighbour[a, i] = distance[i - 1], neighbour[a, i - 1]
-                            i -= 1
-                        distance[i], neighbour[a, i] = apart, b
-        beyond = (ring + margin) * side
-        if n == most and beyond * beyond > distance[n - 1]:
+    margin = max(min(min(x - column, column + 1 - x), min(y - row, row + 1 - y)) - 1e-9, 0.0)
+    ring, within, n, limit = 0, 0, 0, 0.0
+    while within < most:
+        ring += 1
+        n = _around(grid, u, v, tie, i, column, row, ring, distance, place, work)
+        limit = (ring + margin) * side * ((ring + margin) * side)
+        if ring >= max(columns, rows):  # all of them
+            limit = (columns * columns + rows * rows) * side * side + TIE * tie.size + 1
+        within = _within(distance, n, limit, work)
+    least, below = 0.0, 0
+    for _ in range(_TRIALS):
+        if within == most:
             break
+        # Their number grows about as the square of the distance.
+        middle = least + (limit - least) * (most + 0.5 - below) / (within + 1 - below)
+        count = _within(distance, n, middle, work)
+        if count < most:
+            least, below = middle, count
+        else:
+            limit, within = middle, count
+    count = 0
+    for j in range(n):
+        if distance[j] < limit and count < most:
+            neighbour[count] = place[j]
+            count += 1
+
+
+@leaf
+def _around(grid, u, v, tie, i, column, row, ring, distance, place, work):
+    """Write the squared distances of anchor i from those in rings of cells around its own, infinite from itself, and
+    which they are; return how many. Behind the last one there are as many infinite ones as fit in a vector."""
+    columns, rows, start = grid[2], grid[3], grid[4]
+    n, left, right = 0, max(column - ring, 0), min(column + ring, columns - 1)
+    for y in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
+        first, last = start[y * columns + left], start[y * columns + right + 1]
+        square_distances(u, v, tie, first, last - first, work, distance, n)
+        for j in range(first, last):
+            place[n + j - first] = j
+        if first <= i < last:
+            distance[n + i - first] = np.inf
+        n += last - first
+    for j in range(LANES):
+        distance[n + j] = np.inf
     return n
+
+
+@leaf
+def _within(distance, n, limit, work):
+    """How many of n distances are less than ``limit``."""
+    work[2] = limit
+    count_less(distance, n, work[2:])
+    return int(work[3])
 
 
 @part

@@ -49,10 +49,12 @@ def regress_maps(
     config: UfMStarConfig,
     pixels: Tensor | None = None,
     near: Sequence[tuple[NDArray[np.int64], int]] | None = None,
+    shift: NDArray[np.float64] | None = None,
 ) -> Regression:
     """:func:`regress_image` of a depth that is positive where it is valid, and only there.
 
     ``near`` are the slots of each stream that can matter, in increasing order, and how many are occupied; None = all.
+    With the exact sum, ``shift`` [B, 2] is added to the two features before the last, of three or more; None = nothing.
     """
     if pixels is not None and config.regression != "exact":
         return regress_pixels(mixture_cam, depth, intrinsics, depth > 0, config, pixels, regress)
@@ -60,7 +62,7 @@ def regress_maps(
     shape = z.shape if pixels is None else tuple(pixels.shape)
     out, features = np.empty(shape, z.dtype), np.empty((len(z), mixture_cam.features.shape[2], *shape[1:]), z.dtype)
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
-    settings = _settings(config, depth.dtype)
+    settings, moved = _settings(config, depth.dtype), np.zeros((len(z), 2)) if shift is None else shift
     kernel = near_image if config.regression != "exact" else exact if pixels is None else exact_at
     calls: list[tuple[Any, ...]] = []
     for b, fields in enumerate(zip(*_fields(mixture_cam), strict=True)):
@@ -71,9 +73,9 @@ def regress_maps(
         occupied = len(slots) if near is None else near[b][1]
         view = in_view(slots, occupied, *fields, K[b], z[b], *settings)
         if pixels is None:
-            calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
+            calls += [(z[b], K[b], view, fields[4], moved[b], out[b], features[b], i, shares) for i in range(shares)]
         else:
-            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, fields[4], out[b], features[b]))
+            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, fields[4], moved[b], out[b], features[b]))
     each(kernel, calls)
     return _regression(out, features)
 

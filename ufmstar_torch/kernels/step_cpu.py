@@ -127,8 +127,9 @@ def step(
     stage("append")
 
     with kernel("regress_image"):
-        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, joined)
-    if stream is not None:
+        shift = None if stream is None else array(stream)
+        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, joined, shift)
+    if stream is not None and config.regression != "exact":
         result.features[..., -3:-1] += stream.to(frame.depth.dtype).view(-1, *[1] * (result.features.dim() - 2), 2)
     result, _, measured = after_regress(result, None, frame, config, pixels)
     residual = None
