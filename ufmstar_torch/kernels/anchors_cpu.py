@@ -33,18 +33,18 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
-from ufmstar_torch.kernels.regress_cpu import EPSILON
-from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
-from ufmstar_torch.kernels.regress_vectors_cpu import add_shares, count_less, square_distances
+from ufmstar_torch.kernels.regress_cpu import Seen, View, all_seen, look
+from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull
+from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, add_shares, count_less, square_distances
+from ufmstar_torch.kernels.rigid_cpu import padded
 from ufmstar_torch.kernels.threads_cpu import each
 from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
 
-_LOG2_E = math.log2(math.e)
-
 # Anchors of a cell, on average, where neighbours are searched and where components are.
-_FEW, _SOME = 3, 32
+_FEW, _SOME = 3, 16
+_NOTHING = 1e-30  # of a mean: less is 0 and not a number too small for single precision
 _TRIALS = 100  # of a radius: distances differ by so little only where rounding makes them equal
 
 
@@ -101,39 +101,50 @@ def learn(
     frame: FrameInput,
     anchors: AnchorInput | None,
     config: UfMStarConfig,
-    near: Sequence[tuple[NDArray[np.int64], int]] | None = None,
 ) -> Learnt:
     """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors, of evidence that may have less room than the
-    mixture; with the exact sum, shares are right to twice the error of the regression's in the dtype of the evidence.
-
-    ``near`` are the slots of each stream that can matter, in increasing order, and how many are occupied; None = all.
-    """
+    mixture."""
     if config.regression != "exact":
-        padded = evidence.padded(mixture_cam.capacity)
-        return learn_reference(padded, mixture_cam, frame, anchors, config, distribute, inliers)
-    b, capacity = mixture_cam.weight.shape
-    dtype = evidence.overall.dtype
-    if near is None:
-        near = [(slots, slots.size) for slots in map(np.flatnonzero, array(mixture_cam.weight) > 0)]
-    # In float64 for every dtype, so that there is one kernel to compile.
-    component, beyond = np.empty((b, capacity, 3)), np.empty((b, capacity, 2))
-    overall, stream, used = np.empty((b, 3)), np.empty((b, 2)), np.zeros((b, 1), np.int64)
+        padded_evidence = evidence.padded(mixture_cam.capacity)
+        return learn_reference(padded_evidence, mixture_cam, frame, anchors, config, distribute, inliers)
+    seen, slots = all_seen(mixture_cam, features=3)
+    views = look(seen, frame.depth, frame.intrinsics, config, evidence.overall.dtype)
+    return learn_in_view(evidence, mixture_cam.capacity, slots, seen, views, frame, anchors, config)
+
+
+def learn_in_view(
+    evidence: Evidence,
+    capacity: int,
+    slots: Sequence[NDArray[np.int64]],
+    seen: Sequence[Seen],
+    views: Sequence[View],
+    frame: FrameInput,
+    anchors: AnchorInput | None,
+    config: UfMStarConfig,
+) -> Learnt:
+    """:func:`learn` with the exact sum, of what is in view (``regress_cpu.look``); shares are right to twice the error
+    of the regression's. Of the last three features of ``seen`` and ``views`` the first two, which are what was learnt
+    of the components, are written.
+
+    Args:
+        evidence, frame, anchors, config: as :func:`learn`.
+        capacity: of the mixture.
+        slots: of each stream's ``seen`` components.
+    """
+    b, before, overall_before = len(views), array(evidence.component), array(evidence.overall)
+    component, overall = np.empty((b, capacity, 3), before.dtype), np.empty((b, 3), before.dtype)
+    beyond, stream, used = np.empty((b, capacity, 2)), np.empty((b, 2)), np.zeros((b, 1), np.int64)
     if anchors is None:
         fields = [np.empty((b, 0), np.int64), np.empty((b, 0, 2)), *np.empty((4, b, 0)), np.empty((b, 0), np.bool_)]
     else:
         given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
         fields = [array(anchors.index), *map(array, given), array(anchors.valid)]
-    own = (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight, frame.intrinsics)
-    doubles = [np.asarray(array(v), np.float64) for v in (*own, evidence.component, evidence.overall)]
-    settings = (
-        frame.size[1], 0.5 ** (1 / config.anchor_half_life), config.anchor_shrinkage, config.prior_weight,
-        EPSILON[dtype], dtype == torch.float32,
-    )  # fmt: skip
-    arrays = zip(*fields, *doubles, strict=True)
+    features = [one.features for one in seen]
+    settings = frame.size[1], 0.5 ** (1 / config.anchor_half_life), config.anchor_shrinkage
+    arrays = zip(slots, views, features, *fields, array(frame.intrinsics), before, overall_before, strict=True)
     out = zip(component, overall, used, beyond, stream, strict=True)
-    calls = zip(near, arrays, out, strict=True)
-    each(_learn, [(*slots, *arguments, *settings, *into) for slots, arguments, into in calls])
-    learnt = Evidence(torch.from_numpy(component).to(dtype), torch.from_numpy(overall).to(dtype))
+    each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
+    learnt = Evidence(torch.from_numpy(component), torch.from_numpy(overall))
     return Learnt(learnt, torch.from_numpy(used[:, 0]), torch.from_numpy(beyond), torch.from_numpy(stream))
 
 
@@ -155,34 +166,35 @@ def _add_term(depth, excess, disagreement, term, both):
 
 @kernel
 def _learn(
-    slots, occupied, index, pixel, predicted, depth, variance, own, valid, mean, covariance, weight, K, before,
-    overall_before, width, memory, shrinkage, prior_weight, epsilon, single, component, overall, used, beyond, stream,
+    slots, view, features, index, pixel, predicted, depth, variance, own, valid, K, before, overall_before,
+    width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
-    """One stream: N anchors, K components, of which only ``slots`` [n] can explain a point."""
+    """One stream: N anchors, K components, of which only ``view`` can explain a point."""
     supported = np.empty(valid.size, np.bool_)
     rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
     _supported(pixel, predicted, depth, variance, valid, supported)
     used[0] = _rows(predicted, depth, variance, own, supported, rows)
     if valid.size > 0:
-        mixture = (slots, occupied, mean, covariance, weight)
-        _distribute(index, predicted, supported, rows, K, width, mixture, prior_weight, epsilon, sums)
+        _distribute(index, predicted, supported, rows, K, width, slots, view, sums)
     fade = memory if used[0] > 0 else 1.0
-    for c in range(3):
-        overall[c] = _rounded(fade * overall_before[c] + _folded(rows[:, c]), single)
+    for c in range(3):  # rounded as the state keeps it
+        overall[c] = fade * overall_before[c] + _folded(rows[:, c])
     for c in range(2):
-        stream[c] = overall[c + 1] / (overall[0] + shrinkage)
+        stream[c] = np.float64(overall[c + 1]) / (np.float64(overall[0]) + shrinkage)
     for k in range(component.shape[0]):
         for c in range(3):
-            old = before[k, c] if k < before.shape[0] else 0.0
-            component[k, c] = _rounded(fade * old + sums[k, c], single)
+            old = np.float64(before[k, c]) if k < before.shape[0] else 0.0
+            component[k, c] = fade * old + sums[k, c]
+        n = np.float64(component[k, 0])
         for c in range(2):
-            beyond[k, c] = (component[k, c + 1] - component[k, 0] * stream[c]) / (component[k, 0] + shrinkage)
-
-
-@part
-def _rounded(value, single):
-    """A value as the state keeps it."""
-    return np.float64(np.float32(value)) if single else value
+            value = (np.float64(component[k, c + 1]) - n * stream[c]) / (n + shrinkage)
+            beyond[k, c] = value if abs(value) > _NOTHING else 0.0
+    last = features.shape[1] - 1
+    for i in range(slots.size):
+        features[i, last - 2], features[i, last - 1] = beyond[slots[i], 0], beyond[slots[i], 1]
+    for i in range(view[0].size):
+        k = slots[view[0][i]]
+        view[3][i, TERMS - 1], view[3][i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
 
 
 @part
@@ -387,44 +399,51 @@ def _within(distance, n, limit, work):
 
 
 @part
-def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight, epsilon, sums):
+def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
-    Left out is what adds less than eps/K of the prior to the denominator.
+    What is left out of each cell of anchors is what the regression leaves out of a tile.
     """
-    slots, count, mean, covariance, weight = mixture
+    visible, fields, packed, _, settings = view
     points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
     for i in range(chosen.size):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
-    occupied, whitening, log_peak = prepare(slots.copy(), mean, covariance, weight)
-    share = math.log(epsilon / max(count, 1))
-    boxes = _boxes(mean, covariance, occupied, log_peak, share + math.log(prior_weight))
     start, order = _grid(pixel, chosen, _SOME)[4:]
-    near = _touched(points, order, np.arange(occupied.size), boxes)
-    room = (near.size + LANES - 1) // LANES * LANES
-    fields, density, added = np.empty((10, room)), np.empty(room), np.empty((3, room))
-    point, row, scale = np.empty(3), np.empty(4), math.sqrt(0.5 * _LOG2_E)
-    row[3] = prior_weight
+    room = packed.shape[1]
+    kept, work = np.empty(visible.size, np.int64), np.empty(8 + room, packed.dtype)
+    near, density, added = np.empty((FIELDS, room)), np.empty(room), np.empty((3, room))
+    point, row = np.empty(3), np.empty(4)
+    row[3] = settings[0]
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:
             continue
-        kept = _touched(points, order[start[cell] : start[cell + 1]], near, boxes)
-        n = (kept.size + LANES - 1) // LANES * LANES
+        box = _box(points, order, start[cell], start[cell + 1])
+        count = cull(packed, visible.size, settings[4], box, settings, work, kept)
+        n = padded(count)
         for i in range(n):
-            k = kept[i] if i < kept.size else -1
+            for field in range(FIELDS):
+                near[field, i] = fields[kept[i], field] if i < count else 0.0
+            near[FIELDS - 1, i] = near[FIELDS - 1, i] if i < count else -np.inf
             for axis in range(3):
-                fields[axis, i] = mean[occupied[k], axis] if k >= 0 else 0.0
                 added[axis, i] = 0.0
-            for entry in range(6):
-                fields[3 + entry, i] = whitening[k, entry] * scale if k >= 0 else 0.0
-            fields[9, i] = log_peak[k] * _LOG2_E if k >= 0 else -np.inf
         for place in range(start[cell], start[cell + 1]):
             p = order[place]
             for axis in range(3):
                 point[axis], row[axis] = points[p, axis], rows[p, axis]
-            add_shares(fields, room, n, point, row, density, added)
-        for i in range(kept.size):
+            add_shares(near, room, n, point, row, density, added)
+        for i in range(count):
             for axis in range(3):
-                sums[occupied[kept[i]], axis] += added[axis, i]
+                sums[slots[visible[kept[i]]], axis] += added[axis, i]
+
+
+@leaf
+def _box(points, order, first, last):
+    """The least and the greatest corner of the points in those places of an order."""
+    a = b = c = np.inf
+    d = e = f = -np.inf
+    for place in range(first, last):
+        x, y, z = points[order[place], 0], points[order[place], 1], points[order[place], 2]
+        a, b, c, d, e, f = min(a, x), min(b, y), min(c, z), max(d, x), max(e, y), max(f, z)
+    return a, b, c, d, e, f
