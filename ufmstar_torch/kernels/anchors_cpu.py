@@ -19,11 +19,6 @@ from ufmstar_torch.anchors.evidence import (
     CLAIM,
     COUNTS,
     LEAST_SIGMA,
-    LOWER_QUARTILE,
-    NEIGHBOURS,
-    SIMILAR_SIGMAS,
-    SUPPORT,
-    TIE,
     Evidence,
 )
 from ufmstar_torch.anchors.given import FARTHEST_OFF, AnchorInput, Anchors, claimed
@@ -33,19 +28,17 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
+from ufmstar_torch.kernels.neighbours_cpu import grid, supported
 from ufmstar_torch.kernels.regress_cpu import Seen, View, all_seen, look
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull
-from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, add_shares, count_less, square_distances
+from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, add_shares
 from ufmstar_torch.kernels.rigid_cpu import padded
 from ufmstar_torch.kernels.threads_cpu import each
-from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
 
-# Anchors of a cell, on average, where neighbours are searched and where components are.
-_FEW, _SOME = 3, 16
+_SOME = 16  # anchors of a cell, on average, where components are searched
 _NOTHING = 1e-30  # of a mean: less is 0 and not a number too small for single precision
-_TRIALS = 100  # of a radius: distances differ by so little only where rounding makes them equal
 
 
 def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
@@ -92,7 +85,7 @@ def inliers(anchors: AnchorInput) -> Tensor:
 @kernel
 def _inliers(pixel, predicted, depth, variance, valid, out):
     """One stream, N anchors, into ``out`` [N]."""
-    _supported(pixel, predicted, depth, variance, valid, out)
+    supported(pixel, predicted, depth, variance, valid, out)
 
 
 def learn(
@@ -170,12 +163,12 @@ def _learn(
     width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
     """One stream: N anchors, K components, of which only ``view`` can explain a point."""
-    supported = np.empty(valid.size, np.bool_)
+    chosen = np.empty(valid.size, np.bool_)
     rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
-    _supported(pixel, predicted, depth, variance, valid, supported)
-    used[0] = _rows(predicted, depth, variance, own, supported, rows)
+    supported(pixel, predicted, depth, variance, valid, chosen)
+    used[0] = _rows(predicted, depth, variance, own, chosen, rows)
     if valid.size > 0:
-        _distribute(index, predicted, supported, rows, K, width, slots, view, sums)
+        _distribute(index, predicted, chosen, rows, K, width, slots, view, sums)
     fade = memory if used[0] > 0 else 1.0
     for c in range(3):  # rounded as the state keeps it
         overall[c] = fade * overall_before[c] + _folded(rows[:, c])
@@ -243,162 +236,6 @@ def _folded(values):
 
 
 @part
-def _grid(pixel, chosen, mean_count):
-    """Cells over the chosen ones of N pixels [N, 2], about so many in each: their first corner and side [px], columns
-    and rows, where each cell starts in the order [cells + 1], and the order."""
-    low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
-    for i in range(chosen.size):
-        if chosen[i]:
-            count += 1
-            for j in range(2):
-                low[j], high[j] = min(low[j], pixel[i, j]), max(high[j], pixel[i, j])
-    if count == 0:
-        low[:], high[:] = 0.0, 0.0
-    wide, tall, share = high[0] - low[0], high[1] - low[1], mean_count / max(count, 1)
-    # Not smaller than on a line, so that there are no more cells than about anchors, wherever they lie.
-    side = max(math.sqrt(wide * tall * share), max(wide, tall) * share, 1e-6)
-    columns, rows = int(wide / side) + 1, int(tall / side) + 1
-    cell, start = np.empty(chosen.size, np.int64), np.zeros(columns * rows + 1, np.int64)
-    for i in range(chosen.size):
-        if chosen[i]:
-            column = min(int((pixel[i, 0] - low[0]) / side), columns - 1)
-            cell[i] = min(int((pixel[i, 1] - low[1]) / side), rows - 1) * columns + column
-            start[cell[i] + 1] += 1
-    for c in range(columns * rows):
-        start[c + 1] += start[c]
-    place, order = start.copy(), np.empty(count, np.int64)
-    for i in range(chosen.size):
-        if chosen[i]:
-            order[place[cell[i]]] = i
-            place[cell[i]] += 1
-    return low, side, columns, rows, start, order
-
-
-@part
-def _supported(pixel, predicted, depth, variance, valid, out):
-    """Which of N anchors are valid and supported by their neighbours (``evidence.inliers``), into ``out`` [N]."""
-    grid = _grid(pixel, valid, _FEW)
-    order = grid[5]
-    n = order.size
-    for a in range(valid.size):
-        out[a] = valid[a]
-    if n <= SUPPORT:
-        return
-    most, room = min(NEIGHBOURS, n - 1), n + LANES
-    # In the order of the grid: pixel, what breaks a tie, log g/d, and the variance of log g.
-    u, v, tie, ratio, noise = np.empty(room), np.empty(room), np.empty(room), np.empty(n), np.empty(n)
-    for i in range(n):
-        a = order[i]
-        u[i], v[i], tie[i] = pixel[a, 0], pixel[a, 1], TIE * a
-        ratio[i], noise[i] = math.log(depth[a] / predicted[a]), variance[a] / (depth[a] * depth[a])
-    neighbour, differ = np.empty((n, most), np.int64), np.empty(n * most)
-    distance, place, work = np.empty(room), np.empty(n, np.int64), np.empty(4)
-    for i in range(n):
-        _nearest(grid, u, v, tie, i, distance, place, work, neighbour[i])
-        for j in range(most):
-            differ[i * most + j] = abs(ratio[i] - ratio[neighbour[i, j]])
-    sigma = _lower_quartile(differ.copy(), differ.size) / LOWER_QUARTILE
-    for i in range(n):
-        support = 0
-        for j in range(most):
-            allowed = sigma * sigma + 2 * LEAST_SIGMA**2 + noise[i] + noise[neighbour[i, j]]
-            support += differ[i * most + j] <= SIMILAR_SIGMAS * math.sqrt(allowed)
-        out[order[i]] = support >= SUPPORT
-
-
-@part
-def _lower_quartile(values, n):
-    """``torch.quantile(values[:n], 0.25)``, 0 where n = 0; reorders the values."""
-    if n == 0:
-        return 0.0
-    rank = 0.25 * (n - 1)
-    below, first, last = int(rank), 0, n - 1
-    while first < last:  # Hoare's selection: what is not above values[below] moves before it
-        pivot, i, j = values[below], first, last
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        if j < below:
-            first = i
-        if below < i:
-            last = j
-    low, high, weight = values[below], values[min(below + 1, n - 1)], rank - below
-    for i in range(below + 1, n):
-        high = min(high, values[i])
-    return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
-
-
-@leaf
-def _nearest(grid, u, v, tie, i, distance, place, work, neighbour):
-    """Write the anchors nearest to anchor i to ``neighbour`` [most], of more than so many in the order of the grid.
-
-    They are among those in rings of cells around its own if so many lie within the circle that the rings contain.
-    """
-    low, side, columns, rows = grid[:4]
-    work[0], work[1], most = u[i], v[i], neighbour.size
-    x, y = (u[i] - low[0]) / side, (v[i] - low[1]) / side
-    column, row = min(int(x), columns - 1), min(int(y), rows - 1)
-    # [cells] From the anchor to the border of its cell; a billionth less for rounding.
-    margin = max(min(min(x - column, column + 1 - x), min(y - row, row + 1 - y)) - 1e-9, 0.0)
-    ring, within, n, limit = 0, 0, 0, 0.0
-    while within < most:
-        ring += 1
-        n = _around(grid, u, v, tie, i, column, row, ring, distance, place, work)
-        limit = (ring + margin) * side * ((ring + margin) * side)
-        if ring >= max(columns, rows):  # all of them
-            limit = (columns * columns + rows * rows) * side * side + TIE * tie.size + 1
-        within = _within(distance, n, limit, work)
-    least, below = 0.0, 0
-    for _ in range(_TRIALS):
-        if within == most:
-            break
-        # Their number grows about as the square of the distance.
-        middle = least + (limit - least) * (most + 0.5 - below) / (within + 1 - below)
-        count = _within(distance, n, middle, work)
-        if count < most:
-            least, below = middle, count
-        else:
-            limit, within = middle, count
-    count = 0
-    for j in range(n):
-        if distance[j] < limit and count < most:
-            neighbour[count] = place[j]
-            count += 1
-
-
-@leaf
-def _around(grid, u, v, tie, i, column, row, ring, distance, place, work):
-    """Write the squared distances of anchor i from those in rings of cells around its own, infinite from itself, and
-    which they are; return how many. Behind the last one there are as many infinite ones as fit in a vector."""
-    columns, rows, start = grid[2], grid[3], grid[4]
-    n, left, right = 0, max(column - ring, 0), min(column + ring, columns - 1)
-    for y in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-        first, last = start[y * columns + left], start[y * columns + right + 1]
-        square_distances(u, v, tie, first, last - first, work, distance, n)
-        for j in range(first, last):
-            place[n + j - first] = j
-        if first <= i < last:
-            distance[n + i - first] = np.inf
-        n += last - first
-    for j in range(LANES):
-        distance[n + j] = np.inf
-    return n
-
-
-@leaf
-def _within(distance, n, limit, work):
-    """How many of n distances are less than ``limit``."""
-    work[2] = limit
-    count_less(distance, n, work[2:])
-    return int(work[3])
-
-
-@part
 def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
@@ -410,7 +247,7 @@ def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
-    start, order = _grid(pixel, chosen, _SOME)[4:]
+    start, order = grid(pixel, chosen, _SOME)[4:]
     room = packed.shape[1]
     kept, work = np.empty(visible.size, np.int64), np.empty(8 + room, packed.dtype)
     near, density, added = np.empty((FIELDS, room)), np.empty(room), np.empty((3, room))
