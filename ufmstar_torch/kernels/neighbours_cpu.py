@@ -134,7 +134,8 @@ def _nearest(cells, u, v, tie, i, distance, place, work, neighbour):
         n = _around(cells, u, v, tie, i, column, row, ring, distance, place, work)
         limit = (ring + margin) * side * ((ring + margin) * side)
         if ring >= max(columns, rows):  # all of them
-            limit = (columns * columns + rows * rows) * side * side + TIE * tie.size + 1
+            for j in range(n):
+                limit = max(limit, 2 * distance[j] + 1) if distance[j] < np.inf else limit
         within = _within(distance, n, limit, work)
     least, below = 0.0, 0
     for _ in range(_TRIALS):
