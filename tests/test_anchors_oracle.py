@@ -162,7 +162,7 @@ def test_what_was_learnt_may_be_small_and_is_moved_by_the_streams(some):
     seen, _ = all_seen(walked.mixture.to(torch.float64), features=3)
     seen[0].features[:] = 1e-32, 0.5, 1.0
     pixels = torch.arange(0, HEIGHT * WIDTH, 7)[None] if some else None
-    depth = torch.tensor(depths[0], dtype=torch.float32)[None].nan_to_num(0).clamp_min(0)
+    depth = torch.tensor(depths[0], dtype=torch.float32)[None].nan_to_num(0, posinf=0).clamp_min(0)
     given = seen, depth, torch.tensor(K)[None], ANCHORED, pixels, None
     plain = regress_maps(*given).features
     moved = regress_maps(*given, np.array([[0.25, -0.125]])).features
