@@ -62,7 +62,7 @@ def test_anchored_without_anchors_is_plain():
         a.corrected()
 
 
-def test_a_common_bias_is_found_and_not_counted_twice():
+def test_a_common_bias_is_measured_and_counted_once():
     # 20 % too far everywhere, and 4 % flicker between frames: r = 1/1.2 - 1 on average.
     _, outputs, depths = walk(lambda z, i, rng: z * 1.2 * (1 + 0.04 * rng.standard_normal()))
     sums = np.zeros(4)
@@ -79,7 +79,7 @@ def test_a_common_bias_is_found_and_not_counted_twice():
     assert claimed_left < 0.7 * claimed  # M stays
 
 
-def test_different_biases_are_told_apart():
+def test_different_biases_are_separated():
     def predict(truth, i, rng):
         return np.where(truth > 2.5, truth * 1.3, truth)
 
@@ -135,8 +135,9 @@ def test_what_is_claimed_is_the_larger_of_disagreement_and_lesson():
     assert 0.05 < float((often.anchored[often.valid] == 0).double().mean()) < 0.95, "M is the larger in some places"
     torch.testing.assert_close(often.variance, often.disagreement + often.anchored, rtol=0, atol=0, equal_nan=True)
     d2, m = torch.tensor([[4.0, 4.0, 1.0]]), torch.tensor([[0.1, 0.9, 0.2]])
-    term = anchored_term(d2.sqrt(), torch.tensor([[0.2, 0.2, -0.3]]), m)
-    torch.testing.assert_close(term + m, torch.tensor([[0.8, 0.9, 0.2]]))
+    term, both = anchored_term(d2.sqrt(), torch.tensor([[0.2, 0.2, -0.3]]), m)
+    torch.testing.assert_close(both, torch.tensor([[0.8, 0.9, 0.2]]))
+    torch.testing.assert_close(term, both - m)
 
 
 def rows(values, valid=None, pixel=None):

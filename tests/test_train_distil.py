@@ -136,7 +136,7 @@ def test_the_head_comes_to_state_what_ufmstar_computes(monkeypatch, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_fastdepth_comes_to_state_it_too(tmp_path, seed):
     """A tiny one, from nothing, on two tours that it is trained on."""
     size, lengths = (64, 96), {"tours": 2, "validation_tours": 1, "tour_frames": 8}
@@ -152,7 +152,7 @@ def test_a_fastdepth_comes_to_state_it_too(tmp_path, seed):
     assert train_member(job, 0) is None
     after = correlation(load_for_training(job.folder(0) / WEIGHTS)[0], batch)
     print(f"seed {seed}: Spearman {before:.2f} before, {after:.2f} after 200 steps")
-    # Measured over the four seeds: -.14 to .01 before, .32 to .50 after.
+    # Measured over four seeds: -.14 to .01 before, .32 to .50 after.
     assert after > before + 0.1
 
 
@@ -219,8 +219,8 @@ def test_clips_are_whole_and_every_frame_is_in_one_batch(room):
     frames = [[key.frame for key in batch] for step in steps for batch in step]
     assert sorted(frames) == [list(clip) for clip in found]
     truth = truth_at(room.sequences[0][3], room.sequences[0].intrinsics, SIZE)
-    torch.testing.assert_close(room.load(3).depth, torch.from_numpy(truth))
-    torch.testing.assert_close(room.load(3).T_world_cam.numpy(), room.sequences[0][3].T_world_cam)
+    np.testing.assert_array_equal(room.load(3).depth, truth)
+    np.testing.assert_array_equal(room.load(3).T_world_cam, room.sequences[0][3].T_world_cam)
 
 
 def test_what_cannot_be_clips_is_refused(room, tmp_path, monkeypatch):
