@@ -31,6 +31,9 @@ from ufmstar_torch.regress import Regression, regress_pixels
 EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
 
 
+View = tuple[Any, ...]  # what `in_view` returns
+
+
 class Seen(NamedTuple):
     """What of a stream's mixture can matter in an image: n components by field [13, n and more] in the camera's frame
     (``rigid_cpu``), their disagreement [n] and features [n, F], and how many components the mixture has."""
@@ -58,6 +61,19 @@ def in_slots(seen: Sequence[Seen], slots: Sequence[NDArray[np.int64]], capacity:
     return mixture
 
 
+def all_seen(mixture_cam: GaussianMixture, features: int | None = None) -> tuple[list[Seen], list[NDArray[np.int64]]]:
+    """All components of each stream, and their slots; with so many features, zeros, in place of their own."""
+    seen, slots = [], []
+    for mean, covariance, weight, disagreement, own in zip(*_fields(mixture_cam), strict=True):
+        at = np.flatnonzero(weight > 0)
+        n = len(at)
+        components = np.zeros((FIELDS, padded(n)))
+        components[:, :n] = np.column_stack([mean[at], covariance[at].reshape(n, 9), weight[at]]).T
+        seen.append(Seen(components, disagreement[at], own[at] if features is None else np.zeros((n, features)), n))
+        slots.append(at)
+    return seen, slots
+
+
 def regress_image(
     mixture_cam: GaussianMixture,
     depth: Tensor,
@@ -67,21 +83,35 @@ def regress_image(
     pixels: Tensor | None = None,
 ) -> Regression:
     """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors; every feature is a contiguous map."""
-    seen = []
-    for mean, covariance, weight, disagreement, features in zip(*_fields(mixture_cam), strict=True):
-        slots = np.flatnonzero(weight > 0)
-        n = len(slots)
-        components = np.zeros((FIELDS, padded(n)))
-        components[:, :n] = np.column_stack([mean[slots], covariance[slots].reshape(n, 9), weight[slots]]).T
-        seen.append(Seen(components, disagreement[slots], features[slots], n))
-    return regress_maps(seen, torch.where(valid, depth.detach(), 0), intrinsics, config, pixels)
+    depth = torch.where(valid, depth.detach(), 0)
+    return regress_maps(all_seen(mixture_cam)[0], depth, intrinsics, config, pixels)
+
+
+def look(
+    seen: Sequence[Seen], depth: Tensor, intrinsics: Tensor, config: UfMStarConfig, *others: torch.dtype
+) -> list[View]:
+    """What each stream's mixture has in view, as the exact sum takes it, with the error of the depth's dtype or of a
+    more precise one of the ``others``."""
+    epsilon = min(EPSILON[dtype] for dtype in (depth.dtype, *others))
+    streams = zip(seen, _doubles(intrinsics)[0], array(depth), strict=True)
+    return [in_view(*one, K, z, config.prior_weight, config.prior_mean, epsilon) for one, K, z in streams]
 
 
 def regress_maps(
-    seen: Sequence[Seen], depth: Tensor, intrinsics: Tensor, config: UfMStarConfig, pixels: Tensor | None = None
+    seen: Sequence[Seen],
+    depth: Tensor,
+    intrinsics: Tensor,
+    config: UfMStarConfig,
+    pixels: Tensor | None = None,
+    views: Sequence[View] | None = None,
+    shift: NDArray[np.float64] | None = None,
 ) -> Regression:
     """:func:`regress_image` of a depth that is positive where it is valid, and only there, and of what each stream's
-    mixture has in view."""
+    mixture has in view.
+
+    With the exact sum, ``views`` are those of :func:`look`, which None makes, and ``shift`` [B, 2] is added to the two
+    features before the last, of three or more; None = nothing.
+    """
     if pixels is not None and config.regression != "exact":
         most = max(len(one.disagreement) for one in seen)
         mixture = in_slots(seen, [np.arange(len(one.disagreement)) for one in seen], most)
@@ -90,20 +120,22 @@ def regress_maps(
     shape, features = z.shape if pixels is None else tuple(pixels.shape), seen[0].features.shape[1]
     out, out_f = np.empty(shape, z.dtype), np.empty((len(z), features, *shape[1:]), z.dtype)
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
-    settings = _settings(config, depth.dtype)
+    settings, moved = _settings(config, depth.dtype), np.zeros((len(z), 2)) if shift is None else shift
     kernel = near_image if config.regression != "exact" else exact if pixels is None else exact_at
+    if views is None and kernel is not near_image:
+        views = look(seen, depth, intrinsics, config)
     calls: list[tuple[Any, ...]] = []
     for b, one in enumerate(seen):
         into = out[b], out_f[b]
-        if kernel is near_image:
+        if views is None:
             given = (z[b], K[b], *one.moments(), one.disagreement, one.features, *settings, *into)
             calls += [(*given, i, shares) for i in range(shares)]
             continue
-        view = in_view(*one, K[b], z[b], *settings)
+        view = views[b]
         if pixels is None:
-            calls += [(z[b], K[b], view, one.features, *into, i, shares) for i in range(shares)]
+            calls += [(z[b], K[b], view, one.features, moved[b], *into, i, shares) for i in range(shares)]
         else:
-            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, one.features, *into))
+            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, one.features, moved[b], *into))
     each(kernel, calls)
     return _regression(out, out_f)
 

@@ -28,8 +28,9 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf
 from ufmstar_torch.kernels.regress_points_cpu import HALF_LOG_TWO_PI_CUBED
-from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds
+from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds, largest
 from ufmstar_torch.kernels.rigid_cpu import padded
+from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.kernels.whiten_cpu import PEAK, SQUARE, WHITENED, meets, whiten
 
 _PRIOR = 1e-3  # share of the prior in a threshold
@@ -49,7 +50,7 @@ def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mea
 
     Returns:
         Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
-        sum but their offsets [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold,
+        sum [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold,
         and how many components level 1 left.
     """
     height, width = depth.shape
@@ -59,7 +60,7 @@ def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mea
     n = _visible(components, m.size, whitened, K, height, width, limit, np.empty((2, 3)), index)
     packed = np.empty((FIELDS, padded(n)), depth.dtype)
     _pack(components, whitened, index, n, packed)
-    z = _farthest(depth)
+    z = _farthest(depth, np.empty(1, depth.dtype))
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
@@ -92,7 +93,7 @@ def _pack(components, whitened, index, n, packed):
 
 @leaf
 def _terms(components, whitened, index, m, features, fields, constants):
-    """Write the fields [n, 10] of the chosen components, and the terms of the sum but their offsets."""
+    """Write the fields [n, 10] of the chosen components, and the terms of the sum."""
     for i in range(fields.shape[0]):
         k = index[i]
         for j in range(3):
@@ -105,19 +106,16 @@ def _terms(components, whitened, index, m, features, fields, constants):
 
 
 @leaf
-def _farthest(depth):
-    """The largest depth, in four chains of comparisons, which do not wait for each other."""
-    most = np.float64(0)
-    for v in range(depth.shape[0]):
-        row = depth[v]
-        a = b = c = d = row[0]
-        for u in range(0, depth.shape[1] - 3, 4):
-            a, b = row[u] if row[u] > a else a, row[u + 1] if row[u + 1] > b else b
-            c, d = row[u + 2] if row[u + 2] > c else c, row[u + 3] if row[u + 3] > d else d
-        for u in range(depth.shape[1] - depth.shape[1] % 4, depth.shape[1]):
-            a = row[u] if row[u] > a else a
-        most = max(most, np.float64(max(max(a, b), max(c, d))))
-    return most
+def _farthest(depth, work):
+    """The largest depth; ``work`` is scratch."""
+    flat = depth.reshape(-1)
+    n = flat.size - flat.size % (4 * LANES)
+    work[0] = 0
+    largest(flat, n, work)
+    most = work[0]
+    for i in range(n, flat.size):
+        most = flat[i] if flat[i] > most else most
+    return np.float64(most)
 
 
 @leaf

@@ -23,9 +23,9 @@ from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
-from ufmstar_torch.kernels.anchors_cpu import learn
+from ufmstar_torch.kernels.anchors_cpu import learn, learn_in_view
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.regress_cpu import EPSILON, Seen, in_slots, regress_maps
+from ufmstar_torch.kernels.regress_cpu import EPSILON, Seen, View, in_slots, look, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
 from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
@@ -91,14 +91,15 @@ def step(
         joined = _join(state, frame, segments, cameras[0], pairs, config)
     stage("fuse")
 
-    learnt = None
+    learnt, views = None, None
     if config.anchored:
-        learnt = _learn(state, joined, frame, anchors, config)
+        learnt, views = _learn(state, joined, frame, anchors, config)
     stage("append")
 
     with kernel("regress_image"):
-        result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels)
-    if learnt is not None:
+        shift = None if learnt is None or views is None else array(learnt.stream)
+        result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
+    if learnt is not None and views is None:
         shape = -1, *[1] * (result.features.dim() - 2), 2
         result.features[..., -3:-1] += learnt.stream.to(frame.depth.dtype).view(shape)
     result, _, measured = after_regress(result, None, frame, config, pixels)
@@ -211,14 +212,17 @@ def _join(
 
 def _learn(
     state: UfMStarState, joined: _Joined, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig
-) -> Learnt:
-    """What anchors teach; what each component's error is beyond the stream's goes to the features."""
-    mixture_cam = in_slots(joined.seen, joined.slots, joined.mixture["weight"].shape[1])
-    near = [(slots, one.occupied) for slots, one in zip(joined.slots, joined.seen, strict=True)]
-    learnt = learn(Evidence(state.evidence, state.overall_evidence), mixture_cam, frame, anchors, config, near)
+) -> tuple[Learnt, list[View] | None]:
+    """What anchors teach, and what is in view where the exact sum asks; what each component's error is beyond the
+    stream's goes to the features, before the share that was measured, as ``hook.before_regression`` has them."""
+    evidence, capacity = Evidence(state.evidence, state.overall_evidence), joined.mixture["weight"].shape[1]
+    if config.regression == "exact":
+        views = look(joined.seen, frame.depth, frame.intrinsics, config, evidence.overall.dtype)
+        return learn_in_view(evidence, capacity, joined.slots, joined.seen, views, frame, anchors, config), views
+    learnt = learn(evidence, in_slots(joined.seen, joined.slots, capacity), frame, anchors, config)
     for slots, one, beyond in zip(joined.slots, joined.seen, array(learnt.beyond), strict=True):
-        one.features[:, -3:-1] = beyond[slots]  # before the share that was measured, as `before_regression` has them
-    return learnt
+        one.features[:, -3:-1] = beyond[slots]
+    return learnt, None
 
 
 def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarConfig) -> NDArray[np.float64]:

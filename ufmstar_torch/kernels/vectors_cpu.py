@@ -178,6 +178,10 @@ class Memory:
         places = ir.Constant(ir.VectorType(ir.IntType(32), self._vector.count), [0] * self._vector.count)
         return self._lanes(self._builder.shuffle_vector(filled, none, places))
 
+    def whole(self, place: Any) -> Any:
+        """A number of an array of int64, as a place in another one."""
+        return self._builder.load(self._at(place, 0))
+
     def put(self, value: Lanes, place: Any, offset: int = 0) -> None:
         """Write the first number of a vector."""
         first = self._builder.extract_element(value.value, ir.IntType(32)(0))
