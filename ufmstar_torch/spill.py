@@ -1,15 +1,15 @@
 """Components that the present frame cannot reach, in files instead of memory (``config.spill``), an extension.
 
-After a frame with more than ``config.max_components`` components, those in cubes that it could not reach are written
-out, the farthest first, a page for each cube, until three quarters of the limit are left. Before a frame, every page
-that it may reach is read back. A component is within reach of a frame where
+After a frame with more than ``config.max_components`` components, those that it could not reach are written out, the
+farthest first, until three quarters of the limit are left; neighbours of about the same size share a page. Before a
+frame, every page that it may reach is read back. A component is within reach of a frame where
 
 - its mean may project into the image, at any depth beyond the near plane: then it can match (``correspond``); or
 - its density may exceed 1e-9 of the prior's weight at a point of the depth map: then the regression reads it.
 
 Both are decided by axis-aligned boxes against the planes of the viewing pyramid, which can only say "reached" too
 often. So matching and fusion are those of a mixture that was never written out, to the last bit, and the map differs by
-rounding; components stand in another order. What lies in cubes within reach of one frame is kept even beyond the limit.
+rounding; components stand in another order. What lies within reach of one frame is kept even beyond the limit.
 
 The work of a frame depends on what is in memory and what it reads back: pages are looked up in a tree of boxes
 (``spill_index``), and a journal keeps what changed (``spill_store``). Streams are independent; each has its own limit
@@ -31,13 +31,13 @@ from torch import Tensor
 
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
-from ufmstar_torch.spill_index import CELL, Page, PageIndex, View
+from ufmstar_torch.spill_index import Page, PageIndex, View
 from ufmstar_torch.spill_store import Change, Folder, Memory
 from ufmstar_torch.state import UfMStarState
 
 MEMORY = "memory"
 _COLUMNS = ("mean", "covariance", "weight", "disagreement", "count", "features", "evidence")
-_CUBE = CELL / 8  # [m] edge of the cubes whose components share a page
+_PAGE = 16  # most components of a page: the more there are, the more frames reach one of them and read them all
 _KEPT = 0.75  # share of the limit that is left after writing out
 _NEGLIGIBLE = 1e-9  # density at a point, in units of the prior's weight
 
@@ -86,7 +86,7 @@ class Spill:
             pages.back = pages.index.reached(_view(state, frame, b, self.config)) if usable else []
         if not any(pages.back for pages in streams):
             return state
-        return _with_rows(state, [pages.joined(_rows(state, b), pages.back) for b, pages in enumerate(streams)])
+        return _with_more(state, [pages.content(pages.back) for pages in streams])
 
     def write_out(self, state: UfMStarState, frame: FrameInput) -> UfMStarState:
         """The state without what is beyond the limit, as far as the frame cannot reach it.
@@ -110,9 +110,7 @@ class Spill:
 
     def everything(self, state: UfMStarState) -> UfMStarState:
         """The state with all components, as if none had been written out."""
-        return _with_rows(
-            state, [pages.joined(_rows(state, b), pages.index) for b, pages in enumerate(self._at(state))]
-        )
+        return _with_more(state, [pages.content(pages.index) for pages in self._at(state)])
 
     def spilled(self, state: UfMStarState) -> Spilled:
         """What is out of memory beside a state."""
@@ -162,11 +160,11 @@ class _StreamPages:
         for change in own:
             self._take(change)
 
-    def joined(self, rows: NDArray, numbers: Sequence[int] | PageIndex) -> NDArray:
-        """Rows, and behind them those of pages."""
+    def content(self, numbers: Sequence[int] | PageIndex) -> NDArray:
+        """The rows [n, C] of pages, one page behind the other; [0, 0] of none."""
         pages = [self.index[number] for number in numbers]
-        contents = [np.frombuffer(self._store.read(page.name)).reshape(page.count, -1) for page in pages]
-        return np.concatenate([rows, *contents])
+        content = b"".join([self._store.read(page.name) for page in pages])
+        return np.frombuffer(content).reshape(sum(page.count for page in pages), -1) if pages else np.empty((0, 0))
 
     def write(self, rows: NDArray, boxes: NDArray) -> Page:
         """A page of rows [n, C] with their boxes [n, 2, 2, 3], which is not listed yet."""
@@ -205,42 +203,59 @@ def _parted(
 ) -> tuple[NDArray, list[tuple[NDArray, NDArray]]]:
     """The rows that stay, and those of every page that goes, with their boxes."""
     boxes = _boxes(rows, config)
-    cube = np.floor(rows[:, :3] / _CUBE).astype(np.int64)
-    key = cube % 2**21 @ [2**42, 2**21, 1]  # the same again after 8,000 km
-    _, first, member, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
-    reached = np.bincount(member, _view(state, frame, b, config).reaches(boxes)) > 0
+    free = np.flatnonzero(~_view(state, frame, b, config).reaches(boxes))
     camera = torch.linalg.inv(state.T_world_first[b]) @ frame.T_world_cam[b].to(state.T_world_first)
-    distance = np.linalg.norm((cube[first] + 0.5) * _CUBE - camera[:3, 3].cpu().numpy(), axis=1)
-    farthest = np.argsort(np.where(reached, 0, -distance), kind="stable")[: np.count_nonzero(~reached)]
-    left = len(rows) - np.cumsum(count[farthest]) + count[farthest]  # components when it is a cube's turn
-    parts = [np.flatnonzero(member == cube) for cube in farthest[left > _KEPT * limit]]
+    distance = np.linalg.norm(rows[free, :3] - camera[:3, 3].cpu().numpy(), axis=1)
+    goes = free[np.argsort(-distance, kind="stable")[: len(rows) - math.ceil(_KEPT * limit)]]
     stays = np.ones(len(rows), np.bool_)
-    stays[np.concatenate([np.empty(0, np.int64), *parts])] = False
-    return rows[stays], [(rows[part], boxes[part]) for part in parts]
+    stays[goes] = False
+    corners = boxes[:, 1].reshape(-1, 6)
+    return rows[stays], [(rows[part], boxes[part]) for part in _divided(goes, corners)]
+
+
+def _divided(members: NDArray[np.int64], corners: NDArray) -> list[NDArray[np.int64]]:
+    """Members in halves of halves, each along the coordinate [n, 6] of the largest range, until they fit."""
+    if len(members) <= _PAGE:
+        return [members] if len(members) else []
+    own = corners[members]
+    order = members[np.argsort(own[:, np.ptp(own, axis=0).argmax()], kind="stable")]
+    half = len(order) // 2
+    return [*_divided(order[:half], corners), *_divided(order[half:], corners)]
 
 
 def _rows(state: UfMStarState, b: int) -> NDArray:
     """[n, C] float64, the components of a stream; every number of a state is exact in it."""
     n = int(state.mixture.components[b])
-    columns = [value for name in _COLUMNS if len(value := getattr(state, name)[b])]
+    columns = [value[b] for value in _columns(state).values()]
     return np.concatenate([v[:n].cpu().double().reshape(n, math.prod(v.shape[1:])).numpy() for v in columns], 1)
 
 
-def _with_rows(state: UfMStarState, rows: Sequence[NDArray], capacity: int | None = None) -> UfMStarState:
-    """The state with other components [n, C] in every stream, in as many slots as before or more, or in ``capacity`` or
-    more."""
-    slots = max(state.weight.shape[1] if capacity is None else capacity, *map(len, rows))
-    tables, at, changed = [torch.from_numpy(table) for table in rows], 0, {}
-    for name in _COLUMNS:
-        old: Tensor = getattr(state, name)
-        if not old.shape[1]:
-            continue  # no evidence without anchors
+def _with_rows(state: UfMStarState, rows: Sequence[NDArray], capacity: int) -> UfMStarState:
+    """The state with other components [n, C] in every stream, in ``capacity`` slots or more."""
+    slots = max(capacity, *map(len, rows))
+    empty = {name: v.new_zeros(len(rows), slots, *v.shape[2:]) for name, v in _columns(state).items()}
+    return _with_more(replace(state, **empty), rows)
+
+
+def _with_more(state: UfMStarState, rows: Sequence[NDArray]) -> UfMStarState:
+    """The state with more components [n, C] in every stream, in as many slots as before or more."""
+    first = state.mixture.components.tolist()
+    slots = max(state.weight.shape[1], *(n + len(table) for n, table in zip(first, rows, strict=True)))
+    at, changed = 0, {}
+    for name, old in _columns(state).items():
         width = math.prod(old.shape[2:])
-        new = old.new_zeros(len(tables), slots, *old.shape[2:])
-        for b, table in enumerate(tables):
-            new[b, : len(table)] = table[:, at : at + width].reshape(len(table), *old.shape[2:]).to(new)
+        new = torch.cat([old, old.new_zeros(len(old), slots - old.shape[1], *old.shape[2:])], 1)
+        for b, table in enumerate(rows):
+            if len(table):
+                values = torch.from_numpy(table[:, at : at + width].copy()).to(new)
+                new[b, first[b] : first[b] + len(table)] = values.reshape(len(table), *old.shape[2:])
         changed[name], at = new, at + width
     return replace(state, **changed)
+
+
+def _columns(state: UfMStarState) -> dict[str, Tensor]:
+    """The tensors of the components; no evidence without anchors."""
+    return {name: value for name in _COLUMNS if (value := getattr(state, name)).shape[1]}
 
 
 def _boxes(rows: NDArray, config: UfMStarConfig) -> NDArray:

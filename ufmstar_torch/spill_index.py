@@ -1,9 +1,9 @@
 """Which pages a frame may reach, without a look at all of them: a tree of boxes around boxes.
 
-Space is divided into cells of 32 m, and a page lies in one of them. Eight cells along every axis share a node, eight
-nodes the next one, up to 2 km; the root is above them. A node has the union of its pages' boxes: where a frame does not
-reach it, it reaches none of them. So the pages returned are those of a look at every page, and the work depends on what
-is reached, and hardly on how many there are.
+Space is divided into cells of 32 m, and a page counts to that of the least corner of its means. Eight cells along every
+axis share a node, eight nodes the next one, up to 2 km; the root is above them. A node has the union of its pages'
+boxes: where a frame does not reach it, it reaches none of them. So the pages returned are those of a look at every
+page, and the work depends on what is reached, and hardly on how many there are.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Page:
         name: of the file.
         count: of its components.
         boxes: [2, 2, 3] float64, lower and upper corner in the frame of the first camera [m] of a box around their
-            means, in one cell, and of a box outside of which none of them counts.
+            means, and of a box outside of which none of them counts.
     """
 
     name: str
