@@ -7,7 +7,7 @@ threads (threads that wait by spinning included), without what other processes t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from importlib.util import find_spec
@@ -22,6 +22,7 @@ from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synch
 from ufmstar_torch.eval.results.machine import available_cores
 
 F = TypeVar("F")
+Name = TypeVar("Name", bound=Hashable)
 
 # Every moment of a step belongs to one of these; see ``ufmstar_torch.step.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
@@ -92,7 +93,9 @@ class TimedCalls:
             yield frame
         self.times.drop(warm_up)
 
-    def call(self, calls: Mapping[str, Callable[..., Any]], *args: Any, device: torch.device = _CPU) -> dict[str, Any]:
+    def call(
+        self, calls: Mapping[Name, Callable[..., Any]], *args: Any, device: torch.device = _CPU
+    ) -> dict[Name, Any]:
         """Make every call on the current frame; the results by name.
 
         Args:
@@ -106,11 +109,9 @@ class TimedCalls:
             synchronize(device)
             return result
 
-        untimed = set(self._before)
+        untimed, order = set(self._before), list(calls)[:: -1 if self._number % 2 else 1]
         results = {}
-        for name, previous in zip(
-            list(calls)[:: -1 if self._number % 2 else 1], cycle(self._before or [""]), strict=False
-        ):
+        for name, previous in zip(order, cycle(self._before or [""]), strict=False):
             if previous in untimed:
                 self.times.time(previous, finished, self._before[previous])
                 untimed.discard(previous)
