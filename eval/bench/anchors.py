@@ -180,13 +180,13 @@ class _TimedTracker(LandmarkTracker):
                 clock["rest"][-1] -= times[-1]
         return landmarks
 
-    def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        return self.times.time("following", super()._followed, gray, T)
+    def _followed(self, *args: Any) -> tuple[NDArray, NDArray]:
+        return self.times.time("following", super()._followed, *args)
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
-        free = int((~self._seen[:, self._view]).sum())
+        before = self._seen[:, self._view].sum()
         self.times.time("searching", super()._fill, gray)
-        self.refilled.append(free != int((~self._seen[:, self._view]).sum()))
+        self.refilled.append(bool(before != self._seen[:, self._view].sum()))
 
     def _landmarks(self, tracked: int) -> Landmarks:
         return self.times.time("triangulating", super()._landmarks, tracked)
@@ -207,11 +207,7 @@ def _spread(times: CallTimes, name: str) -> dict[str, float | int]:
     """Median, 90th percentile, mean and minimum of wall-clock and processor times [ms], and their count."""
     figures: dict[str, float | int] = {"count": len(times.wall[name])}
     for prefix, values in (("", times.wall[name]), ("cpu_", times.cpu[name])):
-        of: dict[str, Any] = {
-            "median": np.median(values),
-            "p90": np.percentile(values, 90),
-            "mean": np.mean(values),
-            "min": min(values),
-        }
-        figures |= {f"{prefix}{key}_ms": float(value) for key, value in of.items()}
+        least, median, p90 = np.percentile(values, (0, 50, 90)).tolist()
+        of = {"median": median, "p90": p90, "mean": float(np.mean(values)), "min": least}
+        figures |= {f"{prefix}{key}_ms": value for key, value in of.items()}
     return figures
