@@ -9,7 +9,7 @@ from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.outputs import as_map
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction, infer, takes_intrinsics
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 
 class AlignedNetwork(DepthNetwork):
@@ -28,9 +28,9 @@ class AlignedNetwork(DepthNetwork):
         self.preprocess = preprocess or Preprocess()
 
     @property
-    def takes_intrinsics(self) -> bool:
-        """Whether the relative network does."""
-        return takes_intrinsics(self.network)
+    def wrapped(self) -> tuple[nn.Module]:
+        """The relative network."""
+        return (self.network,)
 
     @property
     def max_depth(self) -> float | None:
@@ -38,12 +38,8 @@ class AlignedNetwork(DepthNetwork):
         return self.alignment.max_depth
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; 0 (no prediction) where
-        the alignment is not possible.
-
-        Raises:
-            ValueError: the network returns another shape.
-        """
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; 0 (no prediction) where the
+        alignment is not possible. Raises ValueError: the network returns another shape."""
         relative = as_map(infer(self.network, image, intrinsics), "the network's relative depth")
         if relative.shape[-2:] != image.shape[-2:]:
             raise ValueError(f"network must return {tuple(image.shape[-2:])} px, got {tuple(relative.shape)}")

@@ -12,7 +12,7 @@ counts as disagreement, and removes the frame-to-frame error of scale that is th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypedDict, Unpack
 
 import torch
@@ -39,15 +39,13 @@ class Alignment(Checked):
         ValueError: another kind, values that are not finite, a scale that is not positive, different shapes.
     """
 
-    kind: str
+    kind: str = field(metadata={"choices": KINDS})
     scale: Tensor
     shift: Tensor
     max_depth: float | None = number(None, "d_max", "m", 0.0, open_low=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.kind not in KINDS:
-            raise ValueError(f"Alignment.kind must be one of {KINDS}, got {self.kind!r}")
         for name in ("scale", "shift"):
             value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
             object.__setattr__(self, name, value)
@@ -61,12 +59,7 @@ class Alignment(Checked):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, exactly."""
-        return {
-            "kind": self.kind,
-            "scale": self.scale.tolist(),
-            "shift": self.shift.tolist(),
-            "max_depth": self.max_depth,
-        }
+        return {**super().to_dict(), "scale": self.scale.tolist(), "shift": self.shift.tolist()}
 
     def depth(self, prediction: Tensor) -> Tensor:
         """Depth [B, H, W] [m]; 0, which UfM* takes as no prediction, where it is not :meth:`valid`.
@@ -100,34 +93,21 @@ class Alignment(Checked):
 
 @dataclass(frozen=True, eq=False)
 class AlignmentFit:
-    """An alignment with what supports it; [] instead of [B] where the images were pooled.
+    """An alignment with what supports it; [] instead of [B] where the images were pooled."""
 
-    Attributes:
-        alignment: the result.
-        points: [B] usable measurements.
-        inliers: [B] those that the final fit used.
-        residual: [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m].
-        sums: to which those of further images can be added.
-    """
-
-    alignment: Alignment
-    points: Tensor
-    inliers: Tensor
-    residual: Tensor
-    sums: AlignmentSums
+    alignment: Alignment  # the result
+    points: Tensor  # [B] usable measurements
+    inliers: Tensor  # [B] those that the final fit used
+    residual: Tensor  # [B] root mean square over the inliers of the difference in inverse depth [1/m] or depth [m]
+    sums: AlignmentSums  # to which those of further images can be added
 
 
 @dataclass(frozen=True, eq=False)
 class AlignmentSums:
-    """Weighted sums over measurements (x, y), which add up over a stream: ``total = total + fit.sums``.
+    """Weighted sums over measurements (x, y), which add up over a stream: ``total = total + fit.sums``."""
 
-    Attributes:
-        kind: of the alignment.
-        values: [..., 5] sums of w, w x, w y, w x^2, w x y.
-    """
-
-    kind: str
-    values: Tensor
+    kind: str  # of the alignment
+    values: Tensor  # [..., 5] sums of w, w x, w y, w x^2, w x y
 
     def __add__(self, other: AlignmentSums) -> AlignmentSums:
         if self.kind != other.kind:
@@ -135,14 +115,11 @@ class AlignmentSums:
         return AlignmentSums(self.kind, self.values + other.values)
 
     def alignment(self, *, shift: float | None = None, max_depth: float | None = None) -> Alignment:
-        """The weighted least-squares alignment of everything summed; ``shift`` as :func:`fit_inverse_depth`.
-
-        Raises:
-            ValueError: the sums do not determine it, or the scale is not positive.
-        """
+        """The weighted least-squares alignment of everything summed; ``shift`` as :func:`fit_inverse_depth`. Raises
+        ValueError: the sums do not determine it, or the scale is not positive."""
         w, wx, wy, wxx, wxy = self.values.unbind(-1)
         if shift is None:
-            gram = torch.stack([torch.stack([wxx, wx], -1), torch.stack([wx, w], -1)], -2)
+            gram = torch.stack([wxx, wx, wx, w], -1).unflatten(-1, (2, 2))
             theta, determined = solve_normal(gram, torch.stack([wxy, wy], -1))
             scale, offset = theta.unbind(-1)
         else:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch.models.checkpoints import read_tensors
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.outputs import OutputSpec, ProgramSpec
+from ufmstar_torch.models.outputs import METRIC, OutputSpec, ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.prediction import DepthPrediction, infer
 from ufmstar_torch.prediction import takes_intrinsics as declares_intrinsics
@@ -49,15 +49,9 @@ class WrappedNetwork(DepthNetwork):
         return self.outputs.max_depth
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
-
-        Args:
-            image: see above.
-            intrinsics: [B, 3, 3] of ``image`` [px], for a network that takes them.
-
-        Raises:
-            ValueError: the network's output is not what was declared, or the intrinsics are missing.
-        """
+        """Depth [B, H, W] [m] of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with ``intrinsics`` [B, 3, 3]
+        [px] for a network that takes them. Raises ValueError: the network's output is not what was declared, or the
+        intrinsics are missing."""
         result = infer(self.network, image, intrinsics, takes=self._passes_intrinsics)
         if isinstance(result, DepthPrediction):
             return result
@@ -99,39 +93,21 @@ def wrap_network(
     """
     if not callable(network):
         raise TypeError(f"network must be an nn.Module or a function, got {type(network).__name__}")
-    spec = OutputSpec(
-        kind="inverse" if inverse else "metric",
-        depth=output,
-        scale=scale,
-        aleatoric=aleatoric,
-        aleatoric_kind=aleatoric_kind,
-        epistemic=epistemic,
-        epistemic_kind=epistemic_kind,
-        resize=resize,
-        focal=focal,
-        max_depth=max_depth,
-    )
+    kind, spreads = "inverse" if inverse else METRIC, (aleatoric, aleatoric_kind, epistemic, epistemic_kind)
+    spec = OutputSpec(kind, output, scale, *spreads, resize, focal, max_depth)
     return WrappedNetwork(network, spec, preprocess or Preprocess(), takes_intrinsics)
 
 
 def load_torchscript(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
-    """A TorchScript file (``torch.jit.save``) as a network, on the CPU. Such a file is a program: load only
-    what you trust.
-
-    Args:
-        path: the file.
-        spec: a :class:`ProgramSpec`, its plain values or a JSON file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not a TorchScript file, or the spec is missing or impossible.
-    """
+    """A TorchScript file (``torch.jit.save``) as a network, on the CPU; ``spec``: a :class:`ProgramSpec`, its plain
+    values or a JSON file. Such a file is a program: load only what you trust. Raises FileNotFoundError: there is no
+    such file; ValueError: it is not a TorchScript file, or the spec is missing or impossible."""
     declared = ProgramSpec.required(spec)
     try:
-        module = torch.jit.load(_existing(path), map_location="cpu")
+        program = torch.jit.load(_existing(path), map_location="cpu")
     except RuntimeError as error:
         raise ValueError(f"{path} is not a readable TorchScript file: {error}") from error
-    return _wrapped(module.eval(), declared)
+    return _wrapped(program.eval(), declared)
 
 
 def load_exported(path: str | Path, spec: Spec | None = None) -> WrappedNetwork:
@@ -202,12 +178,10 @@ def _named(result: Any) -> dict[str | int, Tensor]:
     """The tensors of whatever a network returned, by name or position."""
     if isinstance(result, Tensor):
         return {"depth": result}
-    if isinstance(result, Mapping):
-        items: Any = result.items()
-    elif isinstance(result, (tuple, list)):
-        items = enumerate(result)
-    elif hasattr(result, "__dict__"):
-        items = vars(result).items()
-    else:
-        raise ValueError(f"a network must return tensors or a DepthPrediction, got {type(result).__name__}")
-    return {name: value for name, value in items if isinstance(value, Tensor)}
+    if isinstance(result, (tuple, list)):
+        result = dict(enumerate(result))
+    elif not isinstance(result, Mapping):
+        if not hasattr(result, "__dict__"):
+            raise ValueError(f"a network must return tensors or a DepthPrediction, got {type(result).__name__}")
+        result = vars(result)
+    return {name: value for name, value in result.items() if isinstance(value, Tensor)}

@@ -65,17 +65,16 @@ def convert(
         raise ValueError(f"need members >= 2, init in {list(INITS)} and std >= 0, got {members}, {init!r}, {std}")
     if converted_layers(network):
         raise ValueError(f"{type(network).__name__} is converted already")
+    expected = 0
     for name, module in network.named_modules():
-        _check_layer(name, module)
-    expected = sum(isinstance(module, _PLAIN) for module in network.modules())
+        if isinstance(module, _PLAIN):
+            _require_plain(name, module)
+            expected += 1
     if not expected:
         raise ValueError(f"{type(network).__name__} has no Conv2d and no Linear: nothing to convert")
     result, selection = copy.deepcopy(network), Selection()
-    new: dict[nn.Module, nn.Module] = {}
-    for module in result.modules():
-        if isinstance(module, _PLAIN):
-            new[module] = BatchLayer(module, members, selection)
-    result = _replace(result, new)
+    plain = [module for module in result.modules() if isinstance(module, _PLAIN)]
+    result = _replace(result, {module: BatchLayer(module, members, selection) for module in plain})
     layers = converted_layers(result)
     left = sum(isinstance(module, _PLAIN) for module in result.modules()) - len(layers)  # each has one inside
     if len(layers) != expected or left:
@@ -116,18 +115,10 @@ class BatchEnsemble(DepthNetwork):
         self.members = members
 
     def distribution(self, image: Tensor, member: int | None = None, *, repeat: bool = True) -> DepthDistribution:
-        """The members' distributions, for the losses.
-
-        Args:
-            image: [B, 3, H, W] as ``preprocess`` returns it.
-            member: n: that one alone, [B, H, W]. None: all of them.
-            repeat: all members see every image, [N B, H, W] with member 0's B maps first; False: the batch
-                is split among the members, [B, H, W] with image b by member floor(b N / B), B at least N.
-
-        Raises:
-            IndexError: no such member.
-            ValueError: a batch that is too small to be split.
-        """
+        """The distributions of ``image`` [B, 3, H, W] for the losses: of a ``member`` alone, [B, H, W], or of all. With
+        ``repeat`` all members see every image, [N B, H, W] with member 0's B maps first; without, the batch is split
+        among them, [B, H, W] with image b by member floor(b N / B). Raises IndexError: no such member; ValueError: a
+        batch that is too small to be split."""
         count = len(image)
         if member is not None:
             members = torch.full((count,), self._checked(member), device=image.device)
@@ -150,11 +141,7 @@ class BatchEnsemble(DepthNetwork):
         return combine(blocks[: self.members])
 
     def member(self, n: int) -> BatchEnsembleMember:
-        """Member n as a network, with the weights of this one: nothing is copied.
-
-        Raises:
-            IndexError: no such member.
-        """
+        """Member n as a network, with the weights of this one: nothing is copied. Raises IndexError: no such member."""
         return BatchEnsembleMember(self, self._checked(n))
 
     def all_members(self) -> list[BatchEnsembleMember]:
@@ -162,12 +149,8 @@ class BatchEnsemble(DepthNetwork):
         return [self.member(n) for n in range(self.members)]
 
     def folded(self, n: int) -> UncertaintyNetwork:
-        """Member n as a plain network with its own weights W_n: the same function up to rounding, as fast as
-        the network that was converted, and independent of this one.
-
-        Raises:
-            IndexError: no such member.
-        """
+        """Member n as a plain network with its own weights W_n: the same function up to rounding, as fast as the
+        network that was converted, and independent of this one. Raises IndexError: no such member."""
         self._checked(n)
         network = copy.deepcopy(self.network)
         return _replace(network, {layer: layer.plain(n) for layer in converted_layers(network)})
@@ -221,10 +204,9 @@ class BatchEnsembleMember(DepthNetwork):
         return f"n={self.n}"
 
 
-def _check_layer(name: str, module: nn.Module) -> None:
+def _require_plain(name: str, module: nn.Module) -> None:
     """Raises TypeError where a layer computes something else than its plain class does."""
-    plain = isinstance(module, _PLAIN)
-    if plain and (type(module) not in _PLAIN or set(module._parameters) != {"weight", "bias"}):
+    if type(module) not in _PLAIN or set(module._parameters) != {"weight", "bias"}:
         held = ", ".join(module._parameters)
         raise TypeError(f"{name or 'the network'} cannot be converted: it is a {type(module).__name__} of {held}")
 
@@ -240,11 +222,8 @@ def _draw(factor: nn.Parameter, init: str, std: float, generator: torch.Generato
 
 
 def _replace(root: Network, new: Mapping[nn.Module, nn.Module]) -> Any:
-    """``root`` with modules replaced wherever its modules keep them, in place; or what replaces ``root``.
-
-    Raises:
-        ValueError: a layer that is no registered part of ``root`` is kept in a plain list or dict.
-    """
+    """``root`` with modules replaced wherever its modules keep them, in place; or what replaces ``root``. Raises
+    ValueError: a layer that is no registered part of ``root`` is kept in a plain list or dict."""
     modules = list(root.modules())
     known = {id(module): new.get(module, module) for module in modules}
     for module in modules:

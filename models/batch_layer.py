@@ -17,13 +17,9 @@ from torch import Tensor, nn
 
 
 class Selection(threading.local):
-    """The member that every image goes through, for all layers of one network; each thread has its own.
+    """The member that every image goes through, for all layers of one network; each thread has its own."""
 
-    Attributes:
-        members: [B] int64, the member of every image; None outside of a call.
-    """
-
-    members: Tensor | None = None
+    members: Tensor | None = None  # [B] int64, the member of every image; None outside of a call
 
     def __reduce__(self) -> tuple[type[Selection], tuple[()]]:
         return Selection, ()  # a copied or unpickled network is outside of any call
@@ -62,12 +58,9 @@ class BatchLayer(nn.Module):
         return len(self.r)
 
     def forward(self, x: Tensor) -> Tensor:
-        """y of x ([B, C, H, W], or [B, ..., C] of a linear layer), image b by member ``selection.members[b]``.
-
-        Raises:
-            RuntimeError: the layer was called other than through its BatchEnsemble.
-            ValueError: the network changed the number of images on the way here.
-        """
+        """y of x ([B, C, H, W], or [B, ..., C] of a linear layer), image b by member ``selection.members[b]``. Raises
+        RuntimeError: the layer was called other than through its BatchEnsemble; ValueError: the network changed the
+        number of images on the way here."""
         members = self.selection.members
         if members is None:
             raise RuntimeError("a layer of a BatchEnsemble has to be called through it, which selects the members")

@@ -29,17 +29,11 @@ _BELOW_HORIZON = math.radians(10)
 
 @dataclass(frozen=True, eq=False)
 class GroundFit:
-    """An alignment with the ground plane it comes from.
+    """An alignment with the ground plane it comes from."""
 
-    Attributes:
-        alignment: one for each image, or a single one if pooled.
-        down_cam: [B, 3] the ground's unit normal, downwards, in the camera frame (x right, y down, z forward).
-        ground: [B, H, W] bool, the pixels taken for ground.
-    """
-
-    alignment: Alignment
-    down_cam: Tensor
-    ground: Tensor
+    alignment: Alignment  # one for each image, or a single one if pooled
+    down_cam: Tensor  # [B, 3] the ground's unit normal, downwards, in the camera frame (x right, y down, z forward)
+    ground: Tensor  # [B, H, W] bool, the pixels taken for ground
 
 
 def align_to_camera_height(
@@ -87,36 +81,33 @@ def align_to_camera_height(
     """
     require_maps("prediction", prediction)
     _require_options(kind, height_m, at_infinity, up_cam, max_tilt_deg, tolerance, min_share)
-    batch, inverse = len(prediction), kind == "inverse"
-    if tuple(intrinsics.shape) not in ((3, 3), (batch, 3, 3)):
-        raise ValueError(f"intrinsics must be [3, 3] or [{batch}, 3, 3], got {tuple(intrinsics.shape)}")
-    K = intrinsics.to(prediction.device, torch.float64).expand(batch, 3, 3)
-    rays = unproject(torch.ones_like(prediction, dtype=torch.float64), K).flatten(1, 2)  # third component 1
     x = prediction.detach().double().flatten(1)
-    down = _down(up_cam, batch, x)
-    use = (
-        _searched(prediction, valid, rays, down)
-        & x.isfinite()
-        & (x > (-math.inf if at_infinity is None else at_infinity))
-    )
+    rays = _rays(prediction, intrinsics)
+    down = _down(up_cam, len(x), x)
+    predicted = x.isfinite() & (x > (-math.inf if at_infinity is None else at_infinity))
+    use = _searched(prediction, valid, rays, down) & predicted
     count = use.sum(1)
     require_each(count >= 10, count, "needs at least 10 pixels that look at the ground with a prediction, has")
     if at_infinity is None:
         reciprocal, infinity, inlier = _line(x, rays, down, use, seed)
     else:
-        y = torch.where(use, x - at_infinity if inverse else 1 / x, 1)
-        reciprocal, down, inlier = _plane(y, rays, down, use, math.cos(math.radians(max_tilt_deg)), tolerance, seed)
+        y = torch.where(use, x - at_infinity if kind == "inverse" else 1 / x, 1)
+        reciprocal, down, inlier = _plane(y, rays, down, use, max_tilt_deg, tolerance, seed)
         infinity = torch.full_like(reciprocal, at_infinity)
     share = inlier.sum(1) / count
-    require_each(
-        share >= min_share, share, f"shows no ground plane on {min_share:.0%} of the pixels looked at; the share is"
-    )
-    # y = (n . r) / h' has slope 1/h' in the prediction's units, and 1/d = scale y must have slope 1/height.
-    scale = 1 / (reciprocal * height_m) if inverse else reciprocal * height_m
-    if pooled:
-        scale, infinity = scale.median(), infinity.median()
-    shift = -scale * infinity if inverse else torch.zeros_like(scale)
-    return GroundFit(Alignment(kind, scale, shift, max_depth), down, inlier.view(prediction.shape))
+    lacking = f"shows no ground plane on {min_share:.0%} of the pixels looked at; the share is"
+    require_each(share >= min_share, share, lacking)
+    alignment = _alignment(kind, reciprocal, infinity, height_m, pooled, max_depth)
+    return GroundFit(alignment, down, inlier.view(prediction.shape))
+
+
+def _rays(prediction: Tensor, intrinsics: Tensor) -> Tensor:
+    """[B, P, 3] float64, third component 1."""
+    batch = len(prediction)
+    if tuple(intrinsics.shape) not in ((3, 3), (batch, 3, 3)):
+        raise ValueError(f"intrinsics must be [3, 3] or [{batch}, 3, 3], got {tuple(intrinsics.shape)}")
+    K = intrinsics.to(prediction.device, torch.float64).expand(batch, 3, 3)
+    return unproject(torch.ones_like(prediction, dtype=torch.float64), K).flatten(1, 2)
 
 
 def _searched(prediction: Tensor, valid: Tensor | None, rays: Tensor, down: Tensor) -> Tensor:
@@ -128,10 +119,22 @@ def _searched(prediction: Tensor, valid: Tensor | None, rays: Tensor, down: Tens
     return valid.flatten(1)
 
 
+def _alignment(
+    kind: str, reciprocal: Tensor, infinity: Tensor, height_m: float, pooled: bool, max_depth: float | None
+) -> Alignment:
+    """The alignment with which planes y = (n . r) / h' lie ``height_m`` below: y has slope 1/h' [B] (``reciprocal``) in
+    the prediction's units, and 1/d = scale y must have slope 1/height; ``infinity`` [B]: the prediction there."""
+    scale = 1 / (reciprocal * height_m) if kind == "inverse" else reciprocal * height_m
+    if pooled:
+        scale, infinity = scale.median(), infinity.median()
+    return Alignment(kind, scale, -scale * infinity if kind == "inverse" else torch.zeros_like(scale), max_depth)
+
+
 def _plane(
-    y: Tensor, rays: Tensor, down: Tensor, use: Tensor, cosine: float, tolerance: float, seed: int
+    y: Tensor, rays: Tensor, down: Tensor, use: Tensor, max_tilt_deg: float, tolerance: float, seed: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """1/h' [B], the normal [B, 3] and the inliers [B, P] of y = (n . r) / h'."""
+    cosine = math.cos(math.radians(max_tilt_deg))
 
     def level_enough(m: Tensor) -> Tensor:
         towards = down if m.dim() == 2 else down[:, None]

@@ -11,7 +11,7 @@ import os
 import pickle
 import secrets
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -26,17 +26,7 @@ _UNKNOWN_SUFFIX = f"{{}} must end in .safetensors or one of {', '.join(_TORCH_SU
 # How the files of torch.save begin: an archive, or (before 1.6) the pickled magic number of its own format.
 _BEGINNINGS = (b"PK\x03\x04", b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.")
 # What the restricted unpickler was seen to raise on damaged bytes; it documents none of it.
-_DAMAGE = (
-    EOFError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    AssertionError,
-    struct.error,
-)
+DAMAGE = (EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, AttributeError, AssertionError)
 _SHOWN = 8  # keys named in an error message
 
 
@@ -66,39 +56,34 @@ def load_state_dict_file(path: str | Path, ignore: Collection[str] = ()) -> dict
 def load_weights(module: nn.Module, path: str | Path) -> None:
     """Fill a module from a file, in place; all keys and shapes have to match.
 
-    Types follow the module's (half-precision weights fill a float32 network).
-
-    Raises:
-        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also where
-            keys are missing or unexpected, shapes differ, or values are not finite. The module is unchanged then.
+    Types follow the module's (half-precision weights fill a float32 network). Raises FileNotFoundError,
+    CheckpointError, ModuleNotFoundError: as :func:`load_state_dict_file`; also where keys are missing or unexpected,
+    shapes differ, or values are not finite. The module is unchanged then.
     """
-    path = Path(path)
-    state, expected = _read(path), set(module.state_dict())
-    if set(state) != expected:  # a network may itself have a part called "model"
-        state = _without_prefixes(state, keep=expected)
-    fill(module, state, str(path))
+    # A network may itself have a part called "model".
+    fill(module, _without_prefixes(_read(Path(path)), keep=set(module.state_dict())), str(path))
+
+
+def channels_of(state: Mapping[str, Tensor], keys: Sequence[str], network: str) -> tuple[int, ...]:
+    """The output channels of some weights, from which a network's shape is read. Raises ValueError: one is missing."""
+    if missing := [key for key in keys if key not in state]:
+        raise ValueError(f"not the weights of a {network}: no {missing[0]!r} ({len(missing)} such keys missing)")
+    return tuple(len(state[key]) for key in keys)
 
 
 def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
-    """Fill a module from tensors, in place; all keys and shapes have to match.
-
-    Args:
-        source: where they come from, for the message.
-
-    Raises:
-        CheckpointError: keys are missing or unexpected, shapes differ, or values are not finite. The module is
-            unchanged then.
-    """
+    """Fill a module from tensors, in place; all keys and shapes have to match. Raises CheckpointError as
+    :func:`load_weights`; the message names ``source``, where they come from."""
     expected = module.state_dict()
-    missing, unexpected = sorted(set(expected) - set(state)), sorted(set(state) - set(expected))
-    shapes = [
-        f"{key} is {tuple(state[key].shape)}, expected {tuple(expected[key].shape)}"
-        for key in expected
-        if key in state and state[key].shape != expected[key].shape
-    ]
-    not_finite = [key for key in sorted(state) if not torch.isfinite(state[key]).all()]
-    faults = {"missing": missing, "unexpected": unexpected, "of another shape": shapes}
-    faults["with NaN or infinity"] = not_finite
+    shapes = {key: (tuple(state[key].shape), tuple(expected[key].shape)) for key in expected if key in state}
+    faults = {
+        "missing": sorted(set(expected) - set(state)),
+        "unexpected": sorted(set(state) - set(expected)),
+        "of another shape": [
+            f"{key} is {own}, expected {other}" for key, (own, other) in shapes.items() if own != other
+        ],
+        "with NaN or infinity": [key for key in sorted(state) if not torch.isfinite(state[key]).all()],
+    }
     if texts := [f"{len(keys)} {what}: {some(keys)}" for what, keys in faults.items() if keys]:
         fit = f"{source} does not fit {type(module).__name__} ({len(expected)} keys)"
         raise CheckpointError(f"{fit}: {'; '.join(texts)}")
@@ -106,31 +91,18 @@ def fill(module: nn.Module, state: Mapping[str, Tensor], source: str) -> None:
 
 
 def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[str, Tensor], Any]:
-    """A part of a .safetensors file, without reading the rest.
-
-    Args:
-        path: the file.
-        prefix: of the tensors that are read; None: of none.
-
-    Returns:
-        The tensors by their keys without the prefix, and the metadata that :func:`save_checkpoint` stored
-        (None: there is none).
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        CheckpointError: it is no safetensors file, or cut off or damaged.
-        ModuleNotFoundError: safetensors is not installed.
-    """
+    """The tensors of a .safetensors file whose keys begin with ``prefix`` (None: none), by their keys without it, and
+    the metadata of :func:`save_checkpoint` (None: none); the rest is not read. Raises FileNotFoundError: there is no
+    such file; CheckpointError: it is no safetensors file, or cut off or damaged; ModuleNotFoundError: safetensors is
+    not installed."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no file of weights {path}")
     safetensors = _safetensors()
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get("metadata", "null")
-            names = file.keys()
-            keys = [] if prefix is None else [name for name in names if name.startswith(prefix)]
+            keys = [] if prefix is None else [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118
             tensors = {key[len(prefix or "") :]: file.get_tensor(key) for key in keys}
-        return tensors, json.loads(text)
+            return tensors, json.loads((file.metadata() or {}).get("metadata", "null"))
     except (safetensors.SafetensorError, json.JSONDecodeError) as error:
         raise CheckpointError(f"{path} is not a readable safetensors file: {error}") from error
 
@@ -189,11 +161,8 @@ def _read(path: Path, ignore: Collection[str] = ()) -> dict[str, Tensor]:
 
 
 def read_tensors(file: BinaryIO, name: str | Path) -> Any:
-    """What ``torch.save`` wrote into an open file, without running code from it.
-
-    Raises:
-        CheckpointError: it is damaged, or holds more than tensors and plain values; the message has ``name``.
-    """
+    """What ``torch.save`` wrote into an open file, without running code from it. Raises CheckpointError: it is damaged,
+    or holds more than tensors and plain values; the message has ``name``."""
     beginning = file.read(max(map(len, _BEGINNINGS)))
     if not beginning.startswith(_BEGINNINGS):
         raise CheckpointError(f"{name} is damaged or not a file of torch.save: it begins with {beginning[:8]!r}")
@@ -205,7 +174,7 @@ def read_tensors(file: BinaryIO, name: str | Path) -> Any:
             f"{name} is damaged or holds pickled Python objects (a whole module?), which are never loaded because "
             "they can run code; save the module's state_dict() with the program that made it, and load that"
         ) from error
-    except _DAMAGE as error:
+    except (*DAMAGE, struct.error) as error:
         raise CheckpointError(f"{name} is damaged or not a file of torch.save: {error}") from error
 
 

@@ -17,7 +17,7 @@ import torch
 from ufmstar_torch.checked import Checked
 from ufmstar_torch.models.alignment import Alignment
 from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.hugging_face import HuggingFaceDepth, own_preprocess, patch_size, with_alignment
+from ufmstar_torch.models.hugging_face import HuggingFaceDepth, HuggingFaceSpec, patch_size, with_alignment
 from ufmstar_torch.models.hugging_face_files import read_checkpoint
 from ufmstar_torch.models.network import DepthNetwork
 
@@ -86,8 +86,7 @@ class DepthAnything(HuggingFaceDepth):
             raise ValueError(f"size must be (height, width) in multiples of the patch, {multiple} px, got {size}")
         if not checkpoint.processor:
             checkpoint = replace(checkpoint, processor=_PROCESSOR)
-        preprocess = own_preprocess(checkpoint, size, keep_aspect)
-        return cls.of_checkpoint(checkpoint, preprocess, dtype=dtype).to(device)
+        return cls.of_checkpoint(checkpoint, HuggingFaceSpec(size=size, keep_aspect=keep_aspect), dtype).to(device)
 
 
 @dataclass(frozen=True)
@@ -101,16 +100,9 @@ class DepthAnythingSpec(Checked):
 
 
 def load_depth_anything(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
-    """The metric network in a directory, or of a hub name.
-
-    Args:
-        weights: directory or name.
-        spec: :class:`DepthAnythingSpec`, as plain values or a JSON file.
-
-    Raises:
-        ValueError: an unknown option, or a relative checkpoint without an alignment; others as
-            :meth:`DepthAnything.from_pretrained`.
-    """
+    """The metric network in a directory, or of a hub name; ``spec``: :class:`DepthAnythingSpec`, its plain values or a
+    JSON file. Raises ValueError: an unknown option, or a relative checkpoint without an alignment; others as
+    :meth:`DepthAnything.from_pretrained`."""
     declared = DepthAnythingSpec.read(spec or {})
     network = DepthAnything.from_pretrained(weights, size=declared.size, keep_aspect=declared.keep_aspect)
     return with_alignment(network, declared.alignment)

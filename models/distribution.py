@@ -14,13 +14,9 @@ from ufmstar_torch.prediction import DepthPrediction
 
 @dataclass(frozen=True)
 class PointDepth:
-    """Depth alone.
+    """Depth alone."""
 
-    Attributes:
-        depth: [B, H, W] [m].
-    """
-
-    depth: Tensor
+    depth: Tensor  # [B, H, W] [m]
 
     def prediction(self) -> DepthPrediction:
         """No variances."""
@@ -29,15 +25,11 @@ class PointDepth:
 
 @dataclass(frozen=True)
 class GaussianDepth:
-    """N(depth, exp(log_variance)) (Kendall and Gal 2017).
+    """N(depth, exp(log_variance)) (Kendall and Gal 2017)."""
 
-    Attributes:
-        depth: [B, H, W] mean [m].
-        log_variance: [B, H, W] natural logarithm of the variance [m^2]; the logarithm, because the loss
-            is stable in it and any real number is a valid one.
-    """
-
-    depth: Tensor
+    depth: Tensor  # [B, H, W] mean [m]
+    # [B, H, W] natural logarithm of the variance [m^2]; the logarithm, because the loss is stable in it and any
+    # real number is a valid one
     log_variance: Tensor
 
     def prediction(self) -> DepthPrediction:
@@ -51,18 +43,12 @@ class EvidentialDepth:
 
     The depth's mean and variance are themselves unknown: variance ~ Inverse-Gamma(alpha, beta) and
     mean | variance ~ N(depth, variance / nu).
-
-    Attributes:
-        depth: [B, H, W] gamma [m].
-        nu: [B, H, W] > 0, virtual observations of the mean.
-        alpha: [B, H, W] > 1, half the virtual observations of the variance.
-        beta: [B, H, W] > 0 [m^2].
     """
 
-    depth: Tensor
-    nu: Tensor
-    alpha: Tensor
-    beta: Tensor
+    depth: Tensor  # [B, H, W] gamma [m]
+    nu: Tensor  # [B, H, W] > 0, virtual observations of the mean
+    alpha: Tensor  # [B, H, W] > 1, half the virtual observations of the variance
+    beta: Tensor  # [B, H, W] > 0 [m^2]
 
     def prediction(self) -> DepthPrediction:
         """A = E[variance] = beta / (alpha - 1) and E = Var[mean] = beta / (nu (alpha - 1))."""

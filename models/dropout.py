@@ -13,23 +13,18 @@ from ufmstar_torch.models.distribution import DepthDistribution, split_batch
 from ufmstar_torch.models.heads import UncertaintyNetwork
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.pipeline import combine
-from ufmstar_torch.prediction import DepthPrediction, infer, stated_range, takes_intrinsics
+from ufmstar_torch.prediction import DepthPrediction, infer
 
 SAMPLES = 10  # passes of the paper's multi-inference baseline
 
 
 class DecoderDropout(nn.Module):
-    """Zeroes whole channels with probability p and scales the others by 1 / (1 - p), in training mode or
+    """Zeroes whole channels with probability p in [0, 1) and scales the others by 1 / (1 - p), in training mode or
     while ``sampling``. Without parameters, so that weights load with and without it.
 
     Each channel of each image has one draw, as in the decoder of Poggi et al. Draws for single values would speckle a
-    sample: neighbouring pixels differ by decimetres, which segmentation cannot join to a surface.
-
-    Args:
-        p: probability in [0, 1); 0 does nothing.
-
-    Raises:
-        ValueError: p is out of range.
+    sample: neighbouring pixels differ by decimetres, which segmentation cannot join to a surface. Raises ValueError: p
+    is out of range.
     """
 
     def __init__(self, p: float) -> None:
@@ -53,19 +48,9 @@ class DecoderDropout(nn.Module):
 
 
 def set_sampling(module: nn.Module, on: bool, generator: torch.Generator | None = None) -> int:
-    """Switch sampling in eval mode of every :class:`DecoderDropout` in ``module`` (with p > 0), in place.
-
-    Args:
-        module: a network.
-        on: whether they sample.
-        generator: source of the random numbers, on the network's device; None: torch's global one.
-
-    Returns:
-        The number of layers.
-
-    Raises:
-        ValueError: none, so that nothing would be sampled.
-    """
+    """Switch sampling in eval mode of every :class:`DecoderDropout` in ``module`` (with p > 0), in place; their number.
+    ``generator``: of the random numbers, on the network's device; None: torch's global one. Raises ValueError: there is
+    no such layer, so that nothing would be sampled."""
     layers = [m for m in module.modules() if isinstance(m, DecoderDropout) and m.p > 0]
     if not layers:
         raise ValueError(
@@ -112,24 +97,15 @@ class MonteCarloDropout(DepthNetwork):
         self.batched = batched
 
     def distribution(self, image: Tensor) -> DepthDistribution:
-        """One pass, for the losses.
-
-        Raises:
-            TypeError: the network predicts depth without declaring a distribution.
-        """
+        """One pass, for the losses. Raises TypeError: the network predicts depth without declaring a distribution."""
         if not isinstance(self.network, UncertaintyNetwork):
             raise TypeError(f"{type(self.network).__name__} is no UncertaintyNetwork; put a head on it for training")
         return self.network.distribution(image)
 
     @property
-    def takes_intrinsics(self) -> bool:
-        """Whether the network does."""
-        return takes_intrinsics(self.network)
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] Of the network."""
-        return stated_range([self.network])
+    def wrapped(self) -> tuple[DepthNetwork]:
+        """The network."""
+        return (self.network,)
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Depth [B, H, W] [m] and variances [m^2] of ``image`` [B, 3, H, W] with ``intrinsics`` [B, 3, 3] [px]; with

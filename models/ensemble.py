@@ -15,7 +15,7 @@ from ufmstar_torch.models.checkpoints import CheckpointError
 from ufmstar_torch.models.network import DepthNetwork
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.pipeline import combine
-from ufmstar_torch.prediction import DepthPrediction, infer, stated_range, takes_intrinsics
+from ufmstar_torch.prediction import DepthPrediction, infer, takes_intrinsics
 
 
 class Ensemble(DepthNetwork):
@@ -40,14 +40,9 @@ class Ensemble(DepthNetwork):
         self.preprocess = expected[0]
 
     @property
-    def takes_intrinsics(self) -> bool:
-        """Whether a member does."""
-        return any(takes_intrinsics(member) for member in self.members)
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] Of all members."""
-        return stated_range(self.members)
+    def wrapped(self) -> Sequence[nn.Module]:
+        """The members."""
+        return list(self.members)
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
         """Mean depth [B, H, W] [m], mean A, and the variance between the members (+ mean E) as E [m^2] of
@@ -58,8 +53,8 @@ class Ensemble(DepthNetwork):
 class LazyMember(DepthNetwork):
     """A network that is loaded when it is first called. For inference.
 
-    ``.to()`` decides where and in which type it will run, before and after loading. Its weights are no part of
-    its state_dict, whether loaded or not: they are in its file. A copy loads them anew.
+    ``.to()`` decides where and in which type it will run, before and after loading. Its weights are in its file and no
+    part of its state_dict, whether loaded or not. A copy loads them anew.
 
     Args:
         load: returns the network, on the CPU; called once, again after it raised.
@@ -92,11 +87,8 @@ class LazyMember(DepthNetwork):
         return bool(self._held)
 
     def network(self) -> DepthNetwork:
-        """The network itself, loaded now if it has not been: on the device, or with ``offload`` on the CPU.
-
-        Raises:
-            CheckpointError: it cannot be loaded; the message has its name and the reason.
-        """
+        """The network itself, loaded now if it has not been: on the device, or with ``offload`` on the CPU. Raises
+        CheckpointError: it cannot be loaded; the message has its name and the reason."""
         with self._loading:  # a second thread waits instead of loading it twice
             if not self._held:
                 self._held["network"] = self._placed(self._loaded())
@@ -112,9 +104,8 @@ class LazyMember(DepthNetwork):
         if not isinstance(network, DepthNetwork):
             raise CheckpointError(f"{self.name} must be a DepthNetwork, got {type(network).__name__}")
         if network.preprocess != self.preprocess:
-            raise CheckpointError(
-                f"{self.name} has the preprocessing {network.preprocess}, declared was {self.preprocess}"
-            )
+            declared = f"declared was {self.preprocess}"
+            raise CheckpointError(f"{self.name} has the preprocessing {network.preprocess}, {declared}")
         return network.train(self.training)
 
     @property
@@ -123,11 +114,8 @@ class LazyMember(DepthNetwork):
         return takes_intrinsics(self.network())
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """What the network returns; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them.
-
-        Raises:
-            CheckpointError: it cannot be loaded.
-        """
+        """What the network returns; ``intrinsics`` [B, 3, 3] [px] of ``image`` for a network that takes them. Raises
+        CheckpointError: it cannot be loaded."""
         network, device = self.network(), self._where.device
         if not self.offload or device.type == "cpu":
             prediction: DepthPrediction = infer(network, image, intrinsics)

@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from ufmstar_torch.models.checkpoints import fill, load_state_dict_file
+from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.network import Backbone, require_image
 from ufmstar_torch.models.onnx_weights import read_convolutions
@@ -47,11 +47,8 @@ _POSITIVE: dict[str, tuple[type[nn.Module], float]] = {
 
 @dataclass(frozen=True)
 class FastDepthWidths:
-    """Channels after the encoder's stem and 13 blocks, and after the decoder's 5 layers.
-
-    Raises:
-        ValueError: not 14 and 5 positive numbers, or the widths that a skip adds differ.
-    """
+    """Channels after the encoder's stem and 13 blocks, and after the decoder's 5 layers. Raises ValueError: not 14 and
+    5 positive numbers, or the widths that a skip adds differ."""
 
     encoder: tuple[int, ...]
     decoder: tuple[int, ...]
@@ -82,10 +79,7 @@ class FastDepthWidths:
     @classmethod
     def scaled(cls, multiplier: float) -> FastDepthWidths:
         """:meth:`full` times MobileNet's width multiplier: multiples of 8, never less than .9 of the exact width.
-
-        Raises:
-            ValueError: the multiplier is not positive.
-        """
+        Raises ValueError: the multiplier is not positive."""
         if not 0 < multiplier < float("inf"):
             raise ValueError(f"the width multiplier must be positive, got {multiplier}")
 
@@ -99,17 +93,12 @@ class FastDepthWidths:
 
     @classmethod
     def of_state_dict(cls, state: Mapping[str, Tensor]) -> FastDepthWidths:
-        """The widths of a :class:`FastDepth`'s own state_dict.
-
-        Raises:
-            ValueError: a weight of whose shape a width is read is missing.
-        """
-        keys = ["encoder.0.conv.weight", *(f"encoder.{i}.pointwise.conv.weight" for i in range(1, len(_STRIDES)))]
-        decoder = [f"decoder.{i}.pointwise.conv.weight" for i in range(5)]
-        missing = [key for key in (*keys, *decoder) if key not in state]
-        if missing:
-            raise ValueError(f"not the weights of a FastDepth: no {missing[0]!r} ({len(missing)} such keys missing)")
-        return cls(tuple(len(state[key]) for key in keys), tuple(len(state[key]) for key in decoder))
+        """The widths of a :class:`FastDepth`'s own state_dict. Raises ValueError: a weight of whose shape a width is
+        read is missing."""
+        count = len(_STRIDES)
+        units = [*(f"encoder.{i}.pointwise" for i in range(1, count)), *(f"decoder.{i}.pointwise" for i in range(5))]
+        widths = channels_of(state, [f"{unit}.conv.weight" for unit in ("encoder.0", *units)], "FastDepth")
+        return cls(widths[:count], widths[count:])
 
 
 class ConvUnit(nn.Module):
@@ -131,15 +120,7 @@ class SeparableUnit(nn.Module):
     """A depthwise and a pointwise :class:`ConvUnit`, with dropout between them."""
 
     def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        kernel: int,
-        *,
-        stride: int = 1,
-        relu6: bool,
-        norm: bool,
-        dropout: float = 0.0,
+        self, inputs: int, outputs: int, kernel: int, *, stride: int = 1, relu6: bool, norm: bool, dropout: float = 0.0
     ) -> None:
         super().__init__()
         self.depthwise = ConvUnit(inputs, inputs, kernel, stride=stride, groups=inputs, relu6=relu6, norm=norm)
@@ -204,7 +185,7 @@ class FastDepth(Backbone):
         self.head = ConvUnit(d[-1], 1, 1, relu6=False, norm=norm)
         activation, start = _POSITIVE[positive]
         self.head.activation = activation()
-        nn.init.constant_(_bias(self.head), start)
+        nn.init.constant_(self.head.get_parameter("norm.bias" if norm else "conv.bias"), start)
 
     @property
     def pyramid_channels(self) -> tuple[int, ...]:
@@ -216,17 +197,9 @@ class FastDepth(Backbone):
         return self.pyramid(image)[0]
 
     def pyramid(self, image: Tensor) -> list[Tensor]:
-        """The outputs of the decoder's layers, full resolution first.
-
-        Args:
-            image: [B, 3, H, W] RGB in [0, 1], H and W multiples of 32.
-
-        Returns:
-            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
-
-        Raises:
-            ValueError: the image has another shape or type.
-        """
+        """The outputs of the decoder's five layers, [B, pyramid_channels[s], H / 2^s, W / 2^s], full resolution first,
+        of ``image`` [B, 3, H, W], RGB in [0, 1]. Raises ValueError: another shape or type, or H or W no multiple of
+        32."""
         require_image(image, MULTIPLE)
         x, skips, maps = image, {}, []
         for i, block in enumerate(self.encoder):
@@ -262,8 +235,7 @@ class FastDepth(Backbone):
             FileNotFoundError: there is no such file.
             ValueError: the file is broken or holds another network.
         """
-        layers = read_convolutions(path)
-        expected = 1 + 2 * (len(_STRIDES) - 1) + 2 * 5 + 1
+        layers, expected = read_convolutions(path), 2 * (len(_STRIDES) + 5)  # pairs, but for the first and the last one
         if len(layers) != expected:
             raise ValueError(f"{path} is not a FastDepth: expected {expected} convolutions, got {len(layers)}")
         folded = {not layer.norm for layer in layers}
@@ -284,14 +256,8 @@ class FastDepth(Backbone):
     def folded(self) -> FastDepth:
         """A copy for inference with every batch norm folded into its convolution, in eval mode: the same
         function up to rounding in about three quarters of the time on a CPU."""
-        network = FastDepth(
-            self.widths,
-            norm=False,
-            dropout=self.dropout,
-            dropout_both=self.dropout_both,
-            positive=self.positive,
-            size=self.size,
-        )
+        options = {name: getattr(self, name) for name in ("dropout", "dropout_both", "positive", "size")}
+        network = FastDepth(self.widths, norm=False, **options)
         network.preprocess = self.preprocess
         for (_, source), (_, target) in zip(self._units(), network._units(), strict=True):
             conv, norm = source.conv, source.norm
@@ -310,12 +276,9 @@ class FastDepth(Backbone):
 def load_fastdepth(
     weights: Path, size: tuple[int, int] = (224, 224), dropout: float = 0.0, positive: str = "relu"
 ) -> FastDepth:
-    """The network in an ONNX export or a state_dict file, with the widths of the file.
-
-    Raises:
-        ValueError: the file does not fit, or ``positive`` contradicts an ONNX export, which ends in a ReLU.
-        FileNotFoundError, ModuleNotFoundError: as :meth:`FastDepth.from_onnx` and ``load_state_dict_file``.
-    """
+    """The network in an ONNX export or a state_dict file, with the widths of the file. Raises ValueError: the file does
+    not fit, or ``positive`` contradicts an ONNX export, which ends in a ReLU; FileNotFoundError, ModuleNotFoundError:
+    as :meth:`FastDepth.from_onnx` and ``load_state_dict_file``."""
     if weights.suffix == ".onnx":
         if positive != "relu":
             raise ValueError(f"an ONNX export of FastDepth ends in a ReLU, got positive={positive!r}")
@@ -358,10 +321,3 @@ def _require_same_function(network: FastDepth, path: str | Path) -> None:
             f"{path} is not a FastDepth: its graph computes another depth from the same weights (up to {apart:.3g} m "
             f"apart, of at most {largest:.3g} m)"
         )
-
-
-def _bias(unit: ConvUnit) -> Tensor:
-    """What is added before the activation."""
-    bias = unit.norm.bias if isinstance(unit.norm, nn.BatchNorm2d) else unit.conv.bias
-    assert isinstance(bias, Tensor)
-    return bias

@@ -14,13 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.distribution import (
-    DepthDistribution,
-    EvidentialDepth,
-    GaussianDepth,
-    PointDepth,
-    split_batch,
-)
+from ufmstar_torch.models.distribution import DepthDistribution, EvidentialDepth, GaussianDepth, PointDepth, split_batch
 from ufmstar_torch.models.network import Backbone, DepthNetwork
 from ufmstar_torch.prediction import DepthPrediction
 
@@ -129,11 +123,7 @@ HEADS: dict[str, type[UncertaintyNetwork]] = {
 
 def with_head(backbone: Backbone, method: str, scales: int = 1) -> UncertaintyNetwork:
     """A backbone with the head of a method: "depth" (none), "aleatoric" or "evidential"; ``scales`` as in
-    :class:`UncertaintyNetwork`.
-
-    Raises:
-        ValueError: another method, or more scales than the backbone has.
-    """
+    :class:`UncertaintyNetwork`. Raises ValueError: another method, or more scales than the backbone has."""
     if method not in HEADS:
         raise ValueError(f"method must be one of {list(HEADS)}, got {method!r}")
     return HEADS[method](backbone, scales)

@@ -7,7 +7,7 @@ every network here; where both exist, they have to agree.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -42,6 +42,32 @@ _METRIC = ("depth_pro", "zoedepth")
 _DECLARED = {"metric": METRIC, "relative": "inverse"}
 
 
+@dataclass(frozen=True)
+class HuggingFaceSpec(Checked):
+    """What is declared about a checkpoint: arguments of :func:`from_hugging_face` for configuration files.
+
+    Attributes:
+        kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"
+            (DPT and MiDaS otherwise) or "affine" (depth up to scale and shift). None = as the configuration or the
+            architecture states, if it does.
+        scale: [m] length of one unit of metric depth.
+        size: (height, width) [px] of the input; None = that of preprocessor_config.json.
+        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
+        preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
+        allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
+            "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
+        alignment: of a relative network, in configuration files only.
+    """
+
+    kind: str | None = None
+    scale: float = 1.0
+    size: tuple[int, int] | None = None
+    keep_aspect: bool | None = None
+    preprocess: Preprocess | None = None
+    allow_missing: tuple[str, ...] = ()
+    alignment: Alignment | None = None
+
+
 class HuggingFaceDepth(DepthNetwork):
     """A transformers depth model; made by :func:`from_hugging_face`.
 
@@ -49,17 +75,13 @@ class HuggingFaceDepth(DepthNetwork):
         raw: the :class:`RawDepth`; ``raw(image)`` is what alignments are fitted to.
         kind: "metric", "inverse" or "affine".
         scale: [m] length of one unit, where metric.
+        max_depth: [m] the ``max_depth`` of a metric checkpoint, of which its output is a share.
     """
 
+    max_depth: float | None = None
+
     def __init__(
-        self,
-        raw: RawDepth,
-        preprocess: Preprocess,
-        kind: str,
-        *,
-        scale: float = 1.0,
-        source: str = "",
-        max_depth: float | None = None,
+        self, raw: RawDepth, preprocess: Preprocess, kind: str, *, scale: float = 1.0, source: str = ""
     ) -> None:
         super().__init__()
         if kind not in (METRIC, *KINDS):
@@ -68,38 +90,25 @@ class HuggingFaceDepth(DepthNetwork):
             raise ValueError(f"scale must be positive metres per unit, got {scale}")
         if kind != METRIC and scale != 1:
             raise ValueError(f"scale goes with kind {METRIC!r} only; a relative network gets an Alignment")
-        self.raw = raw
-        self.preprocess = preprocess
-        self.kind = kind
-        self.scale = scale
-        self.source = source
-        self._max_depth = max_depth
-
-    @property
-    def max_depth(self) -> float | None:
-        """[m] The ``max_depth`` of a metric checkpoint, of which its output is a share."""
-        return self._max_depth
+        self.raw, self.preprocess = raw, preprocess
+        self.kind, self.scale, self.source = kind, scale, source
 
     @classmethod
-    def of_checkpoint(
-        cls,
-        checkpoint: Checkpoint,
-        preprocess: Preprocess,
-        *,
-        kind: str | None = None,
-        scale: float = 1.0,
-        allow_missing: Sequence[str] = (),
-        dtype: torch.dtype = torch.float32,
-    ) -> Self:
-        """From a checkpoint that was read; arguments and errors as :func:`from_hugging_face`."""
-        kind = _kind(checkpoint, kind)
-        model, reading = load_model(checkpoint, dtype, allow_missing), _ARCHITECTURES[checkpoint.model_type]
+    def of_checkpoint(cls, checkpoint: Checkpoint, spec: HuggingFaceSpec, dtype: torch.dtype = torch.float32) -> Self:
+        """From a checkpoint that was read, in eval mode; errors as :func:`from_hugging_face`."""
+        kind, preprocess = _kind(checkpoint, spec.kind), spec.preprocess
+        if preprocess is None:
+            preprocess = own_preprocess(checkpoint, spec.size, spec.keep_aspect)
+        elif spec.size is not None or spec.keep_aspect is not None:
+            raise ValueError("preprocess excludes size and keep_aspect, which it contains")
+        model, reading = load_model(checkpoint, dtype, spec.allow_missing), _ARCHITECTURES[checkpoint.model_type]
         if reading is PaddedDepth and not checkpoint.processor.get("do_pad", True):
             reading = RawDepth
         raw = reading(model, patch_size(checkpoint))
-        shares = checkpoint.config.get("depth_estimation_type") == METRIC
-        reach = scale * float(checkpoint.config["max_depth"]) if shares else None
-        return cls(raw, preprocess, kind, scale=scale, source=checkpoint.name, max_depth=reach).eval()
+        network = cls(raw, preprocess, kind, scale=spec.scale, source=checkpoint.name)
+        if checkpoint.config.get("depth_estimation_type") == METRIC:
+            network.max_depth = spec.scale * float(checkpoint.config["max_depth"])
+        return network.eval()
 
     @property
     def is_metric(self) -> bool:
@@ -107,19 +116,12 @@ class HuggingFaceDepth(DepthNetwork):
         return self.kind == METRIC
 
     def forward(self, image: Tensor) -> DepthPrediction:
-        """Depth [B, H, W] [m], float32, of ``image`` [B, 3, H, W] as ``preprocess`` returns it.
-
-        Raises:
-            ValueError: the network is relative, or the image does not fit.
-        """
+        """Depth [B, H, W] [m], float32, of ``image`` [B, 3, H, W] as ``preprocess`` returns it. Raises ValueError: the
+        network is relative, or the image does not fit."""
         return DepthPrediction(self.required().raw(image) * self.scale)
 
     def required(self) -> Self:
-        """This network.
-
-        Raises:
-            ValueError: it is relative.
-        """
+        """This network. Raises ValueError: it is relative."""
         if not self.is_metric:
             what = "inverse depth" if self.kind == "inverse" else "depth"
             raise ValueError(
@@ -130,11 +132,8 @@ class HuggingFaceDepth(DepthNetwork):
         return self
 
     def aligned(self, alignment: Alignment) -> AlignedNetwork:
-        """The metric network that a relative one becomes by a fixed alignment; the weights are shared.
-
-        Raises:
-            ValueError: this network is metric, or the alignment is for the other kind of output.
-        """
+        """The metric network that a relative one becomes by a fixed alignment; the weights are shared. Raises
+        ValueError: this network is metric, or the alignment is for the other kind of output."""
         if alignment.kind != self.kind:
             raise ValueError(f"alignment must be of the network's kind {self.kind!r}, got {alignment.kind!r}")
         return AlignedNetwork(self.raw, alignment, self.preprocess)
@@ -161,15 +160,7 @@ def from_hugging_face(
 
     Args:
         name_or_dir: "owner/name" on the hub, or a directory with config.json and weights.
-        kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"
-            (DPT and MiDaS otherwise) or "affine" (depth up to scale and shift). None = as the configuration or the
-            architecture states, if it does.
-        scale: [m] length of one unit of metric depth.
-        size: (height, width) [px] of the input; None = that of preprocessor_config.json.
-        keep_aspect: whether ``size`` is only approximate and the aspect kept; None = as the configuration states.
-        preprocess: instead of the checkpoint's own; excludes ``size`` and ``keep_aspect``.
-        allow_missing: beginnings of weights that the checkpoint may lack (and that stay random), as the unused
-            "neck.fusion_stage.layers.0.residual_layer1" of Intel/dpt-large.
+        kind, scale, size, keep_aspect, preprocess, allow_missing: see :class:`HuggingFaceSpec`.
         dtype: of the weights; what comes out is float32 in any case (float64 for float64).
         device: where they go; None = the CPU.
         revision: branch, tag or commit on the hub.
@@ -182,53 +173,23 @@ def from_hugging_face(
         FileNotFoundError, OSError: there is no such directory, or the hub cannot be reached.
         ModuleNotFoundError: transformers is missing.
     """
+    spec = HuggingFaceSpec(kind, scale, size, keep_aspect, preprocess, tuple(allow_missing))
     checkpoint = read_checkpoint(name_or_dir, revision, local_files_only)
-    _kind(checkpoint, kind)  # before the weights are downloaded
-    if preprocess is None:
-        preprocess = own_preprocess(checkpoint, size, keep_aspect)
-    elif size is not None or keep_aspect is not None:
-        raise ValueError("preprocess excludes size and keep_aspect, which it contains")
-    network = HuggingFaceDepth.of_checkpoint(
-        checkpoint, preprocess, kind=kind, scale=scale, allow_missing=allow_missing, dtype=dtype
-    )
-    return network.to(device)
-
-
-@dataclass(frozen=True)
-class HuggingFaceSpec(Checked):
-    """Arguments of :func:`from_hugging_face` for configuration files, and the alignment of a relative network."""
-
-    kind: str | None = None
-    scale: float = 1.0
-    size: tuple[int, int] | None = None
-    keep_aspect: bool | None = None
-    preprocess: Preprocess | None = None
-    allow_missing: tuple[str, ...] = ()
-    alignment: Alignment | None = None
+    return HuggingFaceDepth.of_checkpoint(checkpoint, spec, dtype).to(device)
 
 
 def load_hugging_face(weights: Path, spec: Mapping[str, Any] | str | Path | None = None) -> DepthNetwork:
-    """The metric network in a directory, or of a hub name.
-
-    Args:
-        weights: directory or name.
-        spec: :class:`HuggingFaceSpec`, as plain values or a JSON file.
-
-    Raises:
-        ValueError: an unknown option, or a relative checkpoint without an alignment; others as
-            :func:`from_hugging_face`.
-    """
+    """The metric network in a directory, or of a hub name; ``spec``: :class:`HuggingFaceSpec`, its plain values or a
+    JSON file. Raises ValueError: an unknown option, or a relative network without an alignment; others as
+    :func:`from_hugging_face`."""
     declared = HuggingFaceSpec.read(spec or {})
-    options = {f.name: getattr(declared, f.name) for f in fields(declared) if f.name != "alignment"}
-    return with_alignment(from_hugging_face(weights, **options), declared.alignment)
+    network = HuggingFaceDepth.of_checkpoint(read_checkpoint(weights), declared)
+    return with_alignment(network, declared.alignment)
 
 
 def with_alignment(network: HuggingFaceDepth, alignment: Alignment | None) -> DepthNetwork:
-    """The aligned network, or without an alignment the network itself.
-
-    Raises:
-        ValueError: the network is relative and has no alignment, or is metric and has one.
-    """
+    """The aligned network, or without an alignment the network itself. Raises ValueError: the network is relative and
+    has no alignment, or is metric and has one."""
     if alignment is not None:
         return network.aligned(alignment)
     try:
@@ -241,11 +202,8 @@ def with_alignment(network: HuggingFaceDepth, alignment: Alignment | None) -> De
 def own_preprocess(
     checkpoint: Checkpoint, size: tuple[int, int] | None = None, keep_aspect: bool | None = None
 ) -> Preprocess:
-    """The preprocessing that a checkpoint's image processor describes.
-
-    Raises:
-        ValueError: the description lacks what is needed, or contains what ``Preprocess`` cannot do.
-    """
+    """The preprocessing that a checkpoint's image processor describes. Raises ValueError: the description lacks what is
+    needed, or contains what ``Preprocess`` cannot do."""
     processor, name = checkpoint.processor, checkpoint.name
     unknown = [option for option in ("do_center_crop", "do_flip_channel_order") if processor.get(option)]
     resample = processor.get("resample", _CUBIC)

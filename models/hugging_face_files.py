@@ -15,27 +15,20 @@ from typing import Any
 import torch
 from torch import nn
 
-from ufmstar_torch.models.checkpoints import CheckpointError, some
+from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 
 _TO_DOWNLOAD = "with a connection, `hf download NAME --local-dir DIR` fetches it; a directory needs no connection"
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint whose configuration has been read.
+    """A checkpoint whose configuration has been read."""
 
-    Attributes:
-        name: as given, for messages.
-        folder: None if it comes from the hub.
-        config: config.json.
-        processor: preprocessor_config.json, empty if there is none.
-        options: keyword arguments for every further call of ``transformers``.
-    """
-
-    name: str
-    folder: Path | None
-    config: dict[str, Any]
-    processor: dict[str, Any]
+    name: str  # as given, for messages
+    folder: Path | None  # None if it comes from the hub
+    config: dict[str, Any]  # config.json
+    processor: dict[str, Any]  # preprocessor_config.json, empty if there is none
+    # keyword arguments for every further call of ``transformers``
     options: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -44,15 +37,10 @@ class Checkpoint:
         return str(self.config.get("model_type"))
 
 
-def read_checkpoint(name_or_dir: str | Path, revision: str | None, local_files_only: bool) -> Checkpoint:
-    """The configuration of a checkpoint.
-
-    Raises:
-        FileNotFoundError: a directory is missing, or lacks config.json.
-        CheckpointError: config.json or preprocessor_config.json cannot be read.
-        OSError: the hub cannot be reached, or has nothing of that name.
-        ModuleNotFoundError: transformers is missing.
-    """
+def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_files_only: bool = False) -> Checkpoint:
+    """The configuration of a checkpoint; arguments as ``from_hugging_face``. Raises FileNotFoundError: a directory is
+    missing, or lacks config.json; CheckpointError: config.json or preprocessor_config.json cannot be read; OSError: the
+    hub cannot be reached, or has nothing of that name; ModuleNotFoundError: transformers is missing."""
     from transformers import PreTrainedConfig
     from transformers.image_processing_base import ImageProcessingMixin
 
@@ -87,26 +75,20 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None, local_files_o
 def load_model(checkpoint: Checkpoint, dtype: torch.dtype, allow_missing: Sequence[str] = ()) -> nn.Module:
     """The model with every weight from the checkpoint, on the CPU.
 
-    Args:
-        checkpoint: what to load.
-        dtype: of the weights, whatever the file has.
-        allow_missing: beginnings of names of weights that the file may lack.
-
-    Raises:
-        CheckpointError: not a depth model, damaged, or with missing, misshapen or non-finite weights; the message
-            names the directory.
+    ``dtype`` is that of the weights, whatever the file has; ``allow_missing`` are beginnings of names of weights that
+    the file may lack. Raises CheckpointError: not a depth model, damaged, or with missing, misshapen or non-finite
+    weights; the message names the directory.
     """
     from huggingface_hub.errors import StrictDataclassError
     from safetensors import SafetensorError
     from transformers import AutoModelForDepthEstimation
 
-    damage = (OSError, ValueError, TypeError, LookupError, RuntimeError, AttributeError, EOFError)
     try:
         with _quiet(checkpoint.folder is not None):
             model, report = AutoModelForDepthEstimation.from_pretrained(
                 checkpoint.name, dtype=dtype, output_loading_info=True, **checkpoint.options
             )
-    except (*damage, UnpicklingError, SafetensorError, StrictDataclassError) as error:
+    except (*DAMAGE, UnpicklingError, SafetensorError, StrictDataclassError) as error:
         raise CheckpointError(
             f"{checkpoint.name} ({checkpoint.model_type}) cannot be loaded as a depth model: {error}"
         ) from error

@@ -36,11 +36,8 @@ class RawDepth(nn.Module):
         self.multiple = multiple
 
     def forward(self, image: Tensor) -> Tensor:
-        """[B, H, W] of ``image`` [B, 3, H, W]; a smaller output is enlarged bilinearly.
-
-        Raises:
-            ValueError: the image has another shape, or sides that are no multiples of ``multiple``.
-        """
+        """[B, H, W] of ``image`` [B, 3, H, W]; a smaller output is enlarged bilinearly. Raises ValueError: the image
+        has another shape, or sides that are no multiples of ``multiple``."""
         size = require_image(image, self.multiple)
         return _resized(self.predicted(image)[0], size, "bilinear")
 

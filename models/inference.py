@@ -71,8 +71,9 @@ class Inference(Checked):
             ModuleNotFoundError: ``onnxruntime`` is asked for and not installed (extra ``models``).
         """
         if isinstance(network, OnnxNetwork):
-            if TORCH in (self.runtime, self._needed):
-                raise ValueError(f"{weights} is a graph that only ONNX Runtime runs, not {self._asked}")
+            if self._torch_only:
+                asked = f"runtime {self.runtime} in {self.precision}"
+                raise ValueError(f"{weights} is a graph that only ONNX Runtime runs, not {asked}")
             return network
         if (graph := self._graph(network, weights, device)) is not None:
             return graph
@@ -84,22 +85,18 @@ class Inference(Checked):
         return _fast_in_torch(network)
 
     @property
-    def _needed(self) -> str:
-        """The runtime that the precision needs."""
-        return TORCH if self.precision == BF16 else "any"
-
-    @property
-    def _asked(self) -> str:
-        return f"runtime {self.runtime} in {self.precision}"
+    def _torch_only(self) -> bool:
+        return self.runtime == TORCH or self.precision == BF16
 
     def _graph(self, network: DepthNetwork, weights: Path, device: torch.device) -> OnnxNetwork | None:
         """The file in ONNX Runtime, where that can replace the torch network of ours that was read from it."""
         if weights.suffix != ".onnx" or not isinstance(network, FastDepth) or network.dropout:
             return None
-        if self.runtime != ONNX and (TORCH in (self.runtime, self._needed) or find_spec("onnxruntime") is None):
-            return None
-        if self.runtime != ONNX and device.type != "cpu" and len(providers_for(device)) == 1:
-            return None
+        if self.runtime != ONNX:
+            if self._torch_only or find_spec("onnxruntime") is None:
+                return None
+            if device.type != "cpu" and len(providers_for(device)) == 1:
+                return None
         graph = OnnxNetwork(weights, OnnxSpec(OutputSpec(METRIC)), **self.options("onnx", device))
         if any(own not in (None, side) for own, side in zip(graph.size, network.size, strict=True)):
             return None

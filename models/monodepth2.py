@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ufmstar_torch.models.checkpoints import fill, load_state_dict_file
+from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_file
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.network import Backbone, fits, require_image
 from ufmstar_torch.models.preprocess import Preprocess
@@ -57,7 +57,7 @@ class ResNetEncoder(nn.Module):
             raise ValueError(f"layers must be one of {LAYERS}, got {layers}")
         if strides not in STRIDES:
             raise ValueError(f"strides must be one of {STRIDES}, got {strides!r}")
-        resnet = getattr(_torchvision_models(), f"resnet{layers}")(weights=None)
+        resnet = _torchvision_models().get_model(f"resnet{layers}", weights=None)
         self.conv1, self.bn1 = resnet.conv1, resnet.bn1
         self.layer1, self.layer2, self.layer3, self.layer4 = resnet.layer1, resnet.layer2, resnet.layer3, resnet.layer4
         # At 1/2, 1/4, 1/8, 1/16 and 1/32 of the resolution.
@@ -153,17 +153,9 @@ class MonodepthResNet(Backbone):
         return self.pyramid(image)[0]
 
     def pyramid(self, image: Tensor) -> list[Tensor]:
-        """The outputs of the decoder's levels, full resolution first.
-
-        Args:
-            image: [B, 3, H, W] normalised as ``preprocess`` does; H and W multiples of 32, at least 64.
-
-        Returns:
-            [B, pyramid_channels[s], H / 2^s, W / 2^s] for s = 0 to 4.
-
-        Raises:
-            ValueError: the image has another shape or type.
-        """
+        """The outputs of the decoder's five levels, [B, pyramid_channels[s], H / 2^s, W / 2^s], full resolution first,
+        of ``image`` [B, 3, H, W], normalised as ``preprocess`` does. Raises ValueError: another shape or type, or H or
+        W no multiple of 32 from 64 on."""
         require_image(image, MULTIPLE, SMALLEST)
         skips = self.encoder(image)
         x, maps = skips.pop(), []
@@ -211,18 +203,13 @@ class MonodepthResNet(Backbone):
 
 def shape_of_state_dict(state: Mapping[str, Tensor]) -> tuple[int, tuple[int, ...]]:
     """(layers, decoder) of the :class:`MonodepthResNet` that a state_dict belongs to; the strides do not show in it.
-
-    Raises:
-        ValueError: a tensor from which they are read is missing.
-    """
-    decoder = [f"levels.{i}.before.weight" for i in range(LEVELS)]
-    missing = [key for key in ("encoder.layer1.0.conv2.weight", *decoder) if key not in state]
-    if missing:
-        raise ValueError(f"not the weights of a MonodepthResNet: no {missing[0]!r} ({len(missing)} such keys missing)")
+    Raises ValueError: a tensor from which they are read is missing."""
+    keys = ["encoder.layer1.0.conv2.weight", *(f"levels.{i}.before.weight" for i in range(LEVELS))]
+    _, *decoder = channels_of(state, keys, "MonodepthResNet")
     # Two, or three, blocks of two convolutions in the first stage; or three of three.
     deep = 34 if "encoder.layer1.2.conv1.weight" in state else 18
     layers = 50 if "encoder.layer1.0.conv3.weight" in state else deep
-    return layers, tuple(len(state[key]) for key in decoder)
+    return layers, tuple(decoder)
 
 
 def load_monodepth_resnet(
@@ -242,17 +229,14 @@ def load_monodepth_resnet(
 
 def _fill_encoder(encoder: ResNetEncoder, state: Mapping[str, Tensor], source: str) -> None:
     """Load every tensor of a classifier's weights but the classifier itself; errors as ``checkpoints.fill``."""
-    state = {key: _within_half(key, value) for key, value in state.items() if not key.startswith("fc.")}
     # Files older than PyTorch 0.4.1 do not count batches; nothing here reads the count.
-    counters = {key: value for key, value in encoder.state_dict().items() if key.endswith("num_batches_tracked")}
-    fill(encoder, counters | state, source)
-
-
-def _within_half(key: str, value: Tensor) -> Tensor:
-    """An overflowed variance as the largest one: as infinity it would make its channel constant."""
-    if value.dtype != torch.float16 or not key.endswith("running_var"):
-        return value
-    return value.clamp(max=torch.finfo(torch.float16).max)
+    filled = {key: value for key, value in encoder.state_dict().items() if key.endswith("num_batches_tracked")}
+    filled |= {key: value for key, value in state.items() if not key.startswith("fc.")}
+    for key, value in filled.items():
+        if value.dtype == torch.float16 and key.endswith("running_var"):
+            # An overflowed variance as the largest one: as infinity it would make its channel constant.
+            filled[key] = value.clamp(max=torch.finfo(torch.float16).max)
+    fill(encoder, filled, source)
 
 
 def _convolution(inputs: int, outputs: int) -> nn.Conv2d:

@@ -27,17 +27,11 @@ _CONVOLUTION = re.compile(r"decoder\.(\d+)(?:\.conv)?\.conv\.(weight|bias)")
 
 @dataclass(frozen=True)
 class Imported:
-    """What became of the tensors of two files.
+    """What became of the tensors of two files."""
 
-    Attributes:
-        loaded: keys of the network that were filled.
-        skipped: keys of the files that were not used, with the reason.
-        kept: keys of the network that stayed as they were; always its head, since disparity is not depth.
-    """
-
-    loaded: tuple[str, ...]
-    skipped: Mapping[str, str]
-    kept: tuple[str, ...]
+    loaded: tuple[str, ...]  # keys of the network that were filled
+    skipped: Mapping[str, str]  # keys of the files that were not used, with the reason
+    kept: tuple[str, ...]  # keys of the network that stayed as they were; always its head, since disparity is not depth
 
 
 def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_path: str | Path) -> Imported:
@@ -66,10 +60,11 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
         state = load_state_dict_file(path, ignore=_NO_WEIGHTS)
         fitting, unused = {}, {}
         for key, value in state.items():
-            target, reason = place(key)
-            reason = reason or _fault(target, value, expected)
-            if reason:
-                unused[key] = reason
+            try:
+                target = place(key)
+                _require_fit(value, expected.get(target))
+            except ValueError as reason:
+                unused[key] = str(reason)
             else:
                 fitting[target] = value
         if not fitting:
@@ -82,31 +77,32 @@ def load_monodepth2(network: MonodepthResNet, encoder_path: str | Path, depth_pa
     return Imported(tuple(sorted(loaded)), skipped, tuple(sorted(set(expected) - set(loaded))))
 
 
-def _encoder_place(key: str) -> tuple[str, str]:
-    """The network's key for one of encoder.pth, or why there is none."""
+def _encoder_place(key: str) -> str:
+    """The network's key for one of encoder.pth. Raises ValueError: there is none."""
     if key.startswith("encoder.fc."):
-        return "", "the classifier is not used"
-    return key, ""
+        raise ValueError("the classifier is not used")
+    return key
 
 
-def _decoder_place(key: str) -> tuple[str, str]:
-    """The network's key for one of depth.pth, or why there is none."""
+def _decoder_place(key: str) -> str:
+    """The network's key for one of depth.pth. Raises ValueError: there is none."""
     match = _CONVOLUTION.fullmatch(key)
     if match is None:
-        return "", "not a key of Monodepth2's decoder"
+        raise ValueError("not a key of Monodepth2's decoder")
     number, kind = int(match[1]), match[2]
     if number >= 2 * LEVELS:
-        return "", "disparity is not metric depth"
-    part = "after" if number % 2 else "before"
-    return f"levels.{LEVELS - 1 - number // 2}.{part}.{kind}", ""
+        raise ValueError("disparity is not metric depth")
+    return f"levels.{LEVELS - 1 - number // 2}.{'after' if number % 2 else 'before'}.{kind}"
 
 
-def _fault(target: str, value: Tensor, expected: Mapping[str, Tensor]) -> str:
-    if target not in expected:
-        return "the network has no such tensor"
-    if value.shape != expected[target].shape:
-        return f"is {tuple(value.shape)}, expected {tuple(expected[target].shape)}"
-    return "" if torch.isfinite(value).all() else "has NaN or infinity"
+def _require_fit(value: Tensor, expected: Tensor | None) -> None:
+    """Raises ValueError unless a tensor can fill the network's."""
+    if expected is None:
+        raise ValueError("the network has no such tensor")
+    if value.shape != expected.shape:
+        raise ValueError(f"is {tuple(value.shape)}, expected {tuple(expected.shape)}")
+    if not torch.isfinite(value).all():
+        raise ValueError("has NaN or infinity")
 
 
 def _to_imagenet_colours(loaded: dict[str, Tensor]) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 from torch import Tensor, nn
 
 from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.prediction import DepthPrediction
+from ufmstar_torch.prediction import DepthPrediction, stated_range, takes_intrinsics
 
 
 class DepthNetwork(nn.Module, ABC):
@@ -20,14 +21,19 @@ class DepthNetwork(nn.Module, ABC):
     preprocess: Preprocess
 
     @property
+    def wrapped(self) -> Sequence[nn.Module]:
+        """The networks that this one calls; its declarations below are theirs."""
+        return ()
+
+    @property
     def takes_intrinsics(self) -> bool:
         """Whether it is called as ``network(x, K)``, with K [B, 3, 3] of ``x`` [px]."""
-        return False
+        return any(takes_intrinsics(network) for network in self.wrapped)
 
     @property
     def max_depth(self) -> float | None:
         """[m] The largest depth that it can predict; None where it is not bounded, or not known."""
-        return None
+        return stated_range(self.wrapped)
 
     @abstractmethod
     def forward(self, image: Tensor) -> DepthPrediction:
@@ -67,16 +73,8 @@ class Backbone(DepthNetwork):
 
 
 def require_image(image: Tensor, multiple: int = 1, smallest: int = 1) -> tuple[int, int]:
-    """(H, W) [px] of a network's input.
-
-    Args:
-        image: what must be floating-point [B, 3, H, W].
-        multiple: [px] that H and W must be multiples of.
-        smallest: [px] allowed for H and W.
-
-    Raises:
-        ValueError: another shape, type or size.
-    """
+    """(H, W) [px] of a network's input. Raises ValueError unless it is floating-point [B, 3, H, W] with H and W
+    multiples of ``multiple`` and at least ``smallest``."""
     if image.dim() != 4 or image.shape[1] != 3 or not image.is_floating_point():
         shape = f"{image.dtype} {tuple(image.shape)}"
         raise ValueError(f"image must be floating-point [B, 3, H, W] as the network's preprocess makes it, got {shape}")

@@ -100,12 +100,10 @@ class OnnxNetwork(DepthNetwork):
             name = next(iter(inputs))
         self.K_input = self._intrinsics_input(name, inputs)
         assert name is not None  # one of the inputs
-        self.input = name
-        self.input_type = inputs[name].type
+        self.input, self.input_type = name, inputs[name].type
         if self.input_type not in _NUMPY_TYPES:
             raise ValueError(f"{self.path}: input {name!r} is {self.input_type}, expected one of {list(_NUMPY_TYPES)}")
-        shape = [d if isinstance(d, int) and d > 0 else None for d in inputs[name].shape]
-        order = (0, 1, 2, 3) if self.spec.layout == "NCHW" else (0, 3, 1, 2)
+        shape, order = _fixed(inputs[name]), (0, 1, 2, 3) if self.spec.layout == "NCHW" else (0, 3, 1, 2)
         if len(shape) != 4 or shape[order[1]] not in (3, None):
             raise ValueError(
                 f"{self.path}: input {name!r} has shape {inputs[name].shape}, expected 4 dimensions with 3 "
@@ -135,7 +133,7 @@ class OnnxNetwork(DepthNetwork):
                 f"{self.path}: takes_intrinsics needs two inputs, the image (the spec's input names it, got {name!r}) "
                 f"and the intrinsics; the graph has {list(inputs)}"
             )
-        shape = [d if isinstance(d, int) and d > 0 else None for d in rest[0].shape]
+        shape = _fixed(rest[0])
         if len(shape) != 3 or {*shape[1:]} - {3, None} or rest[0].type not in _FLOATS:
             raise ValueError(
                 f"{self.path}: input {rest[0].name!r} must be floating-point intrinsics [B, 3, 3], got {rest[0].type} "
@@ -157,7 +155,7 @@ class OnnxNetwork(DepthNetwork):
         height, width = self.size
         if height is None or width is None:
             return preprocess
-        if preprocess.size is not None and tuple(preprocess.size) != (height, width):
+        if preprocess.size not in (None, (height, width)):
             raise ValueError(
                 f"{self.path}: input {self.input!r} has a fixed size of {height} x {width} px, but the spec's "
                 f"preprocess.size is {preprocess.size}"
@@ -165,17 +163,10 @@ class OnnxNetwork(DepthNetwork):
         return replace(preprocess, size=(height, width))
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:
-        """Depth [B, H, W] [m] on the image's device.
-
-        Args:
-            image: [B, 3, H, W] RGB as ``preprocess`` returns it.
-            intrinsics: [B, 3, 3] of ``image`` [px], for a graph that takes them.
-
-        Raises:
-            ValueError: the image does not fit the graph's input, the intrinsics are missing, or an output is not as
-                declared.
-        """
-        self._check(image)
+        """Depth [B, H, W] [m], on the image's device, of ``image`` [B, 3, H, W] as ``preprocess`` returns it, with
+        ``intrinsics`` [B, 3, 3] [px] for a graph that takes them. Raises ValueError: the image does not fit the graph's
+        input, the intrinsics are missing, or an output is not as declared."""
+        self._require_fit(image)
         if self.takes_intrinsics and intrinsics is None:
             raise ValueError(f"{self.path} takes intrinsics: call network(x, K), K [B, 3, 3] of its input x")
         array = image.detach().cpu()
@@ -198,7 +189,7 @@ class OnnxNetwork(DepthNetwork):
             )
         return prediction
 
-    def _check(self, image: Tensor) -> None:
+    def _require_fit(self, image: Tensor) -> None:
         height, width = require_image(image)
         if self.size[0] not in (None, height) or self.size[1] not in (None, width):
             fixed = " x ".join(str(side or "any") for side in self.size)
@@ -242,23 +233,18 @@ def open_session(path: str, threads: int, providers: tuple[str, ...]) -> Inferen
     # Threads that wait by spinning would take the cores from what comes between two runs.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = _ERRORS_ONLY
-    refusals = (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.InvalidArgument)
-    failures = (ort_errors.Fail, ort_errors.NotImplemented)
+    names = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "Fail", "NotImplemented")
     try:
         return ort.InferenceSession(path, options, providers=list(providers))
-    except (*refusals, *failures) as error:
+    except tuple(getattr(ort_errors, name) for name in names) as error:
         raise ValueError(f"{path} is not an ONNX file that ONNX Runtime can run: {error}") from error
 
 
 def providers_for(device: torch.device) -> tuple[str, ...]:
     """ONNX Runtime's execution providers on a device, the preferred one first; the processor's where it has no other.
-
-    Raises:
-        ModuleNotFoundError: ``onnxruntime`` is not installed (extra ``models``).
-    """
-    here, cpu = _onnxruntime().get_available_providers(), "CPUExecutionProvider"
-    gpu = {"cuda": "CUDAExecutionProvider"}.get(device.type)
-    return (gpu, cpu) if gpu in here and gpu is not None else (cpu,)
+    Raises ModuleNotFoundError: ``onnxruntime`` is not installed (extra ``models``)."""
+    here, cpu, gpu = _onnxruntime().get_available_providers(), "CPUExecutionProvider", "CUDAExecutionProvider"
+    return (gpu, cpu) if device.type == "cuda" and gpu in here else (cpu,)
 
 
 def _onnxruntime() -> ModuleType:
@@ -270,6 +256,11 @@ def _onnxruntime() -> ModuleType:
         ) from error
     module: ModuleType = onnxruntime
     return module
+
+
+def _fixed(node: NodeArg) -> list[int | None]:
+    """The sides of an input's shape, None where the graph leaves one open."""
+    return [side if isinstance(side, int) and side > 0 else None for side in node.shape]
 
 
 def load_onnx(

@@ -21,20 +21,14 @@ _NORM = ("weight", "bias", "running_mean", "running_var")
 
 @dataclass
 class ConvWeights:
-    """One convolution.
+    """One convolution."""
 
-    Attributes:
-        weight: [C_out, C_in / groups, k, k].
-        bias: [C_out], or None.
-        norm: the following batch norm's weight, bias, running_mean, running_var [C_out] and, where the file holds it,
-            num_batches_tracked []; empty without batch norm.
-        norm_eps: what batch norm adds to the variance.
-    """
-
-    weight: Tensor
-    bias: Tensor | None
+    weight: Tensor  # [C_out, C_in / groups, k, k]
+    bias: Tensor | None  # [C_out], or None
+    # the following batch norm's weight, bias, running_mean, running_var [C_out] and, where the file holds it,
+    # num_batches_tracked []; empty without batch norm
     norm: dict[str, Tensor] = field(default_factory=dict)
-    norm_eps: float = 0.0
+    norm_eps: float = 0.0  # what batch norm adds to the variance
 
     def state(self) -> dict[str, Tensor]:
         """The weights as a state_dict of parts ``conv`` and ``norm``, where a bias stands in one of the two only."""
@@ -48,13 +42,8 @@ class ConvWeights:
 
 
 def load_onnx_graph(path: str | Path) -> ModelProto:
-    """The parsed file.
-
-    Raises:
-        ModuleNotFoundError: ``onnx`` is not installed (extra ``models``).
-        FileNotFoundError: there is no such file.
-        ValueError: the file is not ONNX, or cut off.
-    """
+    """The parsed file. Raises ModuleNotFoundError: ``onnx`` is not installed (extra ``models``); FileNotFoundError:
+    there is no such file; ValueError: the file is not ONNX, or cut off."""
     try:
         import onnx
         from google.protobuf.message import DecodeError
@@ -74,12 +63,9 @@ def load_onnx_graph(path: str | Path) -> ModelProto:
 
 
 def read_convolutions(path: str | Path) -> list[ConvWeights]:
-    """The convolutions of a graph in the order of execution, with their batch norms.
-
-    Raises:
-        ModuleNotFoundError, FileNotFoundError: as :func:`load_onnx_graph`.
-        ValueError: the file is broken, a weight is not in it, or one in it is used by no node.
-    """
+    """The convolutions of a graph in the order of execution, with their batch norms. Raises ModuleNotFoundError,
+    FileNotFoundError: as :func:`load_onnx_graph`; ValueError: the file is broken, a weight is not in it, or one in it
+    is used by no node."""
     graph = load_onnx_graph(path).graph
     from onnx import helper, numpy_helper
 

@@ -145,11 +145,8 @@ class OutputSpec(Checked):
 
 
 def as_map(value: Any, name: str) -> Tensor:
-    """[B, H, W] floating-point, of a tensor [B, 1, H, W], [B, H, W, 1] or [B, H, W]; half precision stays.
-
-    Raises:
-        ValueError: ``name`` is something else.
-    """
+    """[B, H, W] floating-point, of a tensor [B, 1, H, W], [B, H, W, 1] or [B, H, W]; half precision stays. Raises
+    ValueError: ``name`` is something else."""
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor, got {type(value).__name__}")
     shape = tuple(value.shape)

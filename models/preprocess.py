@@ -107,11 +107,8 @@ class Preprocess(Checked):
         return replace(self, resize_height=nyu.resize_height, crop=nyu.crop, size=size, aspect_multiple=None)
 
     def geometry(self, height: int, width: int) -> Geometry:
-        """The sizes of every step for an image of height x width [px].
-
-        Raises:
-            ValueError: the crop is larger than an image that is not resized.
-        """
+        """The sizes of every step for an image of height x width [px]. Raises ValueError: the crop is larger than an
+        image that is not resized."""
         if min(height, width) < 1:
             raise ValueError(f"an image must have at least one pixel, got {height} x {width}")
         ch, cw = self.crop or (0, 0)
@@ -130,26 +127,17 @@ class Preprocess(Checked):
         return Geometry((height, width), resized, top, left, cropped, self._final(cropped))
 
     def _final(self, cropped: tuple[int, int]) -> tuple[int, int]:
-        if self.size is None or self.aspect_multiple is None:
+        multiple = self.aspect_multiple
+        if self.size is None or multiple is None:
             return self.size or cropped
         factor = min((self.size[0] / cropped[0], self.size[1] / cropped[1]), key=lambda f: abs(1 - f))
-        multiple = self.aspect_multiple
-        final = [max(1, round(factor * side / multiple)) * multiple for side in cropped]
-        return final[0], final[1]
+        height, width = (max(1, round(factor * side / multiple)) * multiple for side in cropped)
+        return height, width
 
     def __call__(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-        """The network's input and its intrinsics.
-
-        Args:
-            image: [B, 3, H, W] RGB, uint8, or floating-point in [0, 1].
-            intrinsics: [B, 3, 3] (or [3, 3]) of ``image`` [px].
-
-        Returns:
-            [B, 3, h, w] floating-point, and intrinsics of the shape and type given.
-
-        Raises:
-            ValueError: wrong shapes, an integer type other than uint8, or floats outside [0, 1].
-        """
+        """The network's input [B, 3, h, w], floating-point, of ``image`` [B, 3, H, W] RGB, uint8 or floating-point in
+        [0, 1]; and its intrinsics, of the shape and type of ``intrinsics`` [B, 3, 3] (or [3, 3]) of ``image`` [px].
+        Raises ValueError: wrong shapes, an integer type other than uint8, or floats outside [0, 1]."""
         return self.apply_image(image), self.apply_intrinsics(intrinsics, *image.shape[-2:])
 
     def apply_image(self, image: Tensor) -> Tensor:
@@ -170,17 +158,9 @@ class Preprocess(Checked):
         return resize_intrinsics(crop_intrinsics(resized, g.top, g.left), g.cropped, g.final)
 
     def apply_depth(self, depth: Tensor) -> Tensor:
-        """A map that is registered to the image, seen by the network: ground truth depth, a mask, labels.
-
-        Every pixel of the result takes the value of the one source pixel that its centre falls into;
-        values are copied, never mixed, and of whatever type.
-
-        Args:
-            depth: [..., H, W].
-
-        Returns:
-            [..., h, w].
-        """
+        """A map [..., H, W] that is registered to the image, ground truth depth, a mask or labels, as the network sees
+        it [..., h, w]: every pixel takes the value of the one source pixel that its centre falls into; values are
+        copied, never mixed, and of whatever type."""
         g = self.geometry(*depth.shape[-2:])
         rows = _source_index(g.final[0], g.cropped[0], g.top, g.resized[0], g.image[0])
         columns = _source_index(g.final[1], g.cropped[1], g.left, g.resized[1], g.image[1])

@@ -30,30 +30,17 @@ _RANK = 1e-10
 
 @dataclass(frozen=True)
 class LinearFit:
-    """target = design @ theta on the inliers.
+    """target = design @ theta on the inliers."""
 
-    Attributes:
-        theta: [B, p].
-        inlier: [B, P] points used.
-        determined: [B] whether the inliers fix all p values.
-    """
-
-    theta: Tensor
-    inlier: Tensor
-    determined: Tensor
+    theta: Tensor  # [B, p]
+    inlier: Tensor  # [B, P] points used
+    determined: Tensor  # [B] whether the inliers fix all p values
 
 
 def least_squares(design: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """argmin sum_i weight_i (target_i - design_i . theta)^2 by the normal equations.
-
-    Args:
-        design: [B, P, p]; use float64, the condition is squared.
-        target: [B, P].
-        weight: [B, P] >= 0.
-
-    Returns:
-        theta [B, p] (NaN where undetermined) and determined [B].
-    """
+    """theta [B, p] (NaN where undetermined) = argmin sum_i weight_i (target_i - design_i . theta)^2 by the normal
+    equations, and determined [B]; of design [B, P, p] in float64, as the condition is squared, target and weight [B,
+    P], not negative."""
     weighted = design * weight[..., None]
     return solve_normal(weighted.mT @ design, (weighted.mT @ target[..., None])[..., 0])
 

@@ -8,7 +8,7 @@ from typing import Any
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble
 from ufmstar_torch.models.heads import HEADS, UncertaintyNetwork, with_head
-from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models.network import Backbone, fits
 from ufmstar_torch.models.preprocess import Preprocess
 
 _MULTIPLE = 32  # [px] both architectures halve the image five times
@@ -72,7 +72,8 @@ class NetworkSpec(Checked):
             expected = "1" if self.members > 1 else "at least 2"
             raise ValueError(f"NetworkSpec.members must be {expected} for {self.method!r}, got {self.members}")
         size, smallest = self.size, _SMALLEST[self.architecture]
-        if type(size) is not tuple or len(size) != 2 or not all(_is_side(side, smallest) for side in size):
+        whole = type(size) is tuple and len(size) == 2 and all(type(side) is int for side in size)
+        if not whole or not fits(*size, _MULTIPLE, smallest):
             expected = f"multiples of {_MULTIPLE} px from {smallest} px on"
             raise ValueError(f"NetworkSpec.size must be (height, width) in {expected}, got {size!r}")
         for f in fields(self):
@@ -97,18 +98,17 @@ class NetworkSpec(Checked):
 def build_backbone(spec: NetworkSpec) -> Backbone:
     """The encoder and decoder of ``spec``, with random weights from torch's generator."""
     backbone: Backbone
-    dropout: dict[str, Any] = {"dropout": spec.dropout, "dropout_both": spec.dropout_both}
+    options: dict[str, Any] = {name: getattr(spec, name) for name in ("dropout", "dropout_both", "size")}
     if spec.architecture == "fastdepth":
         from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
 
         named = {"full": FastDepthWidths.full, "pruned": FastDepthWidths.pruned}
         widths = named[spec.widths]() if isinstance(spec.widths, str) else FastDepthWidths.scaled(spec.widths)
-        options: dict[str, Any] = {"norm": spec.norm, "positive": spec.positive}
-        backbone = FastDepth(widths, **dropout, **options, size=spec.size)
+        backbone = FastDepth(widths, norm=spec.norm, positive=spec.positive, **options)
     else:
         from ufmstar_torch.models.monodepth2 import MonodepthResNet
 
-        backbone = MonodepthResNet(spec.layers, strides=spec.strides, **dropout, size=spec.size)
+        backbone = MonodepthResNet(spec.layers, strides=spec.strides, **options)
     backbone.preprocess = spec.input()
     return backbone
 
@@ -129,7 +129,3 @@ def build_network(
     network = with_head(backbone, spec.method if spec.method in HEADS else "aleatoric", spec.head_scales)
     several = spec.method == "batch_ensemble"
     return BatchEnsemble(network, spec.members, init=init, std=std) if several else network
-
-
-def _is_side(value: object, smallest: int) -> bool:
-    return type(value) is int and value >= smallest and not value % _MULTIPLE

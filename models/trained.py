@@ -32,19 +32,12 @@ _KEYS = {"format", "version", "spec", "networks", "info"}
 
 @dataclass(frozen=True)
 class TrainedInfo:
-    """What a file holds besides weights.
+    """What a file holds besides weights."""
 
-    Attributes:
-        path: of the file.
-        spec: of every network in it.
-        networks: their number (a BatchEnsemble is one).
-        info: what was given to :func:`save_trained`: the training's command, data, figures.
-    """
-
-    path: Path
-    spec: NetworkSpec
-    networks: int
-    info: dict[str, Any]
+    path: Path  # of the file
+    spec: NetworkSpec  # of every network in it
+    networks: int  # their number (a BatchEnsemble is one)
+    info: dict[str, Any]  # what was given to :func:`save_trained`: the training's command, data, figures
 
     @property
     def members(self) -> int:
@@ -95,13 +88,9 @@ def save_trained(
 
 
 def read_info(path: str | Path) -> TrainedInfo:
-    """What a file holds besides its weights, which are not read.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        CheckpointError: it is damaged, of another format or of a newer version.
-        ModuleNotFoundError: safetensors is not installed.
-    """
+    """What a file holds besides its weights, which are not read. Raises FileNotFoundError: there is no such file;
+    CheckpointError: it is damaged, of another format or of a newer version; ModuleNotFoundError: safetensors is not
+    installed."""
     return _TrainedFile(Path(path)).info
 
 
@@ -128,14 +117,12 @@ def load_trained(
         if not lazy and not offload:
             members += [file.member(n) for n in range(file.info.members)]
             continue
-        preprocess = file.info.spec.input()
-        later = [
-            LazyMember(partial(file.member, n), preprocess, name=f"{file.path}, member {n}", offload=offload)
-            for n in range(file.info.members)
-        ]
-        for member in later if not lazy else []:
-            member.network()
-        members += later
+        for n in range(file.info.members):
+            name = f"{file.path}, member {n}"
+            later = LazyMember(partial(file.member, n), file.info.spec.input(), name=name, offload=offload)
+            if not lazy:
+                later.network()
+            members.append(later)
     return members
 
 
@@ -147,58 +134,39 @@ def load_ensemble(weights: Path) -> DepthNetwork:
 
 
 def load_for_training(path: str | Path) -> list[UncertaintyNetwork | BatchEnsemble]:
-    """The networks in a file as ``build_network`` made them, in training mode, to go on from.
-
-    Raises:
-        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`load_trained`.
-    """
+    """The networks in a file as ``build_network`` made them, in training mode, to go on from. Raises FileNotFoundError,
+    CheckpointError, ModuleNotFoundError: as :func:`load_trained`."""
     file = _TrainedFile(Path(path))
     return [file.read(index).train() for index in range(file.info.networks)]
 
 
 class _TrainedFile:
-    """One file, whose networks are read one by one. What they share is read once.
-
-    Raises:
-        FileNotFoundError, CheckpointError, ModuleNotFoundError: as :func:`read_info`.
-    """
+    """One file, whose networks are read one by one. What they share is read once. Raises FileNotFoundError,
+    CheckpointError, ModuleNotFoundError: as :func:`read_info`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.info = _parse(path, read_safetensors(path, prefix=None)[1])
-        self._shared: dict[int, BatchEnsemble] = {}
+        self._shared: dict[int, Any] = {}  # a BatchEnsemble's members are of one network
         self._lock = threading.Lock()
 
     def member(self, n: int) -> DepthNetwork:
-        """Network n of :func:`load_trained`, in eval mode.
-
-        Raises:
-            CheckpointError: its weights are damaged or do not fit; names the file and the member.
-        """
-        method = self.info.spec.method
-        if method == "batch_ensemble":
-            index, member = divmod(n, self.info.spec.members)
-            return self._batch_ensemble(index).member(member)
-        network = self.read(n)
-        return MonteCarloDropout(network).eval() if method == "mc_dropout" else network
+        """Network n of :func:`load_trained`, in eval mode. Raises CheckpointError: its weights are damaged or do not
+        fit; names the file and the member."""
+        index, member = divmod(n, self.info.spec.members)
+        if self.info.spec.method != "batch_ensemble":
+            network = self.read(index)
+            return MonteCarloDropout(network).eval() if self.info.spec.method == "mc_dropout" else network
+        with self._lock:
+            if index not in self._shared:
+                self._shared[index] = self.read(index)
+            return self._shared[index].member(member)
 
     def __reduce__(self) -> tuple[type[_TrainedFile], tuple[Path]]:
         return _TrainedFile, (self.path,)  # a copy reads the file again
 
-    def _batch_ensemble(self, index: int) -> BatchEnsemble:
-        with self._lock:
-            if index not in self._shared:
-                network = self.read(index)
-                assert isinstance(network, BatchEnsemble)
-                self._shared[index] = network
-            return self._shared[index]
-
     def read(self, index: int) -> UncertaintyNetwork | BatchEnsemble:
-        """What is stored under an index, in eval mode.
-
-        Raises:
-            CheckpointError: as :meth:`member`.
-        """
+        """What is stored under an index, in eval mode. Raises CheckpointError: as :meth:`member`."""
         network = _new(self.info.spec)
         fill(network, read_safetensors(self.path, f"member.{index}.")[0], f"{self.path}, member {index},")
         return network.eval()

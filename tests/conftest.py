@@ -13,26 +13,9 @@ from hypothesis import settings
 # One thread per worker, set before torch is imported; .ci/run sets another number for the numerical tests.
 THREADS = int(os.environ.setdefault("OMP_NUM_THREADS", "1"))
 
-KERNELS = Path(__file__).resolve().parents[1] / "ufmstar_torch" / "kernels"
+CORE = Path(__file__).resolve().parents[1] / "ufmstar_torch"
 MAX_WORKERS = 4  # each takes up to 3 GB
-COMPILE = """
-import gc, sys
-import torch
-from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.eval.engine.warm_up import metrics, preprocessing
-from ufmstar_torch.eval.metrics import SequenceMetrics
-gc.disable()
-dtype = getattr(torch, sys.argv[1])
-depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
-K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
-ufm = UfMStar(UfMStarConfig(backend="numba", merge=1.0, merge_every=1))
-for _ in range(2):
-    ufm(depth, pose, K)
-preprocessing()
-SequenceMetrics().update(depth, depth, depth)
-"""
-
-
+COMPILE = Path(__file__).with_name("compile_kernels.py")
 COMPILERS: pytest.StashKey[list[subprocess.Popen[bytes]]] = pytest.StashKey()
 
 settings.register_profile("fast", deadline=None, max_examples=25)
@@ -42,9 +25,9 @@ settings.load_profile("fast")  # --hypothesis-profile=thorough loads the other o
 
 def pytest_configure(config: pytest.Config) -> None:
     """Start to compile the kernels while the workers of pytest-xdist collect the tests."""
-    if config.getoption("tx", None) and not config.option.collectonly and not _compiled():
-        dtypes = ("float32", "float64")
-        config.stash[COMPILERS] = [subprocess.Popen([sys.executable, "-c", COMPILE, dtype]) for dtype in dtypes]
+    if config.getoption("tx", None) and not config.option.collectonly:
+        dtypes = [dtype for dtype in ("float32", "float64") if not _compiled(dtype)]
+        config.stash[COMPILERS] = [subprocess.Popen([sys.executable, COMPILE, dtype]) for dtype in dtypes]
 
 
 def pytest_xdist_node_collection_finished(node) -> None:
@@ -79,10 +62,11 @@ def _names_files(config: pytest.Config) -> bool:
     return any(Path(argument.split("::")[0]).is_file() for argument in config.args)
 
 
-def _compiled() -> bool:
-    """Whether numba's cache is younger than the kernels' sources."""
-    cached = [path.stat().st_mtime for path in KERNELS.glob("__pycache__/*.nbi")]
-    return bool(cached) and max(cached) > max(path.stat().st_mtime for path in KERNELS.glob("*.py"))
+def _compiled(dtype: str) -> bool:
+    """Whether the kernels on disk were compiled since the last change of a file that they depend on."""
+    done = CORE / "kernels" / "__pycache__" / f"{dtype}.compiled"
+    sources = [path for folder in ("", "kernels", "posterior") for path in (CORE / folder).glob("*.py")]
+    return done.is_file() and done.stat().st_mtime > max(path.stat().st_mtime for path in sources)
 
 
 @pytest.fixture(scope="session")
@@ -106,3 +90,28 @@ def results(evaluation: Path):
     from ufmstar_torch.eval.report.data import load_results
 
     return load_results(evaluation)
+
+
+@pytest.fixture
+def ufmstar(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """Calls the program: (exit code, stdout, stderr)."""
+    from ufmstar_torch import cli
+
+    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+
+    def call(*words):
+        capfd.readouterr()
+        code = cli.main([str(word) for word in words])
+        printed = capfd.readouterr()
+        return code, printed.out, printed.err
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three sequences of 4 frames. Nobody may change them."""
+    from suite_runs import write_rooms
+
+    return write_rooms(tmp_path_factory.mktemp("rooms"))

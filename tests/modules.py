@@ -6,7 +6,7 @@ import torch
 from walks import SPGF
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import UfMStarConfig
 
 H, W = 30, 40
 
@@ -25,9 +25,10 @@ def same(a: torch.Tensor, b: torch.Tensor) -> bool:
     return torch.equal(a.nan_to_num(-1.0), b.nan_to_num(-1.0)) and torch.equal(a.isnan(), b.isnan())
 
 
-def snapshot(ufm: UfMStar) -> dict[str, torch.Tensor]:
+def snapshot(ufm: torch.nn.Module) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in ufm.state_dict().items()}
 
 
-def unchanged(ufm: UfMStar, before: dict[str, torch.Tensor]) -> bool:
-    return all(same(value.double(), before[name].double()) for name, value in ufm.state_dict().items())
+def unchanged(ufm: torch.nn.Module, before: dict[str, torch.Tensor]) -> bool:
+    now = ufm.state_dict()
+    return now.keys() == before.keys() and all(same(v.double(), before[k].double()) for k, v in now.items())

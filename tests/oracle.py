@@ -270,13 +270,16 @@ class Oracle:
                  alpha=0.5, overlap_weighted=False, neighbourhood=None, disagreement="w2",
                  unmeasured="paper", unmeasured_relative=0.1):  # fmt: skip
         self.unmeasured, self.unmeasured_relative = unmeasured, unmeasured_relative
-        self.share = None
         self.disagreement = disagreement
         self.spgf, self.eta, self.eta_occl, self.near = spgf, eta, eta_occl, near
         self.prior = {"prior_weight": prior_weight, "prior_mean": prior_mean, "neighbourhood": neighbourhood}
         self.alpha, self.overlap_weighted = alpha, overlap_weighted
         self.mixture, self.T_first, self.smoothed = [], None, None
         self.matches = []
+
+    def share(self):
+        """Of the last frame, :func:`compared_share` [H, W]."""
+        return compared_share(*self.seen, **self.prior)
 
     def step(self, depth, T_world_cam, K, aleatoric=None, epistemic=None, features=None):
         valid = np.isfinite(depth) & (depth > 0) & (depth <= self.spgf.settings.max_depth)
@@ -306,14 +309,14 @@ class Oracle:
             distances=distances,
         )
         mixture_cam = self.mixture_cam = [transform(g, *to_cam) for g in self.mixture]
-        self.share = compared_share(mixture_cam, depth, valid, K, **self.prior)
+        self.seen = mixture_cam, depth, valid, K
         if self.unmeasured == "prior":
             mixture_cam = [g if g["count"] > 1 else {**g, "m": self.prior["prior_mean"]} for g in mixture_cam]
         M = dense(mixture_cam, depth, valid, K, **self.prior)
         if self.unmeasured == "relative":
-            M = M + (1 - self.share) * (self.unmeasured_relative * depth) ** 2
+            M = M + (1 - self.share()) * (self.unmeasured_relative * depth) ** 2
         if self.unmeasured == "nan":
-            M = np.where(self.share < 0.5, np.nan, M)
+            M = np.where(self.share() < 0.5, np.nan, M)
         here = ~np.isnan(M)
         if self.smoothed is not None:
             both = (1 - self.alpha) * self.smoothed + self.alpha * M

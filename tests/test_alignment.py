@@ -13,13 +13,7 @@ from hypothesis import strategies as st
 
 from scenes import look, render
 from ufmstar_torch import UfMStar, UncertainDepth
-from ufmstar_torch.models import (
-    AlignedNetwork,
-    Alignment,
-    align_to_camera_height,
-    fit_affine_depth,
-    fit_inverse_depth,
-)
+from ufmstar_torch.models import AlignedNetwork, Alignment, align_to_camera_height, fit_affine_depth, fit_inverse_depth
 from ufmstar_torch.models.robust_fit import least_squares, masked_median, robust_fit
 
 SIZE = (24, 32)

@@ -11,15 +11,8 @@ from PIL import Image, ImageEnhance
 from torch import Tensor
 
 from ufmstar_torch.eval.tour import box_room as synthetic
-from ufmstar_torch.train.augment import (
-    Augmentation,
-    AugmentationConfig,
-    Change,
-    apply_colour,
-    apply_geometry,
-    camera_change,
-    draw,
-)
+from ufmstar_torch.train import Augmentation, AugmentationConfig
+from ufmstar_torch.train.augment import Change, apply_colour, apply_geometry, camera_change, draw
 
 SIZE = (120, 160)
 # Pixels that are not square, a principal point far from the centre, and skew: nothing may hide in symmetry.

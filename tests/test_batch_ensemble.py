@@ -15,12 +15,18 @@ from hypothesis import strategies as st
 from torch import nn
 
 from ufmstar_torch import UncertainDepth
-from ufmstar_torch.models.batch_ensemble import INIT_STD, BatchEnsemble, convert, converted_layers
+from ufmstar_torch.models import (
+    AleatoricNetwork,
+    Backbone,
+    BatchEnsemble,
+    EvidentialNetwork,
+    FastDepth,
+    FastDepthWidths,
+    Preprocess,
+    convert,
+)
+from ufmstar_torch.models.batch_ensemble import INIT_STD, converted_layers
 from ufmstar_torch.models.batch_layer import BatchLayer, Selection
-from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
-from ufmstar_torch.models.heads import AleatoricNetwork, EvidentialNetwork
-from ufmstar_torch.models.network import Backbone
-from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.pipeline import combine
 
 N = 3

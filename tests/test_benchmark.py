@@ -32,7 +32,7 @@ from ufmstar_torch.eval.bench.text import format_report
 from ufmstar_torch.eval.bench.timing import STAGES, StagedStep, TimedCalls, pinned_threads
 from ufmstar_torch.eval.commands import bench_command
 from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
-from ufmstar_torch.eval.report.figures_growth import draw_growth
+from ufmstar_torch.eval.report.figures_cost import draw_growth
 from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.results.machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.tour import box_room as synthetic

@@ -18,13 +18,7 @@ from safetensors.torch import load_file
 from shared_data import require_shared
 from torch import Tensor, nn
 
-from ufmstar_torch.models import checkpoints
-from ufmstar_torch.models.checkpoints import (
-    CheckpointError,
-    load_state_dict_file,
-    load_weights,
-    save_checkpoint,
-)
+from ufmstar_torch.models import CheckpointError, checkpoints, load_state_dict_file, load_weights, save_checkpoint
 
 FORMATS = ["w.pth", "w.pt", "w.safetensors"]
 

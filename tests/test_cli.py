@@ -32,19 +32,6 @@ def path(tmp_path_factory):
 
 
 @pytest.fixture
-def ufmstar(capfd):
-    """Calls the program: (exit code, stdout, stderr)."""
-
-    def call(*words):
-        capfd.readouterr()
-        code = cli.main([str(word) for word in words])
-        printed = capfd.readouterr()
-        return code, printed.out, printed.err
-
-    return call
-
-
-@pytest.fixture
 def brightness(monkeypatch, tmp_path):
     """Makes ``--model any --weights FILE`` load a network whose gain is the file's content; returns the files."""
 

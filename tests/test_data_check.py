@@ -15,8 +15,8 @@ from shared_data import require_shared
 
 from ufmstar_torch.cli import main
 from ufmstar_torch.eval.check.data_check import check_data
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 from ufmstar_torch.eval.tour.open import open_sequence, open_tour
 from ufmstar_torch.eval.tour.sequence import export_tour
 

@@ -25,7 +25,7 @@ from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.ufm import UfM
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.colours import colour_table
-from ufmstar_torch.eval.report.figures_calibration import write_curves
+from ufmstar_torch.eval.report.figures_curves import write_curves
 from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.text import demo_explanation, demo_table
 from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
@@ -316,17 +316,6 @@ def test_rows_of_the_sheet(unfamiliar, expected):
 
 
 # ---- what goes wrong ----
-
-
-@pytest.fixture
-def ufmstar(capfd):
-    def call(*words):
-        capfd.readouterr()
-        code = cli.main([str(word) for word in words])
-        printed = capfd.readouterr()
-        return code, printed.out, printed.err
-
-    return call
 
 
 def test_a_folder_of_someone_else_is_left_alone(ufmstar, weights, tmp_path):

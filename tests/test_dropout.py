@@ -13,11 +13,18 @@ from walks import SPGF
 
 import scenes
 from ufmstar_torch import UfMStarConfig, UncertainDepth
-from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout, set_sampling
-from ufmstar_torch.models.fastdepth import FastDepth
-from ufmstar_torch.models.heads import AleatoricNetwork, DepthOnlyNetwork, EvidentialNetwork
-from ufmstar_torch.models.monodepth2 import MonodepthResNet
-from ufmstar_torch.models.network import Backbone
+from ufmstar_torch.models import (
+    AleatoricNetwork,
+    Backbone,
+    DecoderDropout,
+    DepthOnlyNetwork,
+    EvidentialNetwork,
+    FastDepth,
+    MonodepthResNet,
+    MonteCarloDropout,
+    set_sampling,
+)
+from ufmstar_torch.models.dropout import SAMPLES
 
 P = 0.2
 

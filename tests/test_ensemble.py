@@ -13,10 +13,7 @@ import torch
 from torch import nn
 
 from ufmstar_torch import DepthPrediction, UncertainDepth
-from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.ensemble import Ensemble, LazyMember
-from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.models import CheckpointError, DepthNetwork, Ensemble, LazyMember, Preprocess
 
 INPUT = Preprocess(size=(8, 10))
 POSE, K = torch.eye(4), torch.tensor([[8.0, 0, 4.5], [0, 8, 3.5], [0, 0, 1]])

@@ -14,7 +14,7 @@ from PIL import Image
 from shared_data import require_shared
 from torch import Tensor, nn
 
-from ufmstar_torch.models.fastdepth import FastDepth, FastDepthWidths
+from ufmstar_torch.models import FastDepth, FastDepthWidths
 
 WEIGHTS = "weights/fastdepth_nyu.onnx"
 TUM = "data/rgbd_dataset_freiburg1_xyz"

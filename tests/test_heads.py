@@ -16,20 +16,18 @@ from tiny_networks import Linear, constant_head
 from torch import Tensor
 
 from ufmstar_torch.eval.sequences.images import read_color
-from ufmstar_torch.models.distribution import EvidentialDepth, GaussianDepth, PointDepth
-from ufmstar_torch.models.fastdepth import FastDepth
-from ufmstar_torch.models.heads import (
-    BETA_FLOOR,
-    EVIDENCE_FLOOR,
-    HEADS,
-    LOG_VARIANCE_RANGE,
+from ufmstar_torch.models import (
     AleatoricNetwork,
+    EvidentialDepth,
     EvidentialNetwork,
+    FastDepth,
+    GaussianDepth,
+    MonodepthResNet,
+    PointDepth,
     UncertaintyNetwork,
-    soft_range,
     with_head,
 )
-from ufmstar_torch.models.monodepth2 import MonodepthResNet
+from ufmstar_torch.models.heads import BETA_FLOOR, EVIDENCE_FLOOR, HEADS, LOG_VARIANCE_RANGE, soft_range
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 LOW, HIGH = LOG_VARIANCE_RANGE

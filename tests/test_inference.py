@@ -22,10 +22,16 @@ from ufmstar_torch.eval.results import machine
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, load_network, save_trained
-from ufmstar_torch.models.heads import with_head
+from ufmstar_torch.models import (
+    FastDepth,
+    FastDepthWidths,
+    MonodepthResNet,
+    OnnxNetwork,
+    load_network,
+    save_trained,
+    with_head,
+)
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.models.onnx_network import OnnxNetwork
 from ufmstar_torch.models.trained import NetworkSpec, build_network
 
 CPU = torch.device("cpu")

@@ -13,17 +13,10 @@ from scipy import stats
 from scipy.special import gammaln
 from torch import Tensor
 
-from ufmstar_torch.models.distribution import EvidentialDepth, GaussianDepth, PointDepth
+from ufmstar_torch.models import EvidentialDepth, GaussianDepth, PointDepth
 from ufmstar_torch.models.heads import BETA_FLOOR, EVIDENCE_FLOOR, LOG_VARIANCE_RANGE
-from ufmstar_torch.train.losses import (
-    EVIDENCE_WEIGHT,
-    depth_l1,
-    evidential_loss,
-    evidential_nll,
-    gaussian_nll,
-    loss_of,
-    loss_sums,
-)
+from ufmstar_torch.train import loss_of, loss_sums
+from ufmstar_torch.train.losses import EVIDENCE_WEIGHT, depth_l1, evidential_loss, evidential_nll, gaussian_nll
 
 SHAPE = (2, 5, 7)
 KINDS = ("point", "gaussian", "evidential")

@@ -67,6 +67,7 @@ def camera() -> dict[str, Any]:
     return {"images": images, "K": K, "measured": measured}
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:`torch.jit:FutureWarning", "ignore:`torch.jit:DeprecationWarning")
 def test_every_piece_of_code_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -17,10 +17,8 @@ from onnx_files import save
 from shared_data import require_shared
 from torch import Tensor
 
-from ufmstar_torch.models.fastdepth import FastDepth
-from ufmstar_torch.models.onnx_network import OnnxNetwork, OnnxSpec, load_onnx
-from ufmstar_torch.models.outputs import OutputSpec
-from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.models import FastDepth, OnnxNetwork, OnnxSpec, OutputSpec, Preprocess
+from ufmstar_torch.models.onnx_network import load_onnx
 
 METRIC = OutputSpec("metric")
 COEFFICIENTS = (0.5, 0.25, 2.0)  # depth = .5 R + .25 G + 2 B

@@ -12,7 +12,7 @@ from shared_data import require_shared
 from torch import Tensor
 
 from ufmstar_torch.camera import unproject
-from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.models import Preprocess
 
 NYU = Preprocess.nyu()
 SIZES = [(480, 640), (360, 540), (968, 1296), (640, 480), (240, 320), (375, 1242), (100, 120)]

@@ -18,15 +18,18 @@ from ufmstar_torch.eval.methods.method import BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Merged, Results
-from ufmstar_torch.eval.report.figures_calibration import (
+from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
+from ufmstar_torch.eval.report.figures_curves import (
     MOST_SEQUENCES,
     chosen_sequences,
+    density,
     draw_calibration,
+    draw_entropy,
+    draw_error,
     draw_sequence_calibration,
+    entropy_range,
 )
-from ufmstar_torch.eval.report.figures_cost import STAGES, draw_latency, draw_stages, draw_tradeoff
-from ufmstar_torch.eval.report.figures_error import density, draw_entropy, draw_error, entropy_range
-from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep
+from ufmstar_torch.eval.report.figures_sweep import Point, draw_changes, draw_sweep, sweep_lines, sweeps
 from ufmstar_torch.eval.report.means import difference, mean_of
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.style import (
@@ -37,7 +40,6 @@ from ufmstar_torch.eval.report.style import (
     spread_apart,
     style_of,
 )
-from ufmstar_torch.eval.report.sweeps import Point, sweep_lines, sweeps
 from ufmstar_torch.eval.report.write import write_report
 
 ROWS = rows_of("Ensemble", "UfM-Ensemble-100K", "UfM*-Ensemble", "DepthOnly", "UfM*-DepthOnly")

@@ -186,7 +186,7 @@ class TestStrips:
 
     @given(st.text(alphabet="ab-_ *", max_size=60))
     def test_broken_names_keep_their_letters(self, name: str) -> None:
-        broken = break_name(name)
+        broken = break_name(name, 20)
         assert broken.replace("\n", "").replace(" ", "") == name.replace(" ", "")
         assert max(map(len, broken.split("\n"))) <= 20
 
@@ -258,7 +258,7 @@ class TestProjection:
         forward /= np.linalg.norm(forward)
         T = np.eye(4)
         T[:3, :3] = np.stack([np.cross(forward, above), -above, forward], axis=1)
-        top, oblique = views_of(T[None], elevation=35.0)
+        top, oblique = views_of(T[None])
         np.testing.assert_allclose(top.towards, above, atol=1e-12)
         np.testing.assert_allclose(top.up, forward, atol=1e-12)
         assert oblique.towards @ above == pytest.approx(np.sin(np.radians(35)))
@@ -358,7 +358,7 @@ class TestWritePictures:
             raise ValueError("broken")
 
         monkeypatch.setattr(pictures_module, "draw_breakdown", broken)
-        monkeypatch.setattr("ufmstar_torch.eval.report.figures.figures_of", lambda _: [])
+        monkeypatch.setattr("ufmstar_torch.eval.report.write.figures_of", lambda _: [])
         out = shutil.copytree(evaluation, tmp_path / "o")
         assert write_report(out).undrawn == {f"{KITCHEN[1]}, frame 7: breakdown": "broken"}
         index = json.loads((out / "figures" / "pictures.json").read_text())

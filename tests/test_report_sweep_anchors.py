@@ -16,11 +16,10 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting, setting_from
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.figures import figures_of
-from ufmstar_torch.eval.report.figures_sweep import draw_sweep
+from ufmstar_torch.eval.report.figures_sweep import default_value, draw_sweep, sweep_lines, sweeps
 from ufmstar_torch.eval.report.means import mean_of
 from ufmstar_torch.eval.report.names import ECE_DELTA
-from ufmstar_torch.eval.report.sweeps import default_value, sweep_lines, sweeps
+from ufmstar_torch.eval.report.write import figures_of
 
 STAR = Method.parse("UfM*-DepthOnly")
 SEQUENCES = {"a": 0.3, "b": 0.4, "c": 0.5, "d": 0.6, "e": 0.7}  # ECE_delta of plain UfM*

@@ -269,19 +269,20 @@ def test_a_run_with_a_posterior_corrects_the_depth_and_goes_on_after_a_stop(tour
     panel = Finished(whole, tour, records(whole), with_error=True).panel(7)
     labels = [column.label for column in map_columns([panel])]
     assert labels == ["depth", "posterior", "σ", "|error|", "σ, posterior", "|error|, posterior"]
-    assert np.nanmean(panel.posterior_error) < 0.7 * np.nanmean(panel.error)
+    assert np.nanmean(panel.maps["posterior_error"]) < 0.7 * np.nanmean(panel.maps["error"])
 
 
 def test_pictures_have_a_column_for_what_anchors_add(tour, finished, tmp_path):
     out, done = finished[0], records(finished[0])
     panel = Finished(out, tour, done, with_error=True).panel(7)
     stored = read_frame(out / "frames" / f"{tour.names[7]}.npz")
-    np.testing.assert_array_equal(panel.anchored, np.sqrt(stored["anchored"]))
+    expected = np.where(stored["valid"], np.sqrt(stored["anchored"]), np.nan)
+    np.testing.assert_array_equal(panel.maps["anchored"], expected)
     assert panel.note == f"K = {done[7]['components']}, {done[7]['anchors']['used']} anchors"
-    plain = dataclasses.replace(panel, anchored=None)
+    plain = dataclasses.replace(panel, maps={k: v for k, v in panel.maps.items() if k != "anchored"})
     columns, fewer = map_columns([panel]), map_columns([plain])
     assert [column.label for column in columns] == ["depth", "σ", "√B", "|error|"]
-    width = panel.depth.shape[1] * 240 / panel.depth.shape[0]
+    width = panel.shape[1] * 240 / panel.shape[0]
     gained = preview_frame(panel, columns).shape[1] - preview_frame(plain, fewer).shape[1]
     assert abs(gained - width) < 8
 

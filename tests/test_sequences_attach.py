@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from layouts import quaternion_line
 
-from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.attach import frame_numbers, in_seconds
-from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose
+from ufmstar_torch.eval.sequences import Trajectory, interpolate_pose, open_sequence
+from ufmstar_torch.eval.sequences.attach import frame_numbers
 
 FRAMES = 6
 # Frame numbers as the layouts' writers name them.
@@ -123,17 +122,19 @@ def test_orb_slam3_in_nanoseconds(tmp_path):
 
 
 @pytest.mark.parametrize("unit", [1e9, 1e6, 1e3, 1.0])
-def test_units_are_recognised_by_meeting_the_images(unit):
-    seconds = 20 + np.arange(50) / 10
-    trajectory = Trajectory(seconds * unit, np.tile(np.eye(4), (50, 1, 1)))
-    np.testing.assert_allclose(in_seconds(trajectory, seconds[5:9]).timestamps, seconds)
+def test_units_are_recognised_by_meeting_the_images(tmp_path, unit):
+    path, _ = layouts.write_tum(tmp_path)  # at 10 s and later
+    write(tmp_path / "slam.txt", (10 + np.arange(FRAMES) / 30) * unit, form="{:.9f}")
+    assert_moved(open_sequence(path, trajectory=tmp_path / "slam.txt"), range(FRAMES))
 
 
-def test_a_trajectory_at_another_time_stays_as_it_is():
-    trajectory = Trajectory(5 + np.arange(50) / 10, np.tile(np.eye(4), (50, 1, 1)))
-    assert in_seconds(trajectory, np.array([0.0, 0.1])).timestamps[0] == 5  # 5 s are no 5 ms
-    single = Trajectory(np.array([5e9]), np.eye(4)[None])
-    assert in_seconds(single, np.array([5.0, 6])).timestamps[0] == 5e9
+@pytest.mark.parametrize("stamps", [np.arange(FRAMES) / 10, np.array([10e9])], ids=["another-time", "one-pose"])
+def test_a_trajectory_at_another_time_stays_as_it_is(tmp_path, stamps):
+    """0 to 0.5 s are no 0 to 0.5 ms, and one pose has no unit that its distances could confirm."""
+    path, _ = layouts.write_tum(tmp_path)
+    write(tmp_path / "slam.txt", stamps, MOVED[: len(stamps)])
+    with pytest.raises(ValueError, match=rf"{len(stamps)} poses at {stamps[0]:.3f} to {stamps[-1]:.3f} s"):
+        open_sequence(path, trajectory=tmp_path / "slam.txt")
 
 
 def test_whole_seconds_of_a_video_are_seconds(tmp_path):

@@ -11,13 +11,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from ufmstar_torch.models import FastDepthWidths, NetworkSpec, build_backbone, build_network
-from ufmstar_torch.models.batch_ensemble import BatchEnsemble, converted_layers
-from ufmstar_torch.models.distribution import EvidentialDepth, GaussianDepth, PointDepth
-from ufmstar_torch.models.dropout import DecoderDropout, MonteCarloDropout
-from ufmstar_torch.models.fastdepth import FastDepth
-from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD, MonodepthResNet
-from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.models import (
+    BatchEnsemble,
+    DecoderDropout,
+    EvidentialDepth,
+    FastDepth,
+    FastDepthWidths,
+    GaussianDepth,
+    MonodepthResNet,
+    MonteCarloDropout,
+    NetworkSpec,
+    PointDepth,
+    Preprocess,
+    build_backbone,
+    build_network,
+)
+from ufmstar_torch.models.batch_ensemble import converted_layers
+from ufmstar_torch.models.monodepth2 import IMAGENET_MEAN, IMAGENET_STD
 
 SMALL = NetworkSpec(widths=0.1, size=(32, 64))
 

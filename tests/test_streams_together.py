@@ -23,7 +23,7 @@ from ufmstar_torch.eval.tour.open import open_tour
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.state import UfMStarState
 
-LENGTHS = (5, 2, 4, 3)
+LENGTHS = (4, 2, 3, 2)
 ROWS = [
     row("Ensemble"),
     row("UfM-Ensemble"),

@@ -18,27 +18,6 @@ from ufmstar_torch.eval.methods.suite import names
 from ufmstar_torch.eval.results import launch
 
 
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
-    """Three sequences of 4 frames. Nobody may change them."""
-    return write_rooms(tmp_path_factory.mktemp("rooms"))
-
-
-@pytest.fixture
-def ufmstar(capfd, monkeypatch):
-    """Calls the program: (exit code, stdout, stderr)."""
-    for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK"):
-        monkeypatch.delenv(name, raising=False)
-
-    def call(*words):
-        capfd.readouterr()
-        code = cli.main([str(word) for word in words])
-        printed = capfd.readouterr()
-        return code, printed.out, printed.err
-
-    return call
-
-
 @pytest.fixture
 def stubbed(monkeypatch):
     """The judge of sequences, replaced by one that draws figures; returns it."""

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, one_by_one, write_rooms
+from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept, one_by_one
 from trainings import SPEC
 
 from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
@@ -38,12 +38,6 @@ from ufmstar_torch.eval.results.launch import (
 from ufmstar_torch.eval.results.worker import WorkerTask
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
-
-
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
-    """Three sequences of 4 frames. Nobody may change them."""
-    return write_rooms(tmp_path_factory.mktemp("rooms"))
 
 
 @pytest.fixture

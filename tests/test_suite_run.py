@@ -27,12 +27,6 @@ from ufmstar_torch.eval.results.work import DIED, failures, with_references
 from ufmstar_torch.eval.results.worklist import Shard, content_digest
 
 
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory):
-    """Three sequences of 4 frames. Nobody may change them."""
-    return write_rooms(tmp_path_factory.mktemp("rooms"))
-
-
 def folder_of(job):
     return EvalFolder(job.out, {})
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -26,24 +25,17 @@ from ufmstar_torch.eval.tour.view import cast
 K = torch.from_numpy(intrinsics(24, 32))
 
 
-made = cache(make_tour)  # a second of shadow rays each; nobody may change them
 SEEDS = {"home": 2, "hall": 3, "mixed": 1}
 
 
 @pytest.fixture(scope="module")
 def home() -> Tour:
-    return made(SEEDS["home"], "home")
+    return make_tour(SEEDS["home"], "home")
 
 
 @pytest.fixture(scope="module")
 def mixed() -> Tour:
-    return made(SEEDS["mixed"], "mixed")
-
-
-@pytest.fixture(autouse=True)
-def made_once(monkeypatch):
-    """Sequences of one seed and style share the tour."""
-    monkeypatch.setattr("ufmstar_torch.eval.tour.sequence.make_tour", made)
+    return make_tour(SEEDS["mixed"], "mixed")
 
 
 def scene(*parts) -> Tour:
@@ -219,7 +211,8 @@ def test_a_seed_makes_the_same_tour_and_pictures_for_any_number_of_threads(home)
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     try:
         torch.set_num_threads(3)
-        again = make_tour(2)
+        again = make_tour(2, STYLES["home"])  # a style that is given whole is not kept
+        assert again is not home
         assert same(home, again)
         poses = tour_path(home, 40)
         assert torch.equal(poses, tour_path(again, 40))
@@ -250,7 +243,7 @@ def to_surfaces(tour: Tour, points: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("style", SEEDS)
 def test_every_way_keeps_clear_of_everything(style):
-    tour = made(SEEDS[style], style)
+    tour = make_tour(SEEDS[style], style)
     for frames, path_seed in ((100, None), (300, None), (200, 1)):
         points = tour_path(tour, frames, path_seed)[:, :3, 3]
         boxes = torch.cat([tour.rooms, tour.doors])
@@ -327,7 +320,7 @@ def test_no_ray_of_another_view_passes_a_point_that_was_seen(home):
 
 @pytest.mark.parametrize("style", SEEDS)
 def test_culling_changes_nothing(style):
-    tour = made(SEEDS[style], style)
+    tour = make_tour(SEEDS[style], style)
     for pose in tour_path(tour, 50, 3)[::13]:
         culled, whole = cast(tour, pose, K, 24, 32), cast(tour, pose, K, 24, 32, cull=False)
         assert torch.equal(culled[0], whole[0])
@@ -338,7 +331,8 @@ def test_culling_changes_nothing(style):
 def test_no_texture_occurs_in_both_styles(home):
     assert not set(HOME_TEXTURES) & set(HALL_TEXTURES)
     used = {
-        style: {TEXTURES[i] for i in made(SEEDS[style], style).surfaces.texture.tolist()} for style in ("home", "hall")
+        style: {TEXTURES[i] for i in make_tour(SEEDS[style], style).surfaces.texture.tolist()}
+        for style in ("home", "hall")
     }
     assert used["home"] <= set(HOME_TEXTURES)
     assert used["hall"] <= set(HALL_TEXTURES)
@@ -377,7 +371,7 @@ def test_mixed_tours_begin_at_home_and_end_in_a_hall(mixed):
 
 @pytest.mark.parametrize("style", ["home", "hall"])
 def test_sizes_are_the_styles(style):
-    tour, expected = made(SEEDS[style], style), STYLES[style]
+    tour, expected = make_tour(SEEDS[style], style), STYLES[style]
     size = tour.rooms[:, 1] - tour.rooms[:, 0]
     assert expected.rooms[0] <= len(tour.rooms) <= expected.rooms[1]
     assert ((size[:, [0, 2]] >= expected.room_size[0]) & (size[:, [0, 2]] <= expected.room_size[1])).all()

@@ -15,22 +15,34 @@ from trainings import RECIPE, SPEC, scenes, tiny_job, with_network, write_frames
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.commands.options import parse, parser_of
+from ufmstar_torch.models import (
+    CheckpointError,
+    MonodepthResNet,
+    NetworkSpec,
+    build_network,
+    load_trained,
+    read_info,
+    save_trained,
+)
 from ufmstar_torch.models.batch_layer import BatchLayer
-from ufmstar_torch.models.checkpoints import CheckpointError, read_safetensors
-from ufmstar_torch.models.monodepth2 import MonodepthResNet
-from ufmstar_torch.models.spec import NetworkSpec, build_network
-from ufmstar_torch.models.trained import load_trained, read_info, save_trained
-from ufmstar_torch.train.augment import AugmentationConfig
+from ufmstar_torch.models.checkpoints import read_safetensors
+from ufmstar_torch.train import (
+    AugmentationConfig,
+    DataConfig,
+    FitSettings,
+    NonFiniteLossError,
+    Recipe,
+    TrainingModule,
+    preset,
+    starting_network,
+)
 from ufmstar_torch.train.command import TrainOptions
-from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.examples import camera_image
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.history import METRICS, read_rows
 from ufmstar_torch.train.member import WEIGHTS, make_data, new_network
-from ufmstar_torch.train.module import NonFiniteLossError, TrainingModule
-from ufmstar_torch.train.presets import Recipe, preset, table
-from ufmstar_torch.train.settings import FitSettings
-from ufmstar_torch.train.start import starting_network, train_only
+from ufmstar_torch.train.presets import table
+from ufmstar_torch.train.start import train_only
 
 ONE_STEP = replace(RECIPE, max_steps=1)
 
@@ -41,22 +53,10 @@ def frames(tmp_path_factory):
     return write_frames(tmp_path_factory.mktemp("frames") / "walk")
 
 
-@pytest.fixture
-def ufmstar(capfd):
-    """Calls the program: (exit code, stdout, stderr)."""
-
-    def call(*words):
-        capfd.readouterr()
-        code = cli.main([str(word) for word in words])
-        printed = capfd.readouterr()
-        return code, printed.out, printed.err
-
-    return call
-
-
 # ---- trainings ----
 
 
+@pytest.mark.slow
 def test_it_learns_depth_and_where_the_depth_is_noisy(tmp_path):
     """Twelve scenes, the red half of each with noise of .9 m, twice for training and once more for validation.
 

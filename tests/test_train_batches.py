@@ -9,11 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from training_data import loader, numbers, truncated, write_nyu
 
-from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.train.augment import Augmentation, AugmentationConfig
-from ufmstar_torch.train.batches import EpochBatches, EpochLoader
-from ufmstar_torch.train.nyu import NyuFrames
-from ufmstar_torch.train.samples import SampleDataset
+from ufmstar_torch.models import Preprocess
+from ufmstar_torch.train import Augmentation, AugmentationConfig, EpochBatches, EpochLoader, NyuFrames, SampleDataset
 
 LENGTHS = {"length": st.integers(1, 200), "batch_size": st.integers(1, 9), "world": st.integers(1, 4)}
 

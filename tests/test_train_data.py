@@ -12,13 +12,18 @@ import torch
 from layouts import truth, write_generic
 from training_data import PLAIN, TINY, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
 
-from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.train.augment import Augmentation, AugmentationConfig
-from ufmstar_torch.train.batches import EpochBatches
-from ufmstar_torch.train.data import DepthDataModule
-from ufmstar_torch.train.data_config import DataConfig
-from ufmstar_torch.train.samples import RawSample, SampleDataset, SampleError, SampleKey, make_sample
-from ufmstar_torch.train.tour_data import tour_frames
+from ufmstar_torch.models import Preprocess
+from ufmstar_torch.train import (
+    Augmentation,
+    AugmentationConfig,
+    DataConfig,
+    DepthDataModule,
+    EpochBatches,
+    SampleDataset,
+    SampleError,
+    tour_frames,
+)
+from ufmstar_torch.train.samples import RawSample, SampleKey, make_sample
 
 
 def test_a_sample_is_what_the_network_and_the_losses_take():

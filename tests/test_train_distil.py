@@ -18,22 +18,26 @@ from trainings import SPEC, tiny_job, write_frames
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.models import GaussianDepth
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.models.distribution import GaussianDepth
 from ufmstar_torch.models.trained import load_for_training
+from ufmstar_torch.train import (
+    PRESETS,
+    DataConfig,
+    DepthDataModule,
+    EpochBatches,
+    Job,
+    NyuFrames,
+    Recipe,
+    SequenceFrames,
+    TrainingModule,
+    preset,
+)
 from ufmstar_torch.train import data as training_data_module
-from ufmstar_torch.train.batches import EpochBatches
-from ufmstar_torch.train.data import DepthDataModule
-from ufmstar_torch.train.data_config import DataConfig
 from ufmstar_torch.train.distil import Teacher, distillation_sums
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.member import WEIGHTS, make_data, new_network, train_member
-from ufmstar_torch.train.module import TrainingModule
-from ufmstar_torch.train.nyu import NyuFrames
-from ufmstar_torch.train.presets import PRESETS, Recipe, preset
 from ufmstar_torch.train.samples import clips
-from ufmstar_torch.train.sequence_data import SequenceFrames
-from ufmstar_torch.train.settings import Job
 
 CLIP, SIZE, FRAMES = 4, (48, 64), 16
 # [m] The depth that a full green channel stands for.

@@ -21,12 +21,12 @@ from trainings import RECIPE, tiny_job, with_network, write_frames
 
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
+from ufmstar_torch.train import FitSettings
 from ufmstar_torch.train.ensemble import share_of_time
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.history import METRICS, STEPS, read_rows
 from ufmstar_torch.train.launch import prepared_by_first
 from ufmstar_torch.train.member import WEIGHTS, make_data
-from ufmstar_torch.train.settings import FitSettings
 
 # Without batch norm, whose statistics are those of each process's own part of the batch.
 PLAIN = replace(with_network(RECIPE, norm=False), epochs=1, learning_rate=0.002, clip=0.0)

@@ -9,9 +9,9 @@ import torch
 from scipy.io import savemat
 from training_data import PLAIN, nyu_frame, truncated, write_h5, write_nyu
 
-from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.train.nyu import INTRINSICS, NyuFrames, convert_labelled
-from ufmstar_torch.train.samples import SampleDataset, SampleError
+from ufmstar_torch.models import Preprocess
+from ufmstar_torch.train import NyuFrames, SampleDataset, SampleError, convert_labelled
+from ufmstar_torch.train.nyu import INTRINSICS
 
 
 def test_nyu_frames_are_what_the_files_hold(tmp_path):

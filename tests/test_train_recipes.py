@@ -12,14 +12,13 @@ import pytest
 import torch
 from torch import nn
 
-from ufmstar_torch.models.spec import build_network
+from ufmstar_torch.models import build_network
 from ufmstar_torch.prediction import DepthPrediction
-from ufmstar_torch.train.data_config import DataConfig
+from ufmstar_torch.train import PRESETS, DataConfig, FitSettings, Job, Recipe, preset
 from ufmstar_torch.train.member import new_network
 from ufmstar_torch.train.module import move_average, share_of_rate, step_seed
-from ufmstar_torch.train.presets import OURS, PRESETS, Recipe, preset, table
+from ufmstar_torch.train.presets import OURS, table
 from ufmstar_torch.train.progress import Sums, Validation
-from ufmstar_torch.train.settings import FitSettings, Job
 
 
 def test_every_method_of_the_paper_is_a_preset_of_both_architectures():

@@ -17,7 +17,8 @@ from trainings import RECIPE, tiny_job, with_network, write_frames
 
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.models.checkpoints import read_safetensors
-from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, ResumeError, read_checkpoint
+from ufmstar_torch.train import ResumeError
+from ufmstar_torch.train.checkpoints import NAME, AtomicCheckpointIO, read_checkpoint
 from ufmstar_torch.train.fit import fit
 from ufmstar_torch.train.history import METRICS, STEPS, read_rows
 from ufmstar_torch.train.member import RESULT, WEIGHTS
@@ -108,7 +109,7 @@ def test_killed_in_the_middle_of_an_epoch_it_goes_on_bit_for_bit(frames, uninter
     assert_same_result(tmp_path / "out", uninterrupted)
 
 
-@pytest.mark.parametrize("steps", [2, 3])
+@pytest.mark.parametrize("steps", [4, pytest.param(3, marks=pytest.mark.slow)])
 def test_stopped_again_and_again_it_goes_on_bit_for_bit(frames, uninterrupted, tmp_path, steps):
     sessions = 0
     while True:

@@ -16,10 +16,10 @@ from training_data import PLAIN, TINY, truncated
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.generic import open_unposed
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, TourSettings, tour_frames
 from ufmstar_torch.train.data_config import Part
-from ufmstar_torch.train.samples import SampleDataset, SampleError
-from ufmstar_torch.train.sequence_data import SequenceFrames, open_rgbd
-from ufmstar_torch.train.tour_data import TourFrames, TourSettings, tour_files, tour_frames
+from ufmstar_torch.train.sequence_data import open_rgbd
+from ufmstar_torch.train.tour_data import TourFrames, tour_files
 
 
 @pytest.mark.parametrize(

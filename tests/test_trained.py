@@ -19,11 +19,21 @@ from torch import nn
 
 from ufmstar_torch import UncertainDepth, cli
 from ufmstar_torch.eval.results.writers import read_frame
-from ufmstar_torch.models import NetworkSpec, build_network, load_network, load_trained, read_info, save_trained
-from ufmstar_torch.models.batch_ensemble import BatchEnsemble, BatchEnsembleMember
-from ufmstar_torch.models.checkpoints import CheckpointError
-from ufmstar_torch.models.dropout import MonteCarloDropout, set_sampling
-from ufmstar_torch.models.ensemble import Ensemble, LazyMember
+from ufmstar_torch.models import (
+    BatchEnsemble,
+    CheckpointError,
+    Ensemble,
+    LazyMember,
+    MonteCarloDropout,
+    NetworkSpec,
+    build_network,
+    load_network,
+    load_trained,
+    read_info,
+    save_trained,
+    set_sampling,
+)
+from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.trained import load_for_training
 from ufmstar_torch.pipeline import combine

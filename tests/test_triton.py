@@ -307,7 +307,7 @@ def test_whole_step(streams, settings):
         close(getattr(ufm.mixture, name)[:, :n], value[:, :n], 1e-5, 1e-7)
 
 
-def test_thirty_frames_agree_with_the_oracle(kernels):
+def test_a_walk_agrees_with_the_oracle(kernels):
     """All kernels over the oracle's sequence; in the interpreter the CPU's segmentation, whose labels are the same."""
     from functools import partial
 

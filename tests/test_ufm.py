@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from modules import same, snapshot, unchanged
 
 import scenes
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
@@ -44,19 +45,6 @@ def usable(depth, s2):
 
 def expected(oracle, i, s2, pose=None):
     return oracle.step(DEPTHS[i], s2, usable(DEPTHS[i], s2), POSES[i] if pose is None else pose, K_)
-
-
-def same(a, b):
-    return torch.equal(a.nan_to_num(-1.0), b.nan_to_num(-1.0)) and torch.equal(a.isnan(), b.isnan())
-
-
-def snapshot(ufm):
-    return {name: value.clone() for name, value in ufm.state_dict().items()}
-
-
-def unchanged(ufm, before):
-    now = ufm.state_dict()
-    return now.keys() == before.keys() and all(same(v.double(), before[k].double()) for k, v in now.items())
 
 
 def agree(ufm, b, oracle, tolerance=1e-9):

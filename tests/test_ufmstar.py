@@ -32,7 +32,7 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
     assert max(per_k) > 1, "many must match one"
     assert min(per_c) == 0
     assert sizes[-1] > sizes[0] + 5, "new places must be seen"
-    assert max(g["count"] for g in mixture) > 10, "places must be revisited"
+    assert max(g["count"] for g in mixture) > 8, "places must be revisited"
     # The occlusion filter must have had work to do: without it, other matches follow.
     judge = oracle.Oracle(oracle_settings(SPGF), eta_occl=1.0)
     hidden = 0
@@ -51,9 +51,8 @@ def test_the_rendered_sequence_has_what_it_is_meant_to_test(truth):
     assert hidden > 0
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("streams", [1, 4])
-def test_thirty_frames_agree_with_the_oracle(truth, backend, streams):
+@pytest.mark.parametrize(("backend", "streams"), [("torch", 2), ("numba", 1), ("numba", 4)])
+def test_a_walk_agrees_with_the_oracle(truth, backend, streams):
     depths, poses, K, aleatoric, maps, matches, mixture, sizes = truth
     config = UfMStarConfig(segment=SPGF, backend=backend, features=2, initial_capacity=8)
     ufm = UfMStar(config, dtype=torch.float64)
@@ -81,8 +80,7 @@ def test_thirty_frames_agree_with_the_oracle(truth, backend, streams):
 
 
 VARIANTS = {
-    "plain": {"initial_capacity": 2},
-    "overlap": {"disagreement": "overlap", "overlap_weighted": True},
+    "overlap": {"disagreement": "overlap", "overlap_weighted": True, "initial_capacity": 2},
     "neighbourhood": {"regression": "neighbourhood", "features": 1},
     "anchored": {"anchored": True, "features": 1},
 }
@@ -91,11 +89,11 @@ VARIANTS = {
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_streams_together_equal_streams_alone_to_the_last_bit(backend, variant):
-    """Four streams in one batch give what each gives alone, however many slots the others need."""
+    """Three streams in one batch give what each gives alone, however many slots the others need."""
     config = UfMStarConfig(segment=SPGF, backend=backend, **VARIANTS[variant])
-    frames = list(walks(4))
-    together, all_four = walk(config, frames)
-    for s in range(4):
+    frames = list(walks(3, 5))
+    together, all_three = walk(config, frames)
+    for s in range(3):
         alone, single = walk(config, frames, slice(s, s + 1))
         for a, b in zip(together, alone, strict=True):
             for name in ("variance", "disagreement", "labels", "bias", "features"):
@@ -104,7 +102,7 @@ def test_streams_together_equal_streams_alone_to_the_last_bit(backend, variant):
             assert a.statistics.components[s] == b.statistics.components[0]
         k = int(single.mixture.components)
         for name, value in single.mixture.tensors().items():
-            assert same_bits(all_four.mixture.tensors()[name][s, :k], value[0, :k]), name
+            assert same_bits(all_three.mixture.tensors()[name][s, :k], value[0, :k]), name
 
 
 def same_bits(a, b):

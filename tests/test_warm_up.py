@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from numba.core import event
@@ -103,6 +104,7 @@ def test_one_core_a_frozen_program_or_a_full_system_compile_in_one_process(start
         (compile_beside.os, "sched_getaffinity", lambda _: {0}),
         (compile_beside.sys, "frozen", True),
         (compile_beside.sys, "executable", ""),
+        (compile_beside.sys, "executable", "/opt/robot/bin/robot"),
         (compile_beside.subprocess, "Popen", refused),
     ):
         with monkeypatch.context() as patch, compiling_beside([JOB]) as compiler:
@@ -110,6 +112,17 @@ def test_one_core_a_frozen_program_or_a_full_system_compile_in_one_process(start
             compiler.on_start(begin(exact))
             compiler.wait()
     assert not started
+
+
+def test_jobs_end_with_the_process_that_started_them(monkeypatch):
+    parents = iter([7, 7, 1])  # the parent is gone before the second job
+    monkeypatch.setattr(compile_beside.os, "getppid", lambda: next(parents))
+    done = []
+    monkeypatch.setattr(
+        compile_beside.importlib, "import_module", lambda name: SimpleNamespace(job=lambda: done.append(name))
+    )
+    compile_beside.main(json.dumps([("first", "job", {}), ("second", "job", {})]))
+    assert done == ["first"]
 
 
 def test_the_jobs_of_a_command_compile_all_in_one_pass():

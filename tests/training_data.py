@@ -6,11 +6,17 @@ import h5py
 import numpy as np
 import torch
 
-from ufmstar_torch.models.preprocess import Preprocess
-from ufmstar_torch.train.augment import Augmentation, AugmentationConfig
-from ufmstar_torch.train.batches import EpochBatches, EpochLoader
-from ufmstar_torch.train.samples import RawSample, SampleDataset, SampleError
-from ufmstar_torch.train.tour_data import TourSettings
+from ufmstar_torch.models import Preprocess
+from ufmstar_torch.train import (
+    Augmentation,
+    AugmentationConfig,
+    EpochBatches,
+    EpochLoader,
+    SampleDataset,
+    SampleError,
+    TourSettings,
+)
+from ufmstar_torch.train.samples import RawSample
 
 SMALL = (48, 64)  # NYU's aspect ratio
 PLAIN = Preprocess()

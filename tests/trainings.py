@@ -7,11 +7,8 @@ from dataclasses import replace
 import numpy as np
 from layouts import write_depth_png, write_image
 
-from ufmstar_torch.models.spec import NetworkSpec
-from ufmstar_torch.train.augment import AugmentationConfig
-from ufmstar_torch.train.data_config import DataConfig
-from ufmstar_torch.train.presets import Recipe
-from ufmstar_torch.train.settings import FitSettings, Job
+from ufmstar_torch.models import NetworkSpec
+from ufmstar_torch.train import AugmentationConfig, DataConfig, FitSettings, Job, Recipe
 
 SIZE = (32, 32)
 SPEC = NetworkSpec(widths=0.05, positive="softplus", size=SIZE, preprocess="resize")

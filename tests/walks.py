@@ -36,8 +36,8 @@ def oracle_settings(config: SPGFConfig) -> oracle.Segmentation:
 
 
 def oracle_run():
-    """The oracle's run over 30 rendered frames: inputs, maps, mixtures, matches."""
-    depths, poses, K = scenes.sequence(30, HEIGHT, WIDTH, 0.04)
+    """The oracle's run over 20 rendered frames: inputs, maps, mixtures, matches."""
+    depths, poses, K = scenes.sequence(20, HEIGHT, WIDTH, 0.04)
     rng = np.random.default_rng(1)
     aleatoric = [0.01 + 0.02 * rng.random(d.shape) for d in depths]
     judge = oracle.Oracle(oracle_settings(SPGF))

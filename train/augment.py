@@ -56,29 +56,17 @@ class AugmentationConfig(Checked):
 
 @dataclass(frozen=True)
 class Change:
-    """One draw.
+    """One draw."""
 
-    Attributes:
-        scale: zoom factor s.
-        angle: [rad] by which the camera is rolled.
-        flip: mirrored or not.
-        shift: [px] (right, down) of the zoomed content.
-        colour: (kind, factor) in the order of application; kinds as in the config.
-    """
-
-    scale: float = 1.0
-    angle: float = 0.0
-    flip: bool = False
-    shift: tuple[float, float] = (0.0, 0.0)
-    colour: tuple[tuple[str, float], ...] = ()
+    scale: float = 1.0  # zoom factor s
+    angle: float = 0.0  # [rad] by which the camera is rolled
+    flip: bool = False  # mirrored or not
+    shift: tuple[float, float] = (0.0, 0.0)  # [px] (right, down) of the zoomed content
+    colour: tuple[tuple[str, float], ...] = ()  # (kind, factor) in the order of application; kinds as in the config
 
 
 class Augmentation:
-    """A random change of a frame that depends on nothing but the numbers of its seed.
-
-    Args:
-        config: what is drawn.
-    """
+    """A random change of a frame, drawn as ``config`` has it, that depends on nothing but the numbers of its seed."""
 
     def __init__(self, config: AugmentationConfig | None = None) -> None:
         self.config = config or AugmentationConfig()
@@ -86,17 +74,9 @@ class Augmentation:
     def __call__(
         self, image: Tensor, depth: Tensor, intrinsics: Tensor, seed: tuple[int, ...]
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """A changed copy at the same size.
-
-        Args:
-            image: [3, H, W] floating-point in [0, 1].
-            depth: [H, W] [m], 0 = none.
-            intrinsics: [3, 3] float64 [px].
-            seed: whole numbers >= 0, such as (seed, epoch, index).
-
-        Returns:
-            The same three; depth is 0 where the frame shows nothing.
-        """
+        """A changed copy, at the same size, of image [3, H, W] floating-point in [0, 1], depth [H, W] [m], 0 = none,
+        and intrinsics [3, 3] float64 [px]; depth is 0 where the frame shows nothing. ``seed``: whole numbers >= 0, such
+        as (seed, epoch, index)."""
         height, width = depth.shape
         change = draw(self.config, seed, height, width)
         new_image, new_depth, K = apply_geometry(image, depth, intrinsics, change, self.config.zoom)
@@ -122,16 +102,8 @@ def camera_change(intrinsics: Tensor, change: Change, height: int, width: int, z
     With K = (L, c), L its upper left 2x2 part, c the principal point, a point at x = (X/Z, Y/Z) is seen at
     p = L x + c. The new camera is rolled by R and mirrored by F, so A = s F L R L^-1. The image's centre m stays
     where it is but for the shift t, hence c' = A (c - m) + m + t. And L' = F L F, times s where the zoom is
-    focal; else the points have come nearer: (F R (X, Y), Z / s) projects by K' to p'.
-
-    Args:
-        intrinsics: [3, 3] float64 [px].
-        change: the draw.
-        height, width: [px] of the image.
-        zoom: "depth" or "focal".
-
-    Returns:
-        [2, 3] (A, b) and [3, 3] K', float64.
+    focal; else the points have come nearer: (F R (X, Y), Z / s) projects by K' to p'. Returns [2, 3] (A, b) and
+    [3, 3] K', float64, for ``intrinsics`` [3, 3] float64 of an image of height x width [px].
     """
     L, c = intrinsics[:2, :2], intrinsics[:2, 2]
     m = intrinsics.new_tensor([(width - 1) / 2, (height - 1) / 2])

@@ -59,11 +59,8 @@ class EpochBatches(Sampler[list[SampleKey]]):
         self.epoch = self.start_batch = 0
 
     def set_epoch(self, epoch: int, start_batch: int = 0) -> None:
-        """What the iterations from now on go over: the batches of ``epoch`` from ``start_batch`` on.
-
-        Raises:
-            ValueError: a number out of range.
-        """
+        """What the iterations from now on go over: the batches of ``epoch`` from ``start_batch`` on. Raises ValueError:
+        a number out of range."""
         if epoch < 0 or not 0 <= start_batch <= len(self):
             raise ValueError(f"epoch must be >= 0 and start_batch in [0, {len(self)}], got {epoch} and {start_batch}")
         self.epoch, self.start_batch = epoch, start_batch
@@ -75,14 +72,11 @@ class EpochBatches(Sampler[list[SampleKey]]):
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
         epoch, order = self.epoch, self._order()
+        counts = self.shuffle or self.rank < self.length  # whether this process has frames of its own
         for batch in range(self.start_batch, len(self)):
             chosen = self._batch(order, batch).tolist()
             frames = chosen if self.clips is None else [frame for clip in chosen for frame in self.clips[clip]]
-            yield [SampleKey(epoch, frame, self._counts()) for frame in frames]
-
-    def _counts(self) -> bool:
-        """Whether this process has frames of its own."""
-        return self.shuffle or self.rank < self.length
+            yield [SampleKey(epoch, frame, counts) for frame in frames]
 
     def _order(self) -> np.ndarray:
         if not self.shuffle:

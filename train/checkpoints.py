@@ -28,7 +28,7 @@ from ufmstar_torch.eval.results.files import write_atomic
 NAME = "last.ckpt"
 # Under this key, the sampler's position: {"epoch", "batch"} that come next.
 POSITION = "ufmstar_next"
-TIME, STEPS, SIGNAL = "time budget spent", "step budget spent", "stopped"
+TIME, SIGNAL = "time budget spent", "stopped"
 
 
 class ResumeError(ValueError):
@@ -42,11 +42,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Replace ``path`` durably.
-
-        Raises:
-            OSError: for example a full disk; the checkpoint before it is kept.
-        """
+        """Replace ``path`` durably. Raises OSError: for example a full disk; the checkpoint before it is kept."""
         target = Path(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_atomic(target, lambda file: torch.save(checkpoint, file), durable=True)
@@ -111,24 +107,21 @@ class Stops(pl.Callback):
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, *_: Any) -> None:
         """All processes stop after the same step."""
-        late = self.deadline is not None and time.monotonic() >= self.deadline
-        asked = self.asked is not None and self.asked()
-        reason = SIGNAL if asked else TIME if late else None
+        code = int(self.deadline is not None and time.monotonic() >= self.deadline)
+        code = 2 if self.asked is not None and self.asked() else code
         if trainer.world_size > 1:
-            code = torch.tensor(0 if reason is None else 2 if asked else 1, device=module.device)
-            torch.distributed.all_reduce(code, torch.distributed.ReduceOp.MAX)
-            reason = (None, TIME, SIGNAL)[int(code)]
+            highest = torch.tensor(code, device=module.device)
+            torch.distributed.all_reduce(highest, torch.distributed.ReduceOp.MAX)
+            code = int(highest)
+        reason = (None, TIME, SIGNAL)[code]
         self.reason = self.reason if reason is None else reason
         if reason is not None or trainer.global_step >= self.total:
             trainer.should_stop = True
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint that :class:`Checkpoints` wrote.
-
-    Raises:
-        ResumeError: the file cannot be read, or is another program's.
-    """
+    """A checkpoint that :class:`Checkpoints` wrote. Raises ResumeError: the file cannot be read, or is another
+    program's."""
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, EOFError, RuntimeError, KeyError, UnpicklingError, zipfile.BadZipFile, ValueError) as error:

@@ -90,11 +90,7 @@ class TrainOptions:
     session: SessionOptions = field(default_factory=SessionOptions)
 
     def recipe(self) -> Recipe:
-        """The preset with the values that the options change.
-
-        Raises:
-            ValueError: no preset, or an impossible value.
-        """
+        """The preset with the values that the options change. Raises ValueError: no preset, or an impossible value."""
         if self.preset is None:
             raise ValueError("--preset is missing; ufmstar train --help")
         recipe = preset(self.preset)
@@ -103,11 +99,8 @@ class TrainOptions:
         return recipe if self.members is None else recipe.with_members(self.members)
 
     def job(self) -> Job:
-        """The training that the options mean.
-
-        Raises:
-            ValueError: an option is missing, options contradict each other, or a value is impossible.
-        """
+        """The training that the options mean. Raises ValueError: an option is missing, options contradict each other,
+        or a value is impossible."""
         recipe, d, s = self.recipe(), self.source, self.session
         if d.data is None or self.out is None:
             raise ValueError(f"--{'data' if d.data is None else 'out'} is missing; ufmstar train --help")

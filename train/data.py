@@ -52,12 +52,8 @@ class DepthDataModule(LightningDataModule):
             sources(self.config)
 
     def setup(self, stage: str | None = None) -> None:
-        """Opens both parts; every process does.
-
-        Raises:
-            OSError: a path does not exist, or cannot be written for rendered tours.
-            ValueError: a path holds nothing of the kind asked for, or the two parts overlap.
-        """
+        """Opens both parts; every process does. Raises OSError: a path does not exist, or cannot be written for
+        rendered tours; ValueError: a path holds nothing of the kind asked for, or the two parts overlap."""
         if self.train_set is not None:
             return
         c = self.config
@@ -96,38 +92,28 @@ class DepthDataModule(LightningDataModule):
 
 
 def sources(config: DataConfig) -> tuple[FrameSource, FrameSource]:
-    """The frames to train on and those to validate on.
-
-    Raises:
-        OSError, ValueError: see :meth:`DepthDataModule.setup`.
-    """
+    """The frames to train on, and those to validate on. Raises OSError, ValueError: as ``DepthDataModule.setup``."""
     c = config
     if c.kind == "nyu":
         return NyuFrames(c.paths[0], "train"), NyuFrames(c.paths[0], "val")
     if c.kind == "tour":
         settings = TourSettings(c.tour_frames, c.tour_stride, c.tour_size, c.tour_style, c.tour_fov)
         seeds = range(c.first_tour, c.first_tour + c.tours + c.validation_tours)
-        stored = tour_frames(seeds, settings, c.cache or None, workers=c.render_workers)
-        train, validation = (
-            TourFrames(stored.folder, some, c.tour_frames) for some in (seeds[: c.tours], seeds[c.tours :])
-        )
-        return train, validation
+        folder = tour_frames(seeds, settings, c.cache or None, workers=c.render_workers).folder
+        parts = seeds[: c.tours], seeds[c.tours :]
+        return TourFrames(folder, parts[0], c.tour_frames), TourFrames(folder, parts[1], c.tour_frames)
     return _sequences(c)
 
 
 def _sequences(c: DataConfig) -> tuple[SequenceFrames, SequenceFrames]:
     opened = [open_rgbd(path) for path in c.paths]
     part, held_back = Part.parse(c.part), Part.parse(c.validation_part)
-    same = {_resolved(path) for path in c.paths} & {_resolved(path) for path in c.validation_paths or c.paths}
+    validated = {Path(path).resolve() for path in c.validation_paths or c.paths}
     for sequence, path in zip(opened, c.paths, strict=True):
         both = set(part.frames(len(sequence))) & set(held_back.frames(len(sequence)))
-        if both and _resolved(path) in same:
+        if both and Path(path).resolve() in validated:
             raise ValueError(
                 f"DataConfig.part {part} and validation_part {held_back} share {len(both)} frames of {sequence.name}"
             )
     others = [open_rgbd(path) for path in c.validation_paths] or opened
     return SequenceFrames(opened, part), SequenceFrames(others, held_back)
-
-
-def _resolved(path: str) -> str:
-    return str(Path(path).resolve())

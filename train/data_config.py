@@ -19,23 +19,17 @@ class Part:
     Neighbouring frames of a video show the same thing, so held-back frames must not be close in time to training
     frames. A sequence is therefore divided into contiguous parts, best with a gap between them (``0:70%`` and
     ``75%:``), never at random.
-
-    Attributes:
-        start, stop: a number of frames, or a percentage of them where ``start_share`` / ``stop_share``.
     """
 
-    start: float
+    start: float  # a number of frames, or a percentage of them where ``start_share`` / ``stop_share``
     stop: float
     start_share: bool
     stop_share: bool
 
     @classmethod
     def parse(cls, text: str) -> Part:
-        """``START:STOP``, each a frame number or a percentage of the frames; left out: the first, the end.
-
-        Raises:
-            ValueError: anything else, a share above 100 %, or an empty part.
-        """
+        """``START:STOP``, each a frame number or a percentage of the frames; left out: the first, the end. Raises
+        ValueError: anything else, a share above 100 %, or an empty part."""
         start, colon, stop = text.partition(":")
         result = _PART.fullmatch(f"{start.strip() or '0'}:{stop.strip() or '100%'}") if colon else None
         if result is None or _impossible(result[1], result[2]) or _impossible(result[3], result[4]):
@@ -46,11 +40,7 @@ class Part:
         return part
 
     def frames(self, length: int) -> range:
-        """The frame numbers of a sequence of that length.
-
-        Raises:
-            ValueError: the part has no frame.
-        """
+        """The frame numbers of a sequence of that length. Raises ValueError: the part has no frame."""
         edges = [(self.start, self.start_share), (self.stop, self.stop_share)]
         # Rounded to 1e-6 first: 70 % of 10 is 7, and not the integer part of 0.7 * 10.
         numbers = [int(round(value * length / 100, 6)) if share else int(value) for value, share in edges]
@@ -124,12 +114,10 @@ class DataConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        least, most, expected = {
-            "nyu": (1, 1, "one folder"),
-            "sequences": (1, None, "at least one sequence"),
-            "tour": (0, 0, "nothing"),
-        }[self.kind]
-        if len(self.paths) < least or (most is not None and len(self.paths) > most):
+        count = len(self.paths)
+        fits = {"nyu": count == 1, "sequences": count > 0, "tour": count == 0}[self.kind]
+        if not fits:
+            expected = {"nyu": "one folder", "sequences": "at least one sequence", "tour": "nothing"}[self.kind]
             raise ValueError(f"DataConfig.paths must name {expected} where kind is {self.kind!r}, got {self.paths}")
         if self.validation_paths and self.kind != "sequences":
             raise ValueError(f"DataConfig.validation_paths is for kind 'sequences', got kind {self.kind!r}")

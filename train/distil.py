@@ -25,12 +25,8 @@ _LEAST = 1e-6
 
 
 class Teacher:
-    """UfM* on the clips of a batch; each step begins without a memory.
-
-    Args:
-        clip: frames of a clip.
-        max_depth: [m] the largest depth that the network can predict; None = not known.
-    """
+    """UfM* on the clips of ``clip`` frames of a batch; each step begins without a memory. ``max_depth`` [m]: the
+    largest depth that the network can predict; None = not known."""
 
     def __init__(self, clip: int, max_depth: float | None = None) -> None:
         self._clip = clip

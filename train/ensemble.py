@@ -25,17 +25,9 @@ def read_result(job: Job, member: int) -> dict[str, Any]:
 
 
 def train_members(job: Job, *, end: float | None = None, asked: Callable[[], bool] | None = None) -> str | None:
-    """Train the members that are not finished.
-
-    Args:
-        job: what and how; ``settings.member_processes`` of them at the same time.
-        end: ``time.monotonic()`` at which all training stops, or None. The remaining time is divided evenly among
-            the members.
-        asked: returns whether to stop.
-
-    Returns:
-        None when all are finished, otherwise why not.
-    """
+    """Train the members that are not finished, ``settings.member_processes`` of them at the same time, up to ``end``,
+    in ``time.monotonic()``'s seconds, or until ``asked`` returns True. The remaining time is divided evenly among the
+    members. Returns None when all are finished, otherwise why not."""
     members = [member for member in range(job.recipe.members) if not read_result(job, member).get("finished")]
     if job.settings.member_processes > 1 and len(members) > 1:
         return _side_by_side(job, members, end, asked)

@@ -56,18 +56,11 @@ class Examples(pl.Callback):
 def draw_examples(
     path: Path, network: torch.nn.Module, preprocess: Preprocess, samples: list[tuple[str, Sample]], title: str
 ) -> None:
-    """Write a sheet of a network's predictions for some samples.
-
-    Args:
-        path: of the PNG.
-        network: a ``DepthNetwork`` in eval mode.
-        preprocess: the network's, to show the image as it was.
-        samples: names and samples.
-        title: of the sheet.
-    """
+    """Write a sheet (PNG) of the predictions of a network in eval mode for some samples, given with their names;
+    ``preprocess`` is the network's, to show the image as it was."""
     panels = [_panel(network, preprocess, name, sample) for name, sample in samples]
     columns = map_columns(panels)
-    if not any(panel.sigma.any() for panel in panels):
+    if not any(panel.maps["sigma"].any() for panel in panels):
         columns = [column for column in columns if column.field != "sigma"]
     contact_sheet(panels, path, title=title, columns=columns)
 
@@ -76,13 +69,12 @@ def _panel(network: torch.nn.Module | DepthNetwork, preprocess: Preprocess, name
     device = next(network.parameters()).device
     prediction = network(sample["image"][None].to(device))
     depth = prediction.depth[0].float().cpu().numpy()
-    variance = np.zeros_like(depth)
-    for part in (prediction.aleatoric_variance, prediction.epistemic_variance):
-        variance = variance if part is None else variance + part[0].float().cpu().numpy()
+    variance = np.zeros_like(depth) if prediction.variance is None else prediction.variance[0].float().cpu().numpy()
     truth, valid = sample["depth"].numpy(), sample["valid"].numpy()
     error = np.where(valid, np.abs(depth - truth), np.nan).astype(np.float32)
     image = camera_image(sample["image"], preprocess)
-    return FramePanel(Path(name).name[-24:], image, depth, np.sqrt(variance), error)
+    maps = {"depth": depth, "sigma": np.sqrt(variance), "error": error}
+    return FramePanel(Path(name).name[-24:], image, maps)
 
 
 def camera_image(image: Tensor, preprocess: Preprocess) -> np.ndarray:

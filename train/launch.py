@@ -29,18 +29,10 @@ _READY = "ready"
 def prepared_by_first(
     prepare: AbstractContextManager[None], trainer: pl.Trainer, out: Path, *, wait: float = WAIT_SECONDS
 ) -> Iterator[None]:
-    """Within this, the first process is within ``prepare``, and the others are after its beginning.
-
-    Args:
-        prepare: entered by the first process alone.
-        trainer: of this process; its rank, the number of processes and their address are used.
-        out: the folder that is prepared, for messages.
-        wait: longest time [s] that the others wait.
-
-    Raises:
-        FolderError: the first process could not prepare the folder, or the others have waited in vain.
-        OSError: from ``prepare``.
-    """
+    """Within this, the first process is within ``prepare``, which it alone enters, and the others are after its
+    beginning, for which they wait at most ``wait`` [s]. ``trainer`` has this process's rank, the number of processes
+    and their address; messages name the folder ``out``. Raises FolderError: the first process could not prepare the
+    folder, or the others have waited in vain; OSError: from ``prepare``."""
     first = trainer.is_global_zero
     # The first process holds the store up to the end: it serves the others.
     try:

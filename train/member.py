@@ -12,6 +12,7 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import TQDMProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
 
 from ufmstar_torch.eval.results.files import write_json_atomic
 from ufmstar_torch.models.network import DepthNetwork
@@ -40,21 +41,10 @@ def new_network(job: Job, member: int) -> DepthNetwork:
 def train_member(
     job: Job, member: int, *, deadline: float | None = None, asked: Callable[[], bool] | None = None
 ) -> str | None:
-    """Train one member, from its checkpoint if it has one.
-
-    Args:
-        job: what and how.
-        member: its number.
-        deadline: ``time.monotonic()`` at which to stop, or None.
-        asked: returns whether to stop.
-
-    Returns:
-        None when it is finished, otherwise why it was stopped; in both cases its weights are on disk.
-
-    Raises:
-        NonFiniteLossError: the training has diverged.
-        ResumeError: the checkpoint cannot be read.
-    """
+    """Train one member, from its checkpoint if it has one, up to ``deadline``, in ``time.monotonic()``'s seconds, or
+    until ``asked`` returns True. Returns None when it is finished, otherwise why it was stopped; in both cases its
+    weights are on disk. Raises NonFiniteLossError: the training has diverged; ResumeError: the checkpoint cannot be
+    read."""
     s, folder = job.settings, job.folder(member)
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / NAME
@@ -79,11 +69,8 @@ def train_member(
 
 
 def make_data(job: Job, member: int, world: int) -> DepthDataModule:
-    """The member's data, opened, for ``world`` processes.
-
-    Raises:
-        ValueError: the batch cannot be divided among the processes.
-    """
+    """The member's data, opened, for ``world`` processes. Raises ValueError: the batch cannot be divided among the
+    processes."""
     if job.recipe.batch_size % world:
         raise ValueError(f"batch_size {job.recipe.batch_size} must be a multiple of the {world} processes")
     config = replace(job.data, batch_size=job.recipe.batch_size // world, seed=job.seed(member))
@@ -93,11 +80,8 @@ def make_data(job: Job, member: int, world: int) -> DepthDataModule:
 
 
 def training_length(job: Job, data: DepthDataModule) -> tuple[int, int]:
-    """Optimizer steps of the whole training, and the number of epochs that they begin.
-
-    Raises:
-        ValueError: an epoch has no full batch.
-    """
+    """Optimizer steps of the whole training, and the number of epochs that they begin. Raises ValueError: an epoch has
+    no full batch."""
     images, batch = len(data.train_set or ()), job.recipe.batch_size
     if data.clips is not None:
         images = len(data.clips) * job.recipe.clip_frames
@@ -120,7 +104,9 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
         max_epochs=-1 if r.max_steps else r.epochs,
         max_steps=r.max_steps or -1,
         gradient_clip_val=r.clip or None,
-        logger=_tensorboard(job, member) if s.tensorboard else False,
+        logger=TensorBoardLogger(str(s.out), name="tensorboard", version=f"member_{member}")
+        if s.tensorboard
+        else False,
         callbacks=[TQDMProgressBar(leave=True)] if s.progress else [],
         sync_batchnorm=s.sync_batchnorm,
         plugins=[AtomicCheckpointIO()],
@@ -132,12 +118,6 @@ def make_trainer(job: Job, member: int) -> pl.Trainer:
         use_distributed_sampler=False,
         default_root_dir=str(s.out),
     )
-
-
-def _tensorboard(job: Job, member: int) -> Any:
-    from lightning.pytorch.loggers import TensorBoardLogger
-
-    return TensorBoardLogger(str(job.settings.out), name="tensorboard", version=f"member_{member}")
 
 
 def _finish(job: Job, member: int, module: TrainingModule, history: History, step: int, reason: str | None) -> None:

@@ -93,11 +93,9 @@ class TrainingModule(pl.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The loss of the whole batch, however many processes it is divided among.
 
-        The value returned is this process's sum over the batch's number of pixels, times the number of processes:
-        its gradient, averaged over processes as DistributedDataParallel does, is that of the mean over all pixels.
-
-        Raises:
-            NonFiniteLossError: it is NaN or infinite.
+        The value returned is this process's sum over the batch's number of pixels, times the number of processes: its
+        gradient, averaged over processes as DistributedDataParallel does, is that of the mean over all pixels. Raises
+        NonFiniteLossError: it is NaN or infinite.
         """
         distribution = self._distribution(batch["image"])
         target, valid = _tiled(batch["depth"], distribution), _tiled(batch["valid"], distribution)

@@ -31,16 +31,8 @@ _VALIDATION_EVERY = 4
 
 
 class NyuFrames:
-    """The frames of one part of the dataset, in the order of scenes and numbers.
-
-    Args:
-        root: folder with ``train`` and ``val``.
-        part: "train" or "val".
-
-    Raises:
-        ValueError: another part.
-        FileNotFoundError: no such folder, or no h5 file in it.
-    """
+    """The frames of a part, "train" or "val", of the dataset in a folder, in the order of scenes and numbers. Raises
+    ValueError: another part; FileNotFoundError: no such folder, or no h5 file in it."""
 
     def __init__(self, root: str | Path, part: str) -> None:
         if part not in PARTS:
@@ -62,11 +54,8 @@ class NyuFrames:
         return []
 
     def load(self, index: int) -> RawSample:
-        """Reads a file; nothing stays open, so that worker processes share nothing.
-
-        Raises:
-            SampleError: it cannot be read, lacks ``rgb`` or ``depth``, or they have other types or shapes.
-        """
+        """Reads a file; nothing stays open, so that worker processes share nothing. Raises SampleError: it cannot be
+        read, lacks ``rgb`` or ``depth``, or they have other types or shapes."""
         path = self.files[index]
         try:
             rgb, depth = read_h5(path)

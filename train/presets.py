@@ -161,11 +161,7 @@ better from scratch. The presets demo and fastdepth-ufmstar, whose head learns U
 
 
 def preset(name: str) -> Recipe:
-    """A named recipe.
-
-    Raises:
-        ValueError: there is no such preset.
-    """
+    """A named recipe. Raises ValueError: there is no such preset."""
     if name not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}")
     return PRESETS[name]

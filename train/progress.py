@@ -38,11 +38,7 @@ class Sums:
 
 
 class Validation:
-    """The figures of one validation, over the valid pixels of all processes.
-
-    Args:
-        device: of the sums; NCCL exchanges sums on GPUs only.
-    """
+    """The figures of one validation, over the valid pixels of all processes; NCCL exchanges sums on GPUs only."""
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
         self._accuracy = [metric.to(device) for metric in (Delta1(), RMSE(), AbsRel())]
@@ -50,13 +46,7 @@ class Validation:
         self._has_variance = False
 
     def update(self, prediction: DepthPrediction, depth: Tensor, valid: Tensor) -> None:
-        """Add a batch.
-
-        Args:
-            prediction: maps [B, H, W].
-            depth: [B, H, W] truth [m].
-            valid: [B, H, W] bool, True = use.
-        """
+        """Add a batch: true depth [B, H, W] [m], ``valid`` [B, H, W] bool, True = use."""
         for metric in self._accuracy:
             metric.update(prediction.depth, None, depth, valid)
         if prediction.variance is not None:
@@ -65,11 +55,7 @@ class Validation:
 
     def figures(self, training: Sums) -> dict[str, float]:
         """The figures by their names in metrics.csv; the NLL only if the network predicts a variance, none without a
-        pixel. All processes must call it.
-
-        Args:
-            training: squared errors of the training part [m^2].
-        """
+        pixel. ``training``: squared errors of the training part [m^2]. All processes must call it."""
         accuracy = {name: value for metric in self._accuracy for name, value in metric.compute().items()}
         if not accuracy["pixels"]:
             return {}

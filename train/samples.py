@@ -60,19 +60,12 @@ class SampleKey(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RawSample:
-    """A frame with depth registered to its image, at the size it is stored in.
+    """A frame with depth registered to its image, at the size it is stored in."""
 
-    Attributes:
-        image: [3, H, W] uint8 RGB.
-        depth: [H, W] float32 [m]; 0 or not finite = none.
-        intrinsics: [3, 3] float64 [px].
-        T_world_cam: [4, 4] float64 camera-to-world [m]; None = not known.
-    """
-
-    image: Tensor
-    depth: Tensor
-    intrinsics: Tensor
-    T_world_cam: Tensor | None = None
+    image: Tensor  # [3, H, W] uint8 RGB
+    depth: Tensor  # [H, W] float32 [m]; 0 or not finite = none
+    intrinsics: Tensor  # [3, 3] float64 [px]
+    T_world_cam: Tensor | None = None  # [4, 4] float64 camera-to-world [m]; None = not known
 
 
 class FrameSource(Protocol):
@@ -134,16 +127,9 @@ class SampleDataset(Dataset[Sample]):
         return len(self.source)
 
     def __getitem__(self, key: int | SampleKey) -> Sample:
-        """The sample of a frame.
-
-        Args:
-            key: (epoch, frame) as :class:`~ufmstar_torch.train.batches.EpochBatches` yields it; a frame's number
-                alone is of epoch 0.
-
-        Raises:
-            IndexError: no such frame.
-            SampleError: a broken file with ``on_bad_file="raise"``, or none that can be read.
-        """
+        """The sample of a frame, (epoch, frame) as ``EpochBatches`` yields it; a frame's number alone is of epoch 0.
+        Raises IndexError: no such frame; SampleError: a broken file with ``on_bad_file="raise"``, or none that can be
+        read."""
         epoch, index, counts = SampleKey(*key) if isinstance(key, tuple) else SampleKey(0, key)
         if not 0 <= index < len(self):
             raise IndexError(f"index must lie in [0, {len(self)}), got {index}")
@@ -178,14 +164,7 @@ class SampleDataset(Dataset[Sample]):
 def make_sample(
     raw: RawSample, preprocess: Preprocess, augmentation: Augmentation | None, seed: tuple[int, ...]
 ) -> Sample:
-    """A stored frame as the network sees it: augmented, then preprocessed.
-
-    Args:
-        raw: the frame.
-        preprocess: the network's.
-        augmentation: or None.
-        seed: of the augmentation: the same numbers give the same sample.
-    """
+    """A stored frame as the network sees it: augmented, then preprocessed; ``seed`` is the augmentation's."""
     image = raw.image.to(torch.float32) / 255
     depth = torch.where(raw.depth.isfinite() & (raw.depth > 0), raw.depth, 0.0).to(torch.float32)
     K = raw.intrinsics.to(torch.float64)
@@ -198,11 +177,8 @@ def make_sample(
 
 
 def clips(source: FrameSource, length: int) -> list[range]:
-    """The frames of a source in clips that do not overlap; what is left at the end of a path is in none.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """The frames of a source in clips that do not overlap; what is left at the end of a path is in none. Raises
+    ValueError: there is none."""
     found = [run[i : i + length] for run in source.runs() for i in range(0, len(run) - length + 1, length)]
     if not found:
         raise ValueError(f"clip_frames: the training part has no {length} frames with known poses one after the other")

@@ -19,16 +19,11 @@ from ufmstar_torch.train.samples import RawSample, SampleError
 
 
 class SequenceFrames:
-    """The frames with depth of the same part of several sequences, one after the other.
+    """The frames with depth of the same part of several sequences, one after the other. The part is counted over all
+    usable frames of a sequence, also those without a depth map.
 
-    Depth maps with a camera of their own are seen at the image's pixels (``eval.ground_truth``).
-
-    Args:
-        sequences: as the readers return them.
-        part: of each sequence; counted over all its usable frames, also those without a depth map.
-
-    Raises:
-        ValueError: no sequence, or one whose part has no frame with depth.
+    Depth maps with a camera of their own are seen at the image's pixels (``eval.sequences.ground_truth``). Raises
+    ValueError: no sequence, or one whose part has no frame with depth.
     """
 
     def __init__(self, sequences: Sequence[FrameSequence], part: str | Part = "0:100%") -> None:
@@ -60,11 +55,7 @@ class SequenceFrames:
         return [range(of.index(number), of.index(number) + of.count(number)) for number in posed]
 
     def load(self, index: int) -> RawSample:
-        """Decodes a frame.
-
-        Raises:
-            SampleError: a file is missing, cannot be decoded, or has not the sequence's size.
-        """
+        """Decodes a frame. Raises SampleError: a file is missing, cannot be decoded, or has not the sequence's size."""
         number, i = self._frames[index]
         try:
             frame = self.sequences[number][i]
@@ -84,12 +75,8 @@ class SequenceFrames:
 
 
 def open_rgbd(source: str | Path) -> FrameSequence:
-    """A sequence as ``open_sequence`` detects it, or else a folder of images and depth maps without poses.
-
-    Raises:
-        FileNotFoundError: no such path.
-        ValueError: neither of them, with what was looked for.
-    """
+    """A sequence as ``open_sequence`` detects it, or else a folder of images and depth maps without poses. Raises
+    FileNotFoundError: no such path; ValueError: neither of them, with what was looked for."""
     path = Path(source)
     if has_images_and_depth(path):
         try:

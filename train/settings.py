@@ -68,17 +68,11 @@ class FitSettings(Checked):
 
 @dataclass(frozen=True)
 class Job:
-    """What is trained, on what data, and how it is run; plain values that pickle.
+    """What is trained, on what data, and how it is run; plain values that pickle."""
 
-    Attributes:
-        recipe: decides the weights.
-        data: where samples come from; its batch size and seed are replaced by the recipe's and the member's.
-        settings: of this session.
-    """
-
-    recipe: Recipe
-    data: DataConfig
-    settings: FitSettings
+    recipe: Recipe  # decides the weights
+    data: DataConfig  # where samples come from; its batch size and seed are replaced by the recipe's and the member's
+    settings: FitSettings  # of this session
 
     def folder(self, member: int) -> Path:
         """The folder of one member's files."""

@@ -56,14 +56,8 @@ def missing_start(spec: NetworkSpec, init: Path | None) -> str | None:
 
 
 def train_only(network: nn.Module, prefixes: Sequence[str]) -> int:
-    """Leave only the parameters whose names begin with one of ``prefixes`` to be trained, in place.
-
-    Returns:
-        The number of trained weights.
-
-    Raises:
-        ValueError: a prefix fits no parameter; the message names the network's parts.
-    """
+    """Leave only the parameters whose names begin with one of ``prefixes`` to be trained, in place; the number of
+    trained weights. Raises ValueError: a prefix fits no parameter; the message names the network's parts."""
     names = [name for name, _ in network.named_parameters()]
     for prefix in prefixes:
         if not any(name.startswith(prefix) for name in names):

@@ -77,13 +77,7 @@ class TourSettings(Checked):
 
 
 class TourFrames:
-    """The stored frames of some tours. Build one with :func:`tour_frames`.
-
-    Args:
-        folder: with the tours' files.
-        seeds: of the tours.
-        frames: of each tour.
-    """
+    """The stored frames of some tours, ``frames`` of each. Build one with :func:`tour_frames`."""
 
     def __init__(self, folder: Path, seeds: Iterable[int], frames: int) -> None:
         self.folder, self.seeds, self.frames = folder, tuple(seeds), frames
@@ -105,11 +99,7 @@ class TourFrames:
         return [range(n, n + self.frames) for n in range(0, len(self), self.frames)]
 
     def load(self, index: int) -> RawSample:
-        """Reads a frame.
-
-        Raises:
-            SampleError: the tour's files are missing or truncated.
-        """
+        """Reads a frame. Raises SampleError: the tour's files are missing or truncated."""
         seed, frame = self.seeds[index // self.frames], index % self.frames
         try:
             image, depth, pose, camera = self._mapped(seed)

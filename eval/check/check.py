@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ufmstar_torch.eval.check.depth_image_fit import DepthImageFit, depth_image_fit
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
 _SCALES = 10.0 ** np.arange(-4, 4.01, 0.125)
 _POINTS = 2000
@@ -33,29 +33,18 @@ _MIN_EDGES, _MIN_CONTRAST = 500, 0.03  # contrast observed: .04 to .25
 
 @dataclass(frozen=True)
 class SequenceCheck:
-    """Outcome of :func:`check_sequence`.
+    """Outcome of :func:`check_sequence`."""
 
-    Attributes:
-        pairs, gap: pairs of frames compared, and how many frames apart.
-        error: median relative error of warped depth, as the sequence is given; inf without overlap.
-        poses, scale, best_error: the reading of the poses that fits best, by the name that ``open_sequence`` takes, by
-            what depth must be multiplied then, and the error with both.
-        registration: how depth lies on the image, or None where it was not checked.
-        unreadable: files that could not be decoded.
-        problems: what is wrong, in words; empty if nothing.
-        undecided: what this sequence leaves open, in words.
-    """
-
-    pairs: int
+    pairs: int  # compared, of frames ``gap`` apart
     gap: int
-    error: float
-    poses: str
-    scale: float
-    best_error: float
-    registration: DepthImageFit | None
-    unreadable: tuple[str, ...]
+    error: float  # median relative error of warped depth, as the sequence is given; inf without overlap
+    poses: str  # the reading of the poses that fits best, by the name that ``open_sequence`` takes,
+    scale: float  # by what depth must be multiplied then,
+    best_error: float  # and the error with both
+    registration: DepthImageFit | None  # how depth lies on the image, None where it was not checked
+    unreadable: tuple[str, ...]  # files that could not be decoded
     problems: tuple[str, ...]
-    undecided: tuple[str, ...]
+    undecided: tuple[str, ...]  # what this sequence leaves open
 
     @property
     def reading(self) -> str:

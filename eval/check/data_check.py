@@ -13,8 +13,8 @@ import numpy as np
 
 from ufmstar_torch.eval.check.check import SequenceCheck, check_sequence
 from ufmstar_torch.eval.results.files import to_json
-from ufmstar_torch.eval.sequences.conventions import OURS
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
+from ufmstar_torch.eval.sequences.poses import OURS
 from ufmstar_torch.eval.tour.open import open_sequence
 
 _SAMPLED = 12  # frames whose depth is looked at for its range
@@ -28,44 +28,27 @@ _FEW = 0.5  # share of the frames on disk that must be usable, or the trajectory
 
 @dataclass(frozen=True)
 class DataReport:
-    """Outcome of a check; lengths in metres, sizes (H, W).
-
-    Attributes:
-        name, path: of the sequence; the path as given.
-        layout: "" where it could not be opened.
-        frames, on_disk: usable ones, and all.
-        skipped: number of frames left out, by reason.
-        without_depth: number of usable frames without a depth map.
-        posed, walked: whether there are poses, and their path's length [m].
-        image_size, depth_size: or None.
-        intrinsics: fx, fy, cx, cy of the images [px].
-        depth_intrinsics: those of the depth maps, or None if they are the images'.
-        depth_range, filled: 1 % and 99 % quantiles of the sampled depth [m], or None; the share of valid pixels.
-        checked: what ``check_sequence`` measured, plain values; {} where it could not.
-        problems: what is wrong, in words.
-        remedies: what to do about it; options are named as on the command line.
-        undecided: what the data leave open.
-    """
+    """Outcome of a check; lengths in metres, sizes (H, W)."""
 
     name: str
-    path: str
-    layout: str = ""
-    frames: int = 0
+    path: str  # as given
+    layout: str = ""  # "" where it could not be opened
+    frames: int = 0  # usable ones
     on_disk: int = 0
-    skipped: Mapping[str, int] = field(default_factory=dict)
-    without_depth: int = 0
+    skipped: Mapping[str, int] = field(default_factory=dict)  # number of frames left out, by reason
+    without_depth: int = 0  # usable frames
     posed: bool = True
-    walked: float = 0.0
+    walked: float = 0.0  # length of the path [m]
     image_size: tuple[int, int] | None = None
     depth_size: tuple[int, int] | None = None
-    intrinsics: tuple[float, ...] = ()
-    depth_intrinsics: tuple[float, ...] | None = None
-    depth_range: tuple[float, ...] | None = None
-    filled: float = 0.0
-    checked: Mapping[str, Any] = field(default_factory=dict)
+    intrinsics: tuple[float, ...] = ()  # fx, fy, cx, cy of the images [px]
+    depth_intrinsics: tuple[float, ...] | None = None  # of the depth maps, None if they are the images'
+    depth_range: tuple[float, ...] | None = None  # 1 % and 99 % quantiles of the sampled depth [m]
+    filled: float = 0.0  # share of valid pixels
+    checked: Mapping[str, Any] = field(default_factory=dict)  # what check_sequence measured; {} where it could not
     problems: tuple[str, ...] = ()
-    remedies: tuple[str, ...] = ()
-    undecided: tuple[str, ...] = ()
+    remedies: tuple[str, ...] = ()  # options are named as on the command line
+    undecided: tuple[str, ...] = ()  # what the data leave open
 
     @property
     def ok(self) -> bool:
@@ -78,13 +61,8 @@ class DataReport:
 
 
 def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **options: Any) -> DataReport:
-    """Opens a sequence and checks all that needs no network; one that cannot be opened is a report with that problem.
-
-    Args:
-        path: as ``open_sequence`` takes it.
-        name: instead of the sequence's own.
-        pairs: of frames that are compared.
-        options: of ``open_sequence``.
+    """Open a sequence (``options`` as ``open_sequence`` takes them) and check all that needs no network on ``pairs`` of
+    frames; one that cannot be opened is a report with that problem.
 
     Raises:
         FileNotFoundError: no such path.

@@ -22,24 +22,16 @@ _SHIFT, _SHIFT_STEP = 0.0375, 0.0047
 
 @dataclass(frozen=True)
 class DepthImageFit:
-    """How well depth edges meet image edges.
+    """How well depth edges meet image edges, and the best displacement of the depth map."""
 
-    Attributes:
-        quality: 1 where no displacement is better than none, 0 where none is as bad as a random one; NaN
-            without edges.
-        contrast: mean gradient rank (0 to 1) at the best displacement less that at a random one; small
-            where image edges are everywhere, so that the fit is undetermined.
-        zoom, shift_x, shift_y: the best displacement of the depth map: zoom about the centre, then shift
-            [px].
-        edges: number of edge pixels compared.
-    """
-
-    quality: float
+    quality: float  # 1 where no displacement is better than none, 0 where none is as bad as a random one, NaN: no edges
+    # Mean gradient rank (0 to 1) at the best displacement less that at a random one; small where image edges are
+    # everywhere, so that the fit is undetermined.
     contrast: float
-    zoom: float
-    shift_x: float
+    zoom: float  # about the centre
+    shift_x: float  # after it [px]
     shift_y: float
-    edges: int
+    edges: int  # pixels compared
 
 
 def depth_image_fit(frames: Iterable[tuple[np.ndarray, np.ndarray]]) -> DepthImageFit:

@@ -18,7 +18,7 @@ def main(options: BenchSettings) -> int:
     """Run the benchmark, print its table and write its JSON; the exit code."""
     from ufmstar_torch.eval.bench.benchmark import run_benchmark
     from ufmstar_torch.eval.bench.text import format_report
-    from ufmstar_torch.eval.report.figures_growth import draw_growth
+    from ufmstar_torch.eval.report.figures_cost import draw_growth
     from ufmstar_torch.eval.report.style import save_figure
     from ufmstar_torch.eval.results.files import write_json_atomic
 

@@ -75,7 +75,7 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
     from ufmstar_torch.eval.check.data_check import check_data
-    from ufmstar_torch.eval.sequences.find import find_sequences
+    from ufmstar_torch.eval.sequences.layout import find_sequences
     from ufmstar_torch.eval.sequences.options import Options
 
     path, opening = options.path, options.opening.given()

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from ufmstar_torch.eval.commands.options import option
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
 LAYOUTS = ("auto", "tum", "7scenes", "scannet", "sens", "tartanair", "kitti360", "nyu", "generic")
 # What `open_sequence` calls the options whose names on the command line say that they are about ground truth.

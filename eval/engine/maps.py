@@ -16,8 +16,8 @@ from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
 from ufmstar_torch.eval.methods.setting import CROP
 from ufmstar_torch.eval.sequences.depth_folder import DepthFolder, DepthMaps
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
-from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest, scaled_to_map
-from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics
+from ufmstar_torch.eval.sequences.ground_truth import depth_camera, resample_nearest
+from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.own_output import own_output
 
 
@@ -113,7 +113,7 @@ def folder_source(
         if own is not None and file.stem in own.intrinsics:
             return PredictedMap(depth, spread, own.intrinsics[file.stem])
         try:
-            K = scaled_to_map(frame.intrinsics, sequence.image_size, depth.shape[:2])
+            K = scale_intrinsics(frame.intrinsics, sequence.image_size, depth.shape[:2])
         except ValueError as error:
             raise FrameError(file, _cropped(sequence, depth)) from error
         return PredictedMap(depth, spread, K)
@@ -136,7 +136,7 @@ def _check_first(sequence: FrameSequence, maps: DepthMaps, any_shape: bool) -> N
     try:
         depth, _ = maps[0]
         if not any_shape:
-            scaled_to_map(sequence.intrinsics, sequence.image_size, depth.shape[:2])
+            scale_intrinsics(sequence.intrinsics, sequence.image_size, depth.shape[:2])
     except FrameError:  # counted when its turn comes
         return
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Colours of pictures: perceptually uniform maps, ranges by percentile, grey for invalid pixels; writing of PNGs."""
+"""Colours of pictures: perceptually uniform maps, ranges by percentile, grey for what is unknown; writing of PNGs."""
 
 from __future__ import annotations
 
@@ -24,12 +24,8 @@ PERCENTILES = (1.0, 99.0)
 
 @dataclass(frozen=True)
 class ColourScale:
-    """How lengths become colours.
-
-    Attributes:
-        low: value [m] of the map's dark end; what lies below gets the same colour.
-        high: value [m] of the bright end, > low.
-        colour_map: name of a matplotlib map.
+    """A matplotlib map and the values [m] at its dark and its bright end, low < high; values beyond an end get its
+    colour.
     """
 
     low: float
@@ -40,36 +36,26 @@ class ColourScale:
         if not self.low < self.high:
             raise ValueError(f"low must be less than high, got {self.low} and {self.high}")
 
-    def rgb(self, values: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-        """[..., 3] the colours of ``values`` [...] [m]; grey where not finite or not ``valid``."""
-        usable = np.isfinite(values) if valid is None else valid & np.isfinite(values)
-        # The mean of low and high is harmless where nothing is shown.
-        shown = np.where(usable, values, self.low).astype(np.float64)
+    def rgb(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+        """[..., 3] the colours of ``values`` [...] [m]; grey where not finite."""
+        known = np.isfinite(values)
+        shown = np.where(known, values, self.low).astype(np.float64)
         index = np.clip((shown - self.low) / (self.high - self.low), 0, 1) * 255
         colours = colour_table(self.colour_map)[np.rint(index).astype(np.intp)]
-        return np.where(usable[..., None], colours, np.uint8(INVALID_GREY))
+        return np.where(known[..., None], colours, np.uint8(INVALID_GREY))
 
 
 @cache
 def colour_table(name: str) -> NDArray[np.uint8]:
-    """[256, 3] the sRGB colours of a matplotlib map, read-only.
-
-    Raises:
-        ImportError: matplotlib is missing; names the extra that brings it.
-        KeyError: there is no such map.
-    """
-    colormaps = require_matplotlib().colormaps
-    table: NDArray[np.uint8] = colormaps[name](np.linspace(0, 1, 256), bytes=True)[:, :3].copy()
+    """[256, 3] the sRGB colours of a matplotlib map, read-only."""
+    table: NDArray[np.uint8] = require_matplotlib().colormaps[name](np.linspace(0, 1, 256), bytes=True)[:, :3].copy()
     table.setflags(write=False)
     return table
 
 
 def require_matplotlib() -> Any:
-    """The matplotlib package, without pyplot and so without a global state or a window system.
-
-    Raises:
-        ImportError: it is missing; names the extra that brings it.
-    """
+    """The matplotlib package, without pyplot and so without global state. Raises ImportError: it is missing; names the
+    extra that brings it."""
     try:
         import matplotlib
     except ImportError as error:
@@ -83,30 +69,24 @@ def plain(text: str) -> str:
 
 
 def save_png(figure: Any, path: Path) -> None:
-    """Write a matplotlib figure as PNG, atomically; the same figure gives the same bytes.
-
-    Raises:
-        OSError: see ``write_atomic``.
-    """
+    """Write a matplotlib figure as PNG, atomically; the same figure gives the same bytes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     write_atomic(path, FigureCanvasAgg(figure).print_png)
 
 
-def robust_range(
-    maps: Iterable[tuple[NDArray[Any], NDArray[np.bool_] | None]], *, from_zero: bool
-) -> tuple[float, float]:
-    """The 1st to 99th percentile over all valid pixels of several maps [m].
+def known_where(condition: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[np.float32]:
+    """The values in float32, NaN where the condition is False."""
+    return np.where(condition, values, np.nan).astype(np.float32)
 
-    Args:
-        maps: pairs (values [...], valid [...] or None).
-        from_zero: start the range at 0, as for a sigma or an error.
 
-    Returns:
-        (low, high), low < high always; (0, 1) where there is no valid pixel.
+def robust_range(maps: Iterable[NDArray[Any]], *, from_zero: bool) -> tuple[float, float]:
+    """The 1st to 99th percentile [m] over all finite pixels of several maps, low < high; (0, 1) without a pixel.
+
+    ``from_zero`` starts the range at 0, as for a sigma or an error.
     """
-    kept = [values[np.isfinite(values) & (True if valid is None else valid)] for values, valid in maps]
-    pixels = np.concatenate([k.ravel() for k in kept]) if kept else np.zeros(0)
+    kept = [values[np.isfinite(values)] for values in maps]
+    pixels = np.concatenate(kept) if kept else np.zeros(0)
     if pixels.size == 0:
         return 0.0, 1.0
     low, high = (float(x) for x in np.percentile(pixels, PERCENTILES))

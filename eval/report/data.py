@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -41,45 +41,27 @@ class Failed:
     rows: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Merged:
-    """Several sequences evaluated as one, every pixel with the same weight.
+class Merged(NamedTuple):
+    """Several sequences evaluated as one, every pixel with the same weight."""
 
-    Attributes:
-        figures: ``SequenceMetrics.compute()``.
-        curves: ``SequenceMetrics.curves()``, and "nll_by_error:REFERENCE", "error_by_error:REFERENCE".
-        sequences: their number.
-    """
-
-    figures: Mapping[str, float]
-    curves: Mapping[str, list[float]] = field(default_factory=dict)
+    figures: Mapping[str, float]  # SequenceMetrics.compute()
+    curves: Mapping[str, list[float]]  # its curves(), and "nll_by_error:REFERENCE", "error_by_error:REFERENCE"
     sequences: int = 1
 
 
 @dataclass(frozen=True)
 class Results:
-    """The results of an evaluation, finished or not.
-
-    Attributes:
-        out: its folder.
-        about: ``eval.json``.
-        records: sorted by data set, sequence and row (in the suite's order), whichever process wrote them.
-        merged: figures and curves over all pixels of a data set, by (dataset, row); only where the sums of all
-            sequences exist.
-        failed: sequences that could not be evaluated.
-        missing: (dataset, sequence, row) not evaluated yet.
-        efficiency: ``efficiency.json``, or None.
-        notes: problems of the folder, a sentence each.
-    """
+    """The results of an evaluation, finished or not."""
 
     out: Path
-    about: Mapping[str, Any]
-    records: tuple[Record, ...]
+    about: Mapping[str, Any]  # eval.json
+    records: tuple[Record, ...]  # by data set, sequence and row (in the suite's order), whichever process wrote them
+    # Over all pixels of a data set, by (dataset, row); only where the sums of all sequences exist.
     merged: Mapping[tuple[str, Row], Merged] = field(default_factory=dict)
     failed: tuple[Failed, ...] = ()
-    missing: tuple[tuple[str, str, Row], ...] = ()
-    efficiency: Mapping[str, Any] | None = None
-    notes: tuple[str, ...] = ()
+    missing: tuple[tuple[str, str, Row], ...] = ()  # (dataset, sequence, row) not evaluated yet
+    efficiency: Mapping[str, Any] | None = None  # efficiency.json
+    notes: tuple[str, ...] = ()  # problems of the folder, a sentence each
 
     @property
     def suite(self) -> str:
@@ -134,12 +116,8 @@ class Results:
 
 
 def load_results(out: Path, *, with_sums: bool = True) -> Results:
-    """Read the folder of an evaluation, finished or not.
-
-    Args:
-        out: the folder.
-        with_sums: also add the sums of the sequences of each data set, which figures need (some milliseconds a
-            record); otherwise ``merged`` is empty.
+    """Read the folder of an evaluation, finished or not; ``with_sums`` adds the sums of the sequences of each data set,
+    which figures need (some milliseconds a record).
 
     Raises:
         ResultsError: the folder is no evaluation, holds no record, or records that do not belong together.
@@ -149,25 +127,16 @@ def load_results(out: Path, *, with_sums: bool = True) -> Results:
     by_path = {path: _record(path) for path in sorted((out / "records").rglob("*.json")) if path.name != FAILED}
     order = {row: number for number, row in enumerate(listed_rows(about))}
 
-    def place(path: Path) -> tuple[str, str, int, str]:
-        record, row = by_path[path], row_of(by_path[path])
+    def place(item: tuple[Path, Record]) -> tuple[str, str, int, str]:
+        record, row = item[1], row_of(item[1])
         return record.dataset, record.sequence, order.get(row, len(order)), row.slug
 
-    paths = sorted(by_path, key=place)
-    records = [by_path[path] for path in paths]
-    _check(out, about, paths, records)
-    failed = _failed(out)
-    merged, notes = _merged(paths, records) if with_sums else ({}, [])
-    return Results(
-        out=out,
-        about=about,
-        records=tuple(records),
-        merged=merged,
-        failed=failed,
-        missing=_missing(about, records, failed),
-        efficiency=_read_json(out / "efficiency.json"),
-        notes=tuple(notes),
-    )
+    by_path = dict(sorted(by_path.items(), key=place))
+    _check(out, about, by_path)
+    records, failed = tuple(by_path.values()), _failed(out)
+    merged, notes = _merged(by_path) if with_sums else ({}, [])
+    missing, efficiency = _missing(about, records, failed), _read_json(out / "efficiency.json")
+    return Results(out, about, records, merged, failed, missing, efficiency, tuple(notes))
 
 
 def row_of(record: Record) -> Row:
@@ -224,13 +193,13 @@ def _record(path: Path) -> Record:
     return record
 
 
-def _check(out: Path, about: Mapping[str, Any], paths: Sequence[Path], records: Sequence[Record]) -> None:
+def _check(out: Path, about: Mapping[str, Any], records: Mapping[Path, Record]) -> None:
     """Raise ResultsError where there is no record, or records are not of one evaluation."""
     if not records:
         raise ResultsError(f"{out} holds no finished sequence yet (no record under {out / 'work'})")
     networks: dict[str, tuple[str, Path]] = {}
     seen: dict[tuple[str, str, Row], Path] = {}
-    for path, record in zip(paths, records, strict=True):
+    for path, record in records.items():
         if record.suite != about["suite"]:
             raise ResultsError(f"{path} is of the suite {record.suite!r}, not of {about['suite']!r} as eval.json")
         base = Method.parse(record.method).base
@@ -271,10 +240,10 @@ def _missing(
 # ---- sums over sequences ----
 
 
-def _merged(paths: Sequence[Path], records: Sequence[Record]) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
+def _merged(records: Mapping[Path, Record]) -> tuple[dict[tuple[str, Row], Merged], list[str]]:
     """Sums of each (dataset, row), added in the order of the sequences; a note where a file is missing."""
     groups: dict[tuple[str, Row], list[Path]] = {}
-    for path, record in zip(paths, records, strict=True):
+    for path, record in records.items():
         groups.setdefault((record.dataset, row_of(record)), []).append(path.with_suffix(".pt"))
     merged, notes = {}, []
     for (dataset, row), files in groups.items():

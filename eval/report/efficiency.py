@@ -37,10 +37,9 @@ def efficiency_table(measured: Measured, **how: bool) -> tuple[str, str]:
 
 
 def efficiency_tables(measured: Measured, *, relative: bool = False, net: bool = False) -> list[Table]:
-    """One table per architecture.
+    """One table per architecture of what ``measure`` returned, once or several times.
 
     Args:
-        measured: what ``measure`` returned, once or several times (for several architectures).
         relative: times as multiples of one inference of depth alone, of the same frame: for a machine that also
             does other work. Where all runs on the CPU, these are processor times, which such work does not stretch.
         net: power and energy less those of the idle machine.

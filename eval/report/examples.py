@@ -12,20 +12,16 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.report.colours import known_where
+
 Map = NDArray[np.float32]
 _SCENE = ("image", "truth", "K")
 
 
 @dataclass(frozen=True, eq=False)
 class RowMaps:
-    """One row's maps of a frame, [h, w] float32.
-
-    Attributes:
-        depth: [m].
-        variance: of the row, V [m^2].
-        aleatoric: the network's own A [m^2], None where the row has none.
-        epistemic: the spread of members or samples E [m^2], or None.
-        disagreement: between the views M [m^2], or None.
+    """One row's maps of a frame, [h, w] float32: depth [m], variance V [m^2], and its parts [m^2] where the row has
+    them: the network's own A, the spread of members or samples E, and the disagreement between the views M.
     """
 
     depth: Map
@@ -40,10 +36,15 @@ class RowMaps:
         with np.errstate(invalid="ignore"):
             return np.isfinite(self.depth) & (self.depth > 0) & np.isfinite(self.variance) & (self.variance >= 0)
 
+    def root(self, part: Map) -> Map:
+        """[h, w] square root of the variance or a part of it [m], NaN where invalid."""
+        usable = self.valid & np.isfinite(part) & (part >= 0)
+        return known_where(usable, np.sqrt(np.where(usable, part, 0)))
+
     @property
     def sigma(self) -> Map:
         """[h, w] standard deviation [m], NaN where invalid."""
-        return deviation(self.variance, self.valid)
+        return self.root(self.variance)
 
 
 _MAPS = tuple(f.name for f in fields(RowMaps))
@@ -51,10 +52,9 @@ _MAPS = tuple(f.name for f in fields(RowMaps))
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A frame.
+    """A frame of a sequence of a data set.
 
     Attributes:
-        dataset, sequence, frame: "scannet", the sequence's name within it, and the frame's name within that.
         image: [H, W, 3] uint8.
         truth: [h, w] ground truth [m], 0 = none.
         K: [3, 3] intrinsics of the maps [px].
@@ -85,7 +85,7 @@ class Example:
         """[h, w] |depth - truth| [m], NaN where there is no truth or no prediction."""
         maps = self.rows[row]
         known = (self.truth > 0) & np.isfinite(self.truth) & maps.valid
-        return np.where(known, np.abs(maps.depth - self.truth), np.nan).astype(np.float32)
+        return known_where(known, np.abs(maps.depth - self.truth))
 
     def nll(self, row: str) -> NDArray[np.float64]:
         """[h, w] (g - d)^2 / (2 v) + 0.5 ln(2 pi v) [nats], NaN where there is no truth or v = 0."""
@@ -96,20 +96,12 @@ class Example:
         return np.where(usable, error**2 / (2 * v) + 0.5 * np.log(2 * math.pi * v), np.nan)
 
 
-def deviation(variance: Map, valid: NDArray[np.bool_]) -> Map:
-    """[h, w] square root of a variance [m], NaN where it is not ``valid``."""
-    return np.where(valid, np.sqrt(np.where(valid, variance, 0)), np.nan).astype(np.float32)
-
-
 def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list[Example]:
-    """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames, with the rows'
-    names for people by file name.
+    """The examples of one sequence, ``OUT/records/DATASET/SEQUENCE``, in the order of their frames.
 
     Rows whose maps show the frame with another camera (a network of another size) make an example of their own. Rows
-    without a variance have nothing to show and are left out, and so are frames without any row.
-
-    Raises:
-        ValueError: a file cannot be read or its maps do not fit; the message names it.
+    without a variance and frames without any row are left out. Raises ValueError: a file cannot be read or its maps do
+    not fit; the message names it.
     """
     files = sorted((folder / "examples").glob("*.npz"))
     stems = {file.stem: file for file in files}
@@ -123,11 +115,7 @@ def find_examples(folder: Path, labels: Mapping[str, str] | None = None) -> list
 
 
 def load_arrays(file: Path, names: Sequence[str]) -> dict[str, NDArray]:
-    """The arrays of an npz file.
-
-    Raises:
-        ValueError: it is none, or broken, or one of ``names`` is missing.
-    """
+    """The arrays of an npz file. Raises ValueError: it is none, or broken, or one of ``names`` is missing."""
     try:
         with np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}

@@ -1,4 +1,4 @@
-"""The diagrams of cost: time by method and by stage, calibration against memory and time."""
+"""Figures of cost: time by method and by stage, calibration against memory and time, growth over long runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from ufmstar_torch.eval.report.means import Mean, mean_of
 from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
 from ufmstar_torch.eval.report.style import (
     TICK,
+    Style,
     finish,
+    label_ends,
     new_figure,
     short_name,
     spread_apart,
@@ -153,3 +155,31 @@ def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:
             color=style_of(row.method).colour,
             arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.4, "relpos": (0, 0.5), "shrinkB": 3},
         )  # fmt: skip
+
+
+# ---- growth ----
+
+# Runs of one world differ in their limits of merging and of components in memory; without either comes first.
+_STYLES = (Style("#6b6b6b", "^"), Style("#0072B2", "o"), Style("#D55E00", "v"), Style("#009E73", "D"))
+_PANELS = {"components": "components in memory", "step_median_ms": "time of a step [ms], median"}
+
+
+def draw_growth(runs: Sequence[Mapping[str, Any]]) -> Any:
+    """Components, and the time of a step, over frames, of runs of ``measure_growth``; a row of panels each world."""
+    worlds = list(dict.fromkeys(run["world"] for run in runs))
+    figure = new_figure(8.6, 3.4 * len(worlds), f"Growth: {', '.join(worlds)}; {runs[0]['frames']} frames")
+    for world, panels in zip(worlds, figure.subplots(len(worlds), 2, squeeze=False), strict=True):
+        own = [run for run in runs if run["world"] == world]
+        for panel, (key, words) in zip(panels, _PANELS.items(), strict=True):
+            ends = []
+            for index, run in enumerate(own):
+                style = _STYLES[index % len(_STYLES)]
+                values = [row[key] for row in run["rows"]]
+                panel.plot([row["frames"][1] for row in run["rows"]], values, color=style.colour, linewidth=1.6)
+                merge = f"merge {run['merge']:g}" if run["merge"] else ""
+                most = f"at most {run['max_components']}" if run["max_components"] else ""
+                ends.append((values[-1], ", ".join(filter(None, (merge, most))) or "off", style.colour))
+            panel.set_ylim(bottom=0)
+            finish(panel, x=f"frames, {world}", y=words)
+            label_ends(panel, ends)
+    return figure

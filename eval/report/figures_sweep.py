@@ -1,17 +1,22 @@
-"""Ablations: figures over the values of a setting, and what each setting changes, sequence by sequence."""
+"""Ablations: the rows of an evaluation as lines over the values of one setting, figures over these, and what each
+setting changes, sequence by sequence.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ufmstar_torch.anchors.tracker import TrackerConfig
+from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
-from ufmstar_torch.eval.methods.setting import TRACKED, TRUTH
+from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
@@ -38,7 +43,107 @@ from ufmstar_torch.eval.report.style import (
     stretch,
     style_of,
 )
-from ufmstar_torch.eval.report.sweeps import Point, Rest, SweepLine, default_value, sweep_lines
+from ufmstar_torch.eval.results.record import Record
+
+COUNT = "anchor_count"
+Rest = tuple[tuple[str, Any], ...]
+# Rows without a number of anchors have at most so many.
+_COUNTS = {"": 0, TRACKED: TrackerConfig().max_points, TRUTH: TRUTH_COUNT}
+# What a row without anchors cannot have, beside what begins with "anchor_".
+_OF_ANCHORS = ("anchors", "track_noise", "corrected", "posterior")
+_ANCHORED = {TRACKED: "anchored", DENSE: "dense anchors", TRUTH: "truth anchors"}
+
+
+class Point(NamedTuple):
+    """A value of a setting, the rows that have it (several where noise was drawn with several seeds), their records."""
+
+    value: float
+    rows: tuple[Row, ...]
+    records: tuple[Record, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SweepLine:
+    """A method over the values of a setting, nothing else being changed along it."""
+
+    method: Method
+    rest: Rest  # what all its rows change beside that setting, sorted by name; () for the method as it is
+    points: tuple[Point, ...]  # in rising order of the values
+
+    @property
+    def words(self) -> str:
+        """What is fixed, for people: "", "anchored", "truth anchors, shrinkage κ 1 anchors"."""
+        values = dict(self.rest)
+        anchors = _ANCHORED.get(kind := values.pop("anchors", ""), kind)
+        return ", ".join(filter(None, (anchors, setting_label(values))))
+
+    def at(self, value: float) -> Point | None:
+        """The point of a value; of a line with one point, which does not depend on it, that one."""
+        if len(self.points) == 1:
+            return self.points[0]
+        return next((point for point in self.points if point.value == value), None)
+
+
+def sweeps(results: Results) -> list[tuple[str, str]]:
+    """(base, setting) of every setting of which some line has at least three numbers."""
+    varied = dict.fromkeys((row.method.base, name) for row in results.rows for name in _changed(row))
+    return [
+        (base, name) for base, name in varied if any(len(line.points) >= 3 for line in sweep_lines(results, base, name))
+    ]
+
+
+def sweep_lines(results: Results, base: str, name: str) -> list[SweepLine]:
+    """The lines of a base over the values of a setting, those of one point too, in the order of the rows. How images
+    are prepared is no difference where it is the same of all rows."""
+    groups: dict[tuple[Method, Rest], dict[float, list[Row]]] = {}
+    rows = [row for row in results.rows if row.method.base == base]
+    left_out = {name} if len({row.setting.preprocess for row in rows}) > 1 else {name, "preprocess"}
+    for row in rows:
+        value, values = _value(row, name), row.setting.to_dict()
+        if _is_number(value):
+            rest = tuple(sorted((other, values[other]) for other in _changed(row) if other not in left_out))
+            groups.setdefault((row.method, rest), {}).setdefault(float(value), []).append(row)
+    if name == COUNT:  # lines over several numbers of anchors begin with the rows that do without
+        for (method, rest), by_value in groups.items():
+            without = tuple(i for i in rest if i[0] not in _OF_ANCHORS and not i[0].startswith("anchor_"))
+            plain = groups.get((method, without), {})
+            if len(by_value) > 1 and 0.0 in plain:
+                by_value.setdefault(0.0, plain[0.0])
+
+    def point(value: float, rows: Sequence[Row]) -> Point:
+        return Point(value, tuple(rows), tuple(record for row in rows for record in results.of(row)))
+
+    return [
+        SweepLine(method, rest, tuple(point(value, by_value[value]) for value in sorted(by_value)))
+        for (method, rest), by_value in groups.items()
+    ]
+
+
+def default_value(name: str, preset: str = DEFAULTS) -> float:
+    """The value that a row of a preset has where nothing is changed, NaN where it is no number."""
+    try:
+        value = default_of(name, preset)
+    except ValueError:  # a setting of another version: without a default, its rows stand alone
+        return math.nan
+    return float(value) if _is_number(value) else math.nan
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _value(row: Row, name: str) -> Any:
+    if name == COUNT and row.setting.anchor_count is None:
+        return _COUNTS.get(row.setting.anchors, math.nan)
+    return row.setting.to_dict().get(name, default_value(name, row.setting.ufm_preset))
+
+
+def _changed(row: Row) -> list[str]:
+    """What a row's setting changes, the noise's seed aside."""
+    return [name for name in row.setting.to_dict() if name != "seed"]
+
+
+# ---- figures ----
 
 SHOWN = (NLL, ECE_DELTA, ECE_Q)
 # Lines of the same method by what is fixed; they differ from all of ``style_of``'s.
@@ -54,61 +159,34 @@ _HIGH = 50.0
 _Pairs = list[tuple[SweepLine, list[tuple[Point, Point]]]]
 
 
-class _Curve(NamedTuple):
-    """Means over the values of a setting; ``end`` is the name at the right."""
-
-    x: Sequence[float]
-    means: Sequence[Mean]
-    label: str
-    end: str
-    style: Style
-    dashed: bool = False
-
-
 def draw_sweep(results: Results, base: str, name: str) -> Any:
     """Above, the figures over the values with their confidence intervals; below, the change from the default, or where
     lines differ in what else is fixed, from the method without that."""
     lines = [line for line in sweep_lines(results, base, name) if len(line.points) > 1 or not line.rest]
-    alone = next((line for line in lines if line.method == Method(base)), None)
+    alone = [line for line in lines if line.method == Method(base)][:1]
     drawn = [line for line in lines if line.method.fusion != ALONE]
     others = cycle(_OTHERS)
-    styles = {
-        (line.method, line.rest): style_of(line.method) if not line.rest else _FIXED.get(line.rest) or next(others)
-        for line in drawn
-    }
-    to, below = _compared(drawn, alone, name)
-    anchored = any("anchors" in dict(line.rest) for line in drawn)
-    shown = (*SHOWN, SPEARMAN) if anchored else SHOWN
+    styles = [_FIXED.get(line.rest) or next(others) if line.rest else style_of(line.method) for line in drawn]
+    looks = dict.fromkeys(alone, (ALONE_STYLE, True))
+    looks |= {line: (style, len(line.points) == 1) for line, style in zip(drawn, styles, strict=True)}
+    to, below = _compared(drawn, alone[0] if alone else None, name)
+    shown = (*SHOWN, SPEARMAN) if any("anchors" in dict(line.rest) for line in drawn) else SHOWN
     word, unit = SETTINGS.get(name, (setting_name(name), ""))
     title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {count(len(results.sequences()), 'sequence')}"
     figure = new_figure(4.0 * len(shown), 6.0 if below else 3.4, title)
     axes = figure.subplots(1 + bool(below), len(shown), squeeze=False, sharex=True)
-
-    def curve(line: SweepLine, points: Sequence[Point], means: Sequence[Mean]) -> _Curve:
-        x, dashed = [point.value for point in points], line is alone or len(line.points) == 1
-        if line is alone:
-            return _Curve(x, means, short_name(line.method), short_name(line.method), ALONE_STYLE, dashed)
-        label = " ".join(filter(None, (line.method.name, line.words)))
-        return _Curve(x, means, label, line.words or short_name(line.method), styles[line.method, line.rest], dashed)
-
     for column, quantity in enumerate(shown):
         panel = axes[0][column]
-        levels = [
-            curve(line, line.points, [mean_of(point.records, quantity) for point in line.points])
-            for line in [*filter(None, [alone]), *drawn]
-        ]
-        reached, ends = _draw(panel, levels)
+        means = {line: {p.value: mean_of(p.records, quantity) for p in line.points} for line in looks}
+        reached, ends = _draw(panel, means, looks)
         finish(panel, title=f"{quantity.heading}, mean over sequences")
         _scale(panel, [point.value for line in drawn if len(line.points) > 1 for point in line.points])
         _tame(panel, name, reached, ends)
         if below:
             panel = axes[1][column]
-            changes = [
-                curve(line, [one for one, _ in pairs], [difference(a.records, b.records, quantity) for a, b in pairs])
-                for line, pairs in below
-            ]
             panel.axhline(0, color=FAINT, linewidth=0.8)
-            reached, ends = _draw(panel, changes)
+            means = {line: {a.value: difference(a.records, b.records, quantity) for a, b in ab} for line, ab in below}
+            reached, ends = _draw(panel, means, looks)
             finish(panel, title=f"difference to {to} in {quantity.name}, in pairs")
             _tame(panel, name, reached, ends)
         panel.set_xlabel(plain(f"{word} [{unit}]" if unit else word), size=LABEL, color=INK)
@@ -136,25 +214,30 @@ def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) ->
     return to, [(line, points) for line, points in pairs if points]
 
 
-def _draw(axes: Any, curves: Sequence[_Curve]) -> tuple[list[float], list[tuple[float, str, str]]]:
-    """Lines with their bands, dashed and level those for reference; the values reached and what stands at the ends."""
+def _draw(
+    axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, tuple[Style, bool]]
+) -> tuple[list[float], list[tuple[float, str, str]]]:
+    """Means over the values of a setting with their bands, by line; dashed and level lines for reference, as ``looks``
+    has it. The values reached, and what stands at the ends."""
     reached: list[float] = []
     ends = []
-    for curve in curves:
-        kept = [(x, mean) for x, mean in zip(curve.x, curve.means, strict=True) if not math.isnan(mean.value)]
+    for line, means in curves.items():
+        kept = [(x, mean.value, mean.half) for x, mean in means.items() if not math.isnan(mean.value)]
         if not kept:
             continue
-        x, y, half = np.array([(x, mean.value, mean.half) for x, mean in kept]).T
-        look: dict[str, Any] = {"color": curve.style.colour, "linestyle": "--", "linewidth": 1.4, "label": curve.label}
-        if not curve.dashed:
-            axes.plot(x, y, label=curve.label, **curve.style.line)
-            axes.fill_between(x, y - half, y + half, color=curve.style.colour, alpha=0.15, linewidth=0)
-        elif len(curve.x) == 1:
+        x, y, half = np.array(kept).T
+        (style, dashed), short = looks[line], short_name(line.method)
+        label = short if style is ALONE_STYLE else " ".join(filter(None, (line.method.name, line.words)))
+        look: dict[str, Any] = {"color": style.colour, "linestyle": "--", "linewidth": 1.4, "label": label}
+        if not dashed:
+            axes.plot(x, y, label=label, **style.line)
+            axes.fill_between(x, y - half, y + half, color=style.colour, alpha=0.15, linewidth=0)
+        elif len(means) == 1:
             axes.axhline(y[0], **look)
         else:
             axes.plot(x, y, **look)
         reached += [value for value in y.tolist() if math.isfinite(value)]
-        ends.append((float(y[-1]), curve.end, curve.style.colour))
+        ends.append((float(y[-1]), short if style is ALONE_STYLE else line.words or short, style.colour))
     return reached, ends
 
 

@@ -33,12 +33,10 @@ RADIUS, SUBDIVISIONS = 2.0, 2  # of the ellipsoids, of the icosahedron: 320 tria
 _TYPES = {"<f4": "float", "<i4": "int", "|u1": "uchar"}
 
 
-def write_mixture_ply(
-    path: str | Path, mixture: GaussianMixture, *, stream: int = 0, T_world_first: Tensor | None = None
-) -> int:
-    """Write the occupied components as Gaussian splats, atomically.
+def write_mixture_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
+    """Write the occupied components of the first stream as Gaussian splats, atomically; their number.
 
-    Attributes in the order and with the meaning that 3D Gaussian splatting viewers know: x y z [m],
+    Attributes in the order and with the meaning that 3D Gaussian splatting viewers expect: x y z [m],
     nx ny nz (the shortest axis), f_dc_0..2 (colour, see below), opacity (logit), scale_0..2 = ln sigma
     [ln m], rot_0..3 = unit quaternion w x y z, so that Sigma = R diag(exp(scale))^2 R^T. Behind them our
     own: weight [px], disagreement [m^2], count.
@@ -47,17 +45,12 @@ def write_mixture_ply(
     Args:
         path: the file; its folder must exist.
         mixture: B streams of K slots.
-        stream: which of the B.
         T_world_first: [4, 4] or [1, 4, 4] rigid, from the mixture's frame to the world; None = stay there.
 
-    Returns:
-        The number of components written; 0 makes a valid, empty file.
-
     Raises:
-        ValueError: there is no such stream, or ``T_world_first`` has another shape.
-        OSError: see ``write_atomic``.
+        ValueError: ``T_world_first`` has another shape.
     """
-    parts = _Components(mixture, stream, T_world_first)
+    parts = _Components(mixture, T_world_first)
     quaternion = Rotation.from_matrix(parts.axes).as_quat(canonical=True, scalar_first=True)
     opacity = np.full(len(parts.mean), np.log(OPACITY / (1 - OPACITY)))
     columns = (parts.mean, parts.axes[:, :, 0], (parts.colour / 255 - 0.5) / SH_DC, opacity, np.log(parts.sigma))
@@ -68,16 +61,14 @@ def write_mixture_ply(
     return len(table)
 
 
-def write_ellipsoids_ply(
-    path: str | Path, mixture: GaussianMixture, *, stream: int = 0, T_world_first: Tensor | None = None
-) -> int:
+def write_ellipsoids_ply(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> int:
     """Write the occupied components as a triangle mesh of ellipsoids of ``RADIUS`` standard deviations, atomically.
 
     Opens in MeshLab, Blender and the like. Vertices carry x y z [m], outward normals, red green blue of
     sqrt(disagreement), disagreement [m^2] and the component's number. Arguments, result and errors as
     :func:`write_mixture_ply`.
     """
-    parts = _Components(mixture, stream, T_world_first)
+    parts = _Components(mixture, T_world_first)
     sphere, triangles = icosphere(SUBDIVISIONS)
     k, n = len(parts.mean), len(sphere)
     # Sigma^(1/2) u: symmetric with a positive determinant, so triangles keep facing outwards.
@@ -101,9 +92,6 @@ def write_ellipsoids_ply(
 def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_first: Tensor | None = None) -> None:
     """Write all streams exactly, atomically: the fields of ``GaussianMixture``, and ``T_world_first`` ([B, 4, 4] or
     [4, 4]) in float64. Slots behind the last occupied one of all streams are left out.
-
-    Raises:
-        OSError: see ``write_atomic``.
     """
     used = int(mixture.valid.any(0).nonzero().max()) + 1 if bool(mixture.valid.any()) else 0
     fields = {name: value[:, :used].detach().cpu().numpy() for name, value in mixture.tensors().items()}
@@ -141,7 +129,7 @@ def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64]
 
 
 class _Components:
-    """The occupied components of one stream in float64, in the frame asked for.
+    """The occupied components of the first stream in float64, in the frame asked for.
 
     Attributes:
         mean: [K, 3] [m]; axes: [K, 3, 3] rotations, columns = principal axes, shortest first;
@@ -149,12 +137,10 @@ class _Components:
         colour: [K, 3] uint8; legend: what the colour means.
     """
 
-    def __init__(self, mixture: GaussianMixture, stream: int, T_world_first: Tensor | None) -> None:
-        if not 0 <= stream < mixture.streams:
-            raise ValueError(f"stream must lie in [0, {mixture.streams}), got {stream}")
-        used = mixture.valid[stream]
+    def __init__(self, mixture: GaussianMixture, T_world_first: Tensor | None) -> None:
+        used = mixture.valid[0]
         mean, covariance, self.weight, self.disagreement, self.count = (
-            value[stream][used].detach().cpu().to(torch.float64).numpy()
+            value[0][used].detach().cpu().to(torch.float64).numpy()
             for value in (mixture.mean, mixture.covariance, mixture.weight, mixture.disagreement, mixture.count)
         )
         variance, axes = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
@@ -164,7 +150,7 @@ class _Components:
         self.axes: NDArray[np.float64] = R @ axes
         self.sigma: NDArray[np.float64] = np.sqrt(np.maximum(variance, SIGMA_FLOOR**2))
         root = np.sqrt(np.maximum(self.disagreement, 0))
-        scale = ColourScale(*robust_range([(root, None)], from_zero=True), ERROR_MAP)
+        scale = ColourScale(*robust_range([root], from_zero=True), ERROR_MAP)
         self.colour = scale.rgb(root)
         self.legend = f"colour: sqrt(disagreement), {ERROR_MAP} from 0 to {scale.high:.4g} m"
 

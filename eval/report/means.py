@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row
@@ -18,19 +18,12 @@ from ufmstar_torch.eval.results.record import Record
 MIN_SEQUENCES = 5
 
 
-@dataclass(frozen=True)
-class Mean:
-    """A mean over sequences.
+class Mean(NamedTuple):
+    """A mean over sequences."""
 
-    Attributes:
-        value: NaN without a sequence.
-        half: half-width of its 95 % confidence interval, NaN for fewer than ``MIN_SEQUENCES`` sequences.
-        sequences: number of sequences that have the figure.
-    """
-
-    value: float = math.nan
-    half: float = math.nan
-    sequences: int = 0
+    value: float = math.nan  # without a sequence
+    half: float = math.nan  # half-width of its 95 % confidence interval, NaN below MIN_SEQUENCES
+    sequences: int = 0  # that have the figure
 
     @property
     def beyond(self) -> bool:

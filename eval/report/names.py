@@ -14,25 +14,15 @@ LOWER, HIGHER = "lower", "higher"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A figure, its name and unit in tables and figures.
+    """A figure, its name and unit in tables and figures."""
 
-    Attributes:
-        key: of ``Record.figures``, or "state.bytes_mean", "ms.network", "frames.done" for the others.
-        name: in Markdown and in figures.
-        latex: in LaTeX.
-        decimals: printed; None = three significant digits.
-        better: "lower", "higher", or None where neither is.
-        unit: "" for a pure number.
-        factor: by which the recorded value is multiplied to have that unit.
-    """
-
-    key: str
-    name: str
+    key: str  # of Record.figures, or "state.bytes_mean", "ms.network", "frames.done" for the others
+    name: str  # in Markdown and in figures
     latex: str
-    decimals: int | None
-    better: str | None = None
+    decimals: int | None  # None = three significant digits
+    better: str | None = None  # "lower", "higher", or None where neither is
     unit: str = ""
-    factor: float = 1.0
+    factor: float = 1.0  # by which the recorded value is multiplied to have that unit
 
     def with_unit(self, name: str) -> str:
         """A name with the unit: "RMSE [m]"."""
@@ -158,7 +148,7 @@ def setting_label(values: Mapping[str, Any]) -> str:
 
 
 def row_label(row: Row) -> str:
-    """A row for people: its own title, or "UfM*-Ensemble", "UfM*-Ensemble, rotation noise 2°"."""
+    """A row for people: its own title, or "UfM*-Ensemble, rotation noise 2°"."""
     return row.title or ", ".join(filter(None, (row.name, setting_label(row.changed))))
 
 

@@ -20,7 +20,7 @@ from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.engine.stream import FrameResult
 from ufmstar_torch.eval.methods.method import UFM_STAR
 from ufmstar_torch.eval.metrics import SequenceMetrics
-from ufmstar_torch.eval.report.colours import INVALID_GREY
+from ufmstar_torch.eval.report.colours import INVALID_GREY, known_where
 from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.report.panels import FramePanel, MapColumn, contact_sheet, map_columns
 from ufmstar_torch.eval.report.video import preview_frame, write_video
@@ -43,13 +43,8 @@ DEFAULT_FPS, FPS_RANGE = 10.0, (2.0, 30.0)
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """The finished frames of a run.
-
-    Attributes:
-        out: the run's folder.
-        frames: the sequence.
-        records: the frames' lines of frames.jsonl, in order.
-        with_error: whether there is a ground truth that the prediction can differ from.
+    """The finished frames of a run in the folder ``out``: their sequence, their lines of frames.jsonl in order, and
+    whether there is a ground truth that the prediction can differ from.
     """
 
     out: Path
@@ -67,25 +62,25 @@ class Finished:
             frame: Frame | None = self.frames[record["index"]]
         except FrameError:  # it can be read no more
             frame = None
-        truth = truth_at(frame, K, size) if self.with_error and frame is not None else None
-        maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"]), "valid": stored["valid"]}
+        maps = {"depth": stored["depth"], "sigma": np.sqrt(stored["variance"])}
         note = f"K = {record['components']}"
         if "anchored" in stored:
-            maps["anchored"] = np.sqrt(stored["anchored"])
             note += f", {record['anchors']['used']} anchors"
         if "posterior_depth" in stored:
             maps["posterior"] = stored["posterior_depth"]
             maps["posterior_sigma"] = np.sqrt(stored["posterior_variance"])
-            del maps["anchored"]
+        elif "anchored" in stored:
+            maps["anchored"] = np.sqrt(stored["anchored"])
+        truth = truth_at(frame, K, size) if self.with_error and frame is not None else None
         if truth is not None:
             pairs = {"error": "depth", "posterior_error": "posterior"}
-            errors = {name: np.abs(maps[of] - truth) for name, of in pairs.items() if of in maps}
-            maps |= {name: np.where(truth > 0, error, np.nan).astype(np.float32) for name, error in errors.items()}
-        shown = {name: resample_nearest(value, K, K_square, size_square) for name, value in maps.items()}
+            maps |= {name: absolute_error(maps[of], truth) for name, of in pairs.items() if of in maps}
+        valid, *square = (resample_nearest(m, K, K_square, size_square) for m in (stored["valid"], *maps.values()))
+        shown = {name: known_where(valid, values) for name, values in zip(maps, square, strict=True)}
         image = None if frame is None or frame.image is None else field_of_view(frame.image, frame.intrinsics, K, size)
         if image is None:
             image = np.full((*size_square, 3), INVALID_GREY, np.uint8)
-        return FramePanel(name=record["name"], image=image, note=note, **shown)
+        return FramePanel(record["name"], image, shown, note)
 
     def spread(self, count: int) -> list[int]:
         """Numbers of at most ``count`` frames spread over the run, the first and the last included."""
@@ -146,7 +141,7 @@ def square_pixels(K: NDArray, size: Size) -> tuple[NDArray, Size]:
 
 
 def field_of_view(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) -> NDArray[np.uint8]:
-    """The part of an image that a map with intrinsics K and size (h, w) shows, in the image's own pixels."""
+    """The part of an image that a map with intrinsics K and size (h, w) shows."""
     corners = np.array([[-0.5, -0.5, 1.0], [size[1] - 0.5, size[0] - 0.5, 1.0]])
     (left, top), (right, bottom) = np.rint((corners @ (K_image @ np.linalg.inv(K)).T)[:, :2] + 0.5).astype(int)
     height, width = image.shape[:2]
@@ -162,15 +157,20 @@ def panel(name: str, note: str, result: FrameResult) -> FramePanel:
     image and ground truth) through the demo's rows; ``note`` is the kind of room.
     """
     star: Any = result.rows[UFM_STAR]
-    maps: dict[str, Any] = {}
+    valid, maps = star.estimate.valid.numpy(), {}
     for prefix, row in (("", star), ("posterior_", result.rows[POSTERIOR])):
         estimate: Any = row.estimate
         depth = estimate.depth.float().numpy()
-        error = np.where(star.truth > 0, np.abs(depth - star.truth), np.nan).astype(np.float32)
-        maps |= {prefix.rstrip("_") or "depth": depth, f"{prefix}error": error}
+        maps[prefix.rstrip("_") or "depth"] = depth
         maps[f"{prefix}sigma"] = estimate.variance.float().sqrt().numpy()
+        maps[f"{prefix}error"] = absolute_error(depth, star.truth)
     frame: Any = result.frame
-    return FramePanel(name=name, note=note, image=frame.image, valid=star.estimate.valid.numpy(), **maps)
+    return FramePanel(name, frame.image, {key: known_where(valid, values) for key, values in maps.items()}, note)
+
+
+def absolute_error(depth: NDArray[Any], truth: NDArray[Any]) -> NDArray[np.float32]:
+    """[h, w] |depth - truth| [m], NaN where there is no truth (0)."""
+    return known_where(truth > 0, np.abs(depth - truth))
 
 
 def write_pictures(
@@ -180,19 +180,10 @@ def write_pictures(
     ufm_star: UfMStar,
     title: str,
 ) -> dict[str, str | None]:
-    """Write all of :data:`DEMO_FILES` into an existing folder.
-
-    Args:
-        out: the folder.
-        panels: rows of the contact sheet.
-        metrics: by the name that the legend shows.
-        ufm_star: at the end of the tour.
-        title: of the pictures.
-
-    Returns:
-        By file: None if it was written, else why not (an optional package is missing).
+    """Write all of :data:`DEMO_FILES` into an existing folder: the sheet of the panels, the curves of the metrics by
+    name, and the mixture. By file: None if it was written, else why not (an optional package is missing).
     """
-    from ufmstar_torch.eval.report.figures_calibration import write_curves
+    from ufmstar_torch.eval.report.figures_curves import write_curves
 
     curves = {name: values.curves() for name, values in metrics.items()}
     todo: dict[str, Callable[[Path], object]] = {

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.report.means import MIN_SEQUENCES, value_of
 from ufmstar_torch.eval.report.names import DIFFERENCES, count, row_label
 from ufmstar_torch.eval.report.pictures import BREAKDOWN, COMPARE, ROOM, STRIP, Picture
 from ufmstar_torch.eval.report.table import Table
-from ufmstar_torch.eval.report.tables import difference_table, extra_table, main_table, sequence_tables
+from ufmstar_torch.eval.report.tables import overview, sequence_tables
 from ufmstar_torch.eval.results.files import write_atomic
 
 PAGE = "report.html"
@@ -72,28 +72,28 @@ def write_page(
     *,
     most_bytes: int = MOST_BYTES,
 ) -> Path:
-    """Write the report into the folder of the evaluation.
-
-    Args:
-        results: of the evaluation.
-        figures: diagrams (SVG or PNG), whose names begin with their kind.
-        pictures: with their words; files in the folder's ``figures``.
-        undrawn: reasons by figure, of those that could not be drawn.
-        most_bytes: of all pictures together; those that do not fit are named instead.
+    """Write the report into the folder of the evaluation: figures (SVG or PNG), whose names begin with their kind,
+    pictures with their words, as far as they fit into ``most_bytes``, and why figures could not be drawn.
 
     Raises:
         ValueError: a picture cannot be read.
         ImportError: Pillow or Jinja2 is missing.
-        OSError: the file cannot be written.
     """
     shown, left_out = _pictures(results.out / "figures", figures, pictures, most_bytes)
     efficiency = [] if results.efficiency is None else efficiency_tables(results.efficiency)
     sequences = [table for dataset in results.datasets for table in sequence_tables(results, dataset)]
     more = len(sequences) - MOST_SEQUENCES
     words = f"The other {more} sequences are in the folder's tables." if more > 0 else ""
+    overviews = [
+        _part(
+            title, [table for over, table in tables.items() if over is None], [t for over, t in tables.items() if over]
+        )
+        for title, tables in overview(results).items()
+        if tables
+    ]
     parts = [
         _findings(results),
-        *_tables(results),
+        *overviews,
         *shown,
         *([_part("Efficiency", efficiency)] if efficiency else []),
         _part("Single sequences", folded=sequences[:MOST_SEQUENCES], words=words),
@@ -186,19 +186,6 @@ def _part(title: str, tables: Sequence[Table] = (), folded: Sequence[Table] = ()
     return {"kind": "tables", "title": title, "tables": tables, "folded": folded, "words": words}
 
 
-def _tables(results: Results) -> list[Part]:
-    """The main table, paired differences and further figures, over all sequences and, folded, by data set."""
-    makers = {"The main table": main_table, "Paired differences": difference_table, "Further figures": extra_table}
-    each = results.datasets if len(results.datasets) > 1 else ()
-    parts = []
-    for title, make in makers.items():
-        tables = [table for table in [make(results, None)] if not table.is_empty]
-        folded = [table for dataset in each if not (table := make(results, dataset)).is_empty]
-        if tables or folded:
-            parts.append(_part(title, tables, folded))
-    return parts
-
-
 def _pictures(
     folder: Path, figures: Sequence[Path], pictures: Sequence[Picture], room: int
 ) -> tuple[list[Part], list[str]]:
@@ -230,12 +217,8 @@ def _pictures(
 
 
 def _embedded(path: Path) -> tuple[str, int, int]:
-    """A data URI, and width and height in pixels of the page; a PNG becomes WebP, which is a fifth of it.
-
-    Raises:
-        ValueError: it is neither SVG nor PNG.
-        OSError: it cannot be read.
-    """
+    """A data URI, and width and height in pixels of the page; a PNG becomes WebP, which is a fifth of it. Raises
+    ValueError: it is neither SVG nor PNG."""
     if path.suffix == ".png":
         from PIL import Image
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,8 +31,7 @@ _MARK = "#00d5ff"  # in neither depth's nor sigma's colours
 _GAP, _MARGIN, _CAPTION, _BAR, _BARS, _TITLE = 0.06, 0.08, 0.2, 0.1, 0.62, 0.34
 
 
-@dataclass(frozen=True, eq=False)
-class Panel:
+class Panel(NamedTuple):
     """One picture [h, w, 3] uint8 with a caption above and a box outlined in it; None leaves a place with the words
     ``absent``.
     """
@@ -43,8 +42,7 @@ class Panel:
     absent: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class GridRow:
+class GridRow(NamedTuple):
     """Pictures side by side, with a bold title and small lines at their left."""
 
     title: str
@@ -53,27 +51,17 @@ class GridRow:
 
     def captioned(self, captions: Sequence[str]) -> GridRow:
         """The row with captions above its pictures."""
-        panels = [replace(panel, caption=caption) for panel, caption in zip(self.panels, captions, strict=True)]
-        return replace(self, panels=panels)
+        panels = [panel._replace(caption=caption) for panel, caption in zip(self.panels, captions, strict=True)]
+        return self._replace(panels=panels)
 
 
-@dataclass(frozen=True)
-class Bar:
-    """A colour bar below some columns.
-
-    Attributes:
-        label: the quantity, with its unit.
-        scale: the colours.
-        column: the first column.
-        span: number of columns.
-        extend: which ends are open: "both", "min", "max" or "neither".
-    """
+class Bar(NamedTuple):
+    """A colour bar below ``span`` columns, named by its quantity and unit."""
 
     label: str
     scale: ColourScale
     column: int
     span: int = 1
-    extend: str = "max"
 
 
 def draw_grid(
@@ -85,22 +73,11 @@ def draw_grid(
     title: str = "",
     cell: float = 1.95,
     words: float = 1.5,
-    dpi: int = 110,
 ) -> None:
     """Draw the rows below each other and write the picture (PNG), atomically.
 
-    Args:
-        path: the file; its folder must exist.
-        rows: at least one.
-        bars: below all rows.
-        aspect: height by width of a picture.
-        title: over all.
-        cell: width of a picture [in].
-        words: width of the words at the left [in].
-        dpi: pixels per inch.
-
-    Raises:
-        ImportError: matplotlib is missing.
+    ``aspect`` is height by width of a picture, ``cell`` and ``words`` the widths of a picture and of the words at the
+    left [in].
     """
     names = [break_name(row.title, max(8, int(12 * words))) for row in rows]
     named = [0.16 * (name.count("\n") + 1) + 0.05 for name in names]
@@ -110,7 +87,7 @@ def draw_grid(
     step = cell + _GAP
     width = _MARGIN + words + max(len(row.panels) for row in rows) * step - _GAP + _MARGIN
     top = (_TITLE if title else _MARGIN) + len(rows) * _GAP + sum(tall) + sum(heads) + _BARS
-    figure = new_sheet(width, top, title, dpi)
+    figure = new_sheet(width, top, title)
     top -= _TITLE if title else _MARGIN
     for row, name, above, head, height in zip(rows, names, named, heads, tall, strict=True):
         top -= head
@@ -133,16 +110,12 @@ def draw_grid(
     save_png(figure, path)
 
 
-def new_sheet(width: float, height: float, title: str, dpi: int = 110) -> Any:
-    """An empty figure with a title [in].
-
-    Raises:
-        ImportError: matplotlib is missing.
-    """
+def new_sheet(width: float, height: float, title: str) -> Any:
+    """An empty figure with a title [in]."""
     require_matplotlib()
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    figure = Figure(figsize=(width, height), dpi=110, facecolor="white")
     say(figure, _MARGIN, height - 0.2, title, size=11, weight="bold", color=INK, va="center")
     return figure
 
@@ -158,7 +131,7 @@ def axes_at(figure: Any, left: float, bottom: float, width: float, height: float
     return figure.add_axes((left / wide, bottom / high, width / wide, height / high))
 
 
-def break_name(name: str, letters: int = 20) -> str:
+def break_name(name: str, letters: int) -> str:
     """The name on as many lines as it needs, broken behind hyphens, underscores and blanks where it can be."""
     lines, rest = [], name
     while len(rest) > letters:
@@ -186,7 +159,7 @@ def _draw_panel(axes: Any, panel: Panel) -> None:
 
 
 def draw_bar(axes: Any, bar: Bar) -> None:
-    """A horizontal colour bar with its label in the axes; an open end has an arrow."""
+    """A horizontal colour bar with its label in the axes; an arrow at each end but 0, beyond which nothing lies."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
@@ -195,7 +168,7 @@ def draw_bar(axes: Any, bar: Bar) -> None:
         ScalarMappable(Normalize(bar.scale.low, bar.scale.high), bar.scale.colour_map),
         cax=axes,
         orientation="horizontal",
-        extend=bar.extend,
+        extend="max" if bar.scale.low == 0 else "both",
         extendfrac=0.03,
         ticks=MaxNLocator(5 * bar.span, steps=[1, 2, 5, 10]),
     )
@@ -218,20 +191,13 @@ MAPS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FramePanel:
-    """One frame to be shown.
+    """One frame to be shown: its image [H, W, 3] uint8 RGB of any size, and its maps [h, w] [m], NaN where unknown.
 
-    Attributes:
-        name: of the frame.
-        image: [H, W, 3] uint8 RGB; may have another size than the maps.
-        depth: [h, w] [m].
-        sigma: [h, w] standard deviation [m].
-        error: [h, w] |depth - ground truth| [m], NaN where there is none; or None for no ground truth at all.
-        valid: [h, w] bool, True where depth and sigma hold; None = everywhere finite.
-        note: a short line beside the name, "K = 31" say.
-        anchored: [h, w] the part of sigma that is due to anchors, sqrt(B) [m]; None of a run without.
-        posterior, posterior_sigma, posterior_error: [h, w] the same three of the posterior [m]; None of a run without.
+    ``maps`` has names of ``MAPS``: "depth" and "sigma" always, "error" with ground truth, "anchored" (the part of
+    sigma that is due to anchors) and those of the posterior of a run with them. ``note`` ("K = 31") stands beside the
+    name.
 
     Raises:
         ValueError: shapes or types disagree.
@@ -239,23 +205,20 @@ class FramePanel:
 
     name: str
     image: NDArray[np.uint8]
-    depth: NDArray[Any]
-    sigma: NDArray[Any]
-    error: NDArray[Any] | None = None
-    valid: NDArray[np.bool_] | None = None
+    maps: Mapping[str, NDArray[Any]]
     note: str = ""
-    anchored: NDArray[Any] | None = None
-    posterior: NDArray[Any] | None = None
-    posterior_sigma: NDArray[Any] | None = None
-    posterior_error: NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[-1] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be uint8 [H, W, 3], got {self.image.dtype} {self.image.shape}")
-        for label in (*MAPS, "valid"):
-            value = getattr(self, label)
-            if value is not None and value.shape != self.depth.shape:
-                raise ValueError(f"{label} must have the depth's shape {self.depth.shape}, got {value.shape}")
+        for label, value in self.maps.items():
+            if value.shape != self.shape:
+                raise ValueError(f"{label} must have the depth's shape {self.shape}, got {value.shape}")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(h, w) of the maps."""
+        return self.maps["depth"].shape
 
 
 class PanelScales(NamedTuple):
@@ -266,7 +229,7 @@ class PanelScales(NamedTuple):
 
 
 class MapColumn(NamedTuple):
-    """One kind of map: its name, its scale, and the field of ``FramePanel`` that holds it."""
+    """One kind of map: its label, its scale, and its name in ``MAPS``."""
 
     label: str
     scale: ColourScale
@@ -274,8 +237,14 @@ class MapColumn(NamedTuple):
 
     def rgb(self, panel: FramePanel) -> NDArray[np.uint8] | None:
         """[h, w, 3] the coloured map, None if the panel has none."""
-        values = getattr(panel, self.field)
-        return None if values is None else self.scale.rgb(values, panel.valid)
+        return self.scale.rgb(panel.maps[self.field]) if self.field in panel.maps else None
+
+
+def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
+    """The columns right of the image, of all maps that some panel has, on scales that fit all panels."""
+    scales = fit_scales(panels)._asdict()
+    shown = (name for name in MAPS if any(name in panel.maps for panel in panels))
+    return [MapColumn(MAPS[name][0], scales[MAPS[name][1]], name) for name in shown]
 
 
 def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
@@ -283,32 +252,18 @@ def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
 
     That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
     """
-    of = {name: [(m, p.valid) for p in panels if (m := getattr(p, name)) is not None] for name in MAPS}
+    of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
     depth = robust_range([*of["depth"], *of["posterior"]], from_zero=False)
     lengths = (of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name])
     high = max(robust_range(maps, from_zero=True)[1] for maps in lengths)
     return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(0.0, high, ERROR_MAP))
 
 
-def map_columns(panels: Sequence[FramePanel]) -> list[MapColumn]:
-    """The columns right of the image, of all maps that some panel has, on scales that fit all panels."""
-    scales = fit_scales(panels)
-    shown = (name for name in MAPS if any(getattr(panel, name) is not None for panel in panels))
-    return [MapColumn(MAPS[name][0], getattr(scales, MAPS[name][1]), name) for name in shown]
-
-
 def contact_sheet(
     panels: Sequence[FramePanel], path: str | Path, *, title: str = "", columns: Sequence[MapColumn] | None = None
 ) -> None:
-    """Draw the frames below each other and write the picture (PNG), atomically.
-
-    Neighbouring columns of one scale share a colour bar; invalid pixels are grey.
-
-    Args:
-        panels: at least one; three to six rows read well.
-        path: the file; its folder must exist.
-        title: over the sheet.
-        columns: right of the image; None = ``map_columns(panels)``.
+    """Draw the frames below each other and write the picture (PNG), atomically; neighbouring ``columns`` (None: of all
+    maps) of one scale share a colour bar.
 
     Raises:
         ValueError: there is no panel.
@@ -329,7 +284,7 @@ def contact_sheet(
     for scale, of_scale in groupby(columns, key=lambda column: column.scale):
         labels = [column.label for column in of_scale]
         words = f"{', '.join(labels) if len(labels) < 3 else 'σ and |error|'} [m]"
-        bars.append(Bar(words, scale, position, len(labels), "max" if scale.low == 0 else "both"))
+        bars.append(Bar(words, scale, position, len(labels)))
         position += len(labels)
-    height, width = panels[0].depth.shape
+    height, width = panels[0].shape
     draw_grid(Path(path), rows, bars, aspect=height / width, title=title, cell=2.4, words=1.2)

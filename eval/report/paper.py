@@ -13,23 +13,15 @@ from ufmstar_torch.eval.report.table import Cell
 
 @dataclass(frozen=True)
 class PaperTable:
-    """A table of the paper.
-
-    Attributes:
-        number, network, measured_on: its number, the depth network, data and machine.
-        columns: keys, those of ``Record.figures`` where they mean the same.
-        rows: cells as printed, by method and column; a column in which a dash is printed is missing.
-        suite: the suite that repeats it, "" = none.
-        alone: latency_ms and memory_mb of the network without uncertainty, as printed (table 2).
-    """
+    """A table of the paper."""
 
     number: int
     network: str
-    measured_on: str
-    columns: tuple[str, ...]
-    rows: Mapping[str, Mapping[str, Cell]]
-    suite: str = ""
-    alone: Mapping[str, str] = field(default_factory=dict)
+    measured_on: str  # data and machine
+    columns: tuple[str, ...]  # keys, those of Record.figures where they mean the same
+    rows: Mapping[str, Mapping[str, Cell]]  # as printed, by method and column; without those that print a dash
+    suite: str = ""  # that repeats it
+    alone: Mapping[str, str] = field(default_factory=dict)  # latency_ms, memory_mb without uncertainty (table 2)
 
 
 @cache

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
-from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, known_where, robust_range
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.examples import Example, Map, RowMaps, deviation, find_examples
+from ufmstar_torch.eval.report.examples import Example, Map, RowMaps, find_examples
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
@@ -39,29 +39,18 @@ ZOOM = 1 / 3
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture.
+    """One picture, as pictures.json lists it."""
 
-    Attributes:
-        file: name within the figures' folder.
-        kind: "strip", "breakdown", "compare" or "room".
-        title: what it shows, a few words.
-        caption: how to read it.
-        alt: what a reader who cannot see it should know.
-    """
-
-    file: str
-    kind: str
+    file: str  # name within the figures' folder
+    kind: str  # "strip", "breakdown", "compare" or "room"
     title: str
-    caption: str
-    alt: str
+    caption: str  # how to read it
+    alt: str  # for a reader who cannot see it
 
 
 def pictures_of(results: Results, folder: Path) -> Iterator[tuple[str, Callable[[], Picture]]]:
     """Name and function of strips, breakdowns, comparisons and rooms of the example frames; the function writes the
-    picture into ``folder``.
-
-    Raises:
-        ValueError: an example cannot be read; the message names the file.
+    picture into ``folder``. Raises ValueError: an example cannot be read; the message names the file.
     """
     rows = {row.slug: row for row in results.rows}
     yield from _of_frames(results, folder, rows)
@@ -174,8 +163,8 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
 
 def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
     """Scales over the truth and these rows of a frame: depth between percentiles 1 and 99, lengths from 0 to 99."""
-    depths = [(example.truth, example.truth > 0), *((example.rows[r].depth, example.rows[r].valid) for r in rows)]
-    lengths = [(value, None) for r in rows for value in (example.error(r), example.rows[r].sigma)]
+    depths = [known_truth(example), *(known_depth(example.rows[row]) for row in rows)]
+    lengths = [value for row in rows for value in (example.error(row), example.rows[row].sigma)]
     depth, length = robust_range(depths, from_zero=False), robust_range(lengths, from_zero=True)
     return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(*length, ERROR_MAP))
 
@@ -183,17 +172,17 @@ def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
 def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -> Picture:
     """Image and truth, then depth, error, standard deviation and NLL of each row of a base, on common scales."""
     scales = fit_strip_scales(example, rows)
-    truth = Panel(scales.depth.rgb(example.truth, example.truth > 0), "ground truth")
+    truth = Panel(scales.depth.rgb(known_truth(example)), "ground truth")
     head = GridRow(example.sequence, [f"frame {example.frame}"], [Panel(example.image, "image"), truth])
     body = []
     for row in rows:
-        depth = Panel(scales.depth.rgb(example.rows[row].depth, example.rows[row].valid))
+        depth = Panel(scales.depth.rgb(known_depth(example.rows[row])))
         body.append(GridRow(example.label(row), figures_of(example, row), [depth, *_judged(example, row, scales)]))
     body[0] = body[0].captioned(("predicted depth", "|error|", "σ = √V", "NLL"))
     bars = [
-        Bar("depth [m]", scales.depth, 0, extend="both"),
+        Bar("depth [m]", scales.depth, 0),
         Bar("|error| and σ [m]", scales.length, 1, span=2),
-        Bar("NLL [nats]", NLL_SCALE, 3, extend="both"),
+        Bar("NLL [nats]", NLL_SCALE, 3),
     ]
     words = (
         Method(base).name,
@@ -212,15 +201,15 @@ def draw_breakdown(folder: Path, example: Example, rows: Sequence[str]) -> Pictu
     body = []
     for row in rows:
         maps = example.rows[row]
-        parts = [_part(p, maps, scales.length) for p in (maps.aleatoric, maps.epistemic, maps.disagreement)]
+        parts = [
+            Panel(None if part is None else scales.length.rgb(maps.root(part)), absent="none")
+            for part in (maps.aleatoric, maps.epistemic, maps.disagreement)
+        ]
         error, sigma, nll = _judged(example, row, scales)
         body.append(GridRow(example.label(row), figures_of(example, row), [*parts, sigma, error, nll]))
     captions = ("√A, aleatoric", "√E, epistemic", "√M, between views", "σ = √V, V = A + E + M", "|error|", "NLL")
     body[0] = body[0].captioned(captions)
-    bars = [
-        Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5),
-        Bar("NLL [nats]", NLL_SCALE, 5, extend="both"),
-    ]
+    bars = [Bar("√A, √E, √M, σ and |error| [m]", scales.length, 0, span=5), Bar("NLL [nats]", NLL_SCALE, 5)]
     words = (
         "what the variance is made of",
         "The parts add up as variances, V = A + E + M; shown are their square roots, in metres, on one scale with the "
@@ -238,7 +227,7 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     old, new = example.rows[ufm].sigma, example.rows[ufm_star].sigma
     difference = new - old
     box = largest_difference(difference, ZOOM)
-    reach = robust_range([(np.abs(difference), None)], from_zero=True)[1]
+    reach = robust_range([np.abs(difference)], from_zero=True)[1]
     signed = ColourScale(-reach, reach, DIFFERENCE_MAP)
     maps = {
         "image": example.image,
@@ -251,14 +240,11 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
     whole = [Panel(picture, name, b) for (name, picture), b in zip(maps.items(), boxes, strict=True)]
     enlarged = [Panel(p[top : top + h, x : x + w]) for p, (x, top, w, h) in zip(maps.values(), boxes, strict=True)]
     lines = [line for row in pair for line in (f"{example.label(row)}:", *figures_of(example, row))]
-    rows = [
+    grid = [
         GridRow(example.sequence, [f"frame {example.frame}"], whole),
         GridRow("where they differ most", lines, enlarged),
     ]
-    bars = [
-        Bar("|error| and σ [m]", scales.length, 1, span=3),
-        Bar("UfM* minus UfM [m]", signed, 4, extend="both"),
-    ]
+    bars = [Bar("|error| and σ [m]", scales.length, 1, span=3), Bar("UfM* minus UfM [m]", signed, 4)]
     words = (
         f"{example.label(ufm_star)} against {example.label(ufm)}",
         "Red: UfM* is the less sure of the two; blue: the surer. The blue box marks where they differ most on average, "
@@ -266,17 +252,13 @@ def draw_comparison(folder: Path, example: Example, pair: Sequence[str], base: s
         "Standard deviations and their difference,",
     )
     picture = _picture(example, pair, COMPARE, base, words)
-    draw_grid(folder / picture.file, rows, bars, aspect=example.aspect)
+    draw_grid(folder / picture.file, grid, bars, aspect=example.aspect)
     return picture
 
 
 def largest_difference(difference: NDArray[Any], share: float) -> Box:
-    """The box with the largest mean |difference| [h, w], missing values (NaN) counting as none; the first such box from
-    the top left.
-
-    Returns:
-        (left, top, width, height) [px]; its side by that of the map is ``share``, in (0, 1].
-    """
+    """The box, of a ``share`` of each side, with the largest mean |difference| [h, w], NaN counting as 0; the first
+    such box from the top left."""
     h, w = difference.shape
     height, width = max(1, round(share * h)), max(1, round(share * w))
     size = np.where(np.isfinite(difference), np.abs(difference), 0).astype(np.float64)
@@ -295,17 +277,20 @@ def _scaled(box: Box, shape: tuple[int, ...], picture: tuple[int, ...]) -> Box:
     return round(left * x), round(top * y), max(1, round(width * x)), max(1, round(height * y))
 
 
+def known_truth(example: Example) -> Map:
+    """[h, w] ground truth [m], NaN where there is none."""
+    return known_where(example.truth > 0, example.truth)
+
+
+def known_depth(maps: RowMaps) -> Map:
+    """[h, w] predicted depth [m], NaN where invalid."""
+    return known_where(maps.valid, maps.depth)
+
+
 def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:
     """|error|, sigma and NLL of a row."""
     error, sigma = scales.length.rgb(example.error(row)), scales.length.rgb(example.rows[row].sigma)
     return Panel(error), Panel(sigma), Panel(NLL_SCALE.rgb(example.nll(row)))
-
-
-def _part(part: Map | None, maps: RowMaps, scale: ColourScale) -> Panel:
-    if part is None:
-        return Panel(None, absent="none")
-    usable = maps.valid & np.isfinite(part) & (part >= 0)
-    return Panel(scale.rgb(deviation(part, usable)))
 
 
 def figures_of(example: Example, row: str) -> list[str]:

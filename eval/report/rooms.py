@@ -21,6 +21,7 @@ SIGMAS = float(np.sqrt(3.0))
 # A ceiling hides the room from above; the highest camera is held well below it [m].
 HEADROOM = 0.3
 MOST_TIMES = 4
+ELEVATION = 35.0  # degrees
 _PATH = "#00a6d6"
 _STORED = ("mean_world", "covariance_world", "disagreement", "T_world_cam")
 _CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.3, 0.62, 0.66  # inches
@@ -28,23 +29,14 @@ _CELL, _LEFT, _TOP, _BOTTOM = 3.1, 0.3, 0.62, 0.66  # inches
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A mixture after some frame, in world coordinates.
-
-    Attributes:
-        frame: its name.
-        mean: [K, 3] [m].
-        covariance: [K, 3, 3] [m^2].
-        disagreement: [K] m [m^2].
-        T_world_cam: [4, 4] the camera then.
-        path: [n, 3] where the camera has been until then [m]; n may be 1.
-    """
+    """A mixture after some frame, in world coordinates, and the camera then."""
 
     frame: str
-    mean: Array
-    covariance: Array
-    disagreement: Array
-    T_world_cam: Array
-    path: Array
+    mean: Array  # [K, 3] [m]
+    covariance: Array  # [K, 3, 3] [m^2]
+    disagreement: Array  # [K] m [m^2]
+    T_world_cam: Array  # [4, 4]
+    path: Array  # [n, 3] where the camera has been until then [m]; n may be 1
 
     @property
     def root(self) -> Array:
@@ -59,10 +51,8 @@ class Snapshot:
 
 
 def find_rooms(folder: Path) -> dict[str, list[Snapshot]]:
-    """The snapshots of one sequence, ``OUT/records/DATASET/SEQUENCE``, by row, in the order of their frames.
-
-    Raises:
-        ValueError: a file cannot be read or holds something else; the message names it.
+    """The snapshots of one sequence, ``OUT/records/DATASET/SEQUENCE``, by row, in the order of their frames. Raises
+    ValueError: a file cannot be read or holds something else; the message names it.
     """
     rooms: dict[str, list[Snapshot]] = {}
     for file in sorted((folder / "room").glob("*.npz"), key=lambda f: _natural(f.stem)):
@@ -84,15 +74,11 @@ def choose_times(snapshots: Sequence[Snapshot], most: int = MOST_TIMES) -> list[
 
 def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourScale:
     """Draw each time in a column, from above and obliquely, with the camera's path, on one scale of sqrt(m) [m], which
-    is returned; write the picture (PNG).
-
-    Raises:
-        ValueError: there is no snapshot, or none with a Gaussian.
-        ImportError: matplotlib is missing.
+    is returned; write the picture (PNG). Raises ValueError: no snapshot has a Gaussian.
     """
     if not any(len(snapshot.mean) for snapshot in snapshots):
         raise ValueError("snapshots must hold at least one Gaussian")
-    scale = ColourScale(*robust_range([(snapshot.root, None) for snapshot in snapshots], from_zero=True), ERROR_MAP)
+    scale = ColourScale(*robust_range([snapshot.root for snapshot in snapshots], from_zero=True), ERROR_MAP)
     views = views_of(np.stack([snapshot.T_world_cam for snapshot in snapshots]))
     shown = [below_ceiling(snapshot, views[0].towards, snapshots) for snapshot in snapshots]
     limits = [_limits(view, shown) for view in views]
@@ -202,13 +188,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """An orthographic camera.
-
-    Attributes:
-        right: [3] unit vector that points right in the picture, in the world.
-        up: [3] the one that points up.
-        name: "from above", say.
-    """
+    """An orthographic camera, by the unit vectors [3] of the world that point right and up in its picture."""
 
     right: Array
     up: Array
@@ -225,15 +205,10 @@ class Projection:
 
 
 def project(view: Projection, covariance: Array) -> tuple[Array, Array]:
-    """The ellipses of Gaussians: P Sigma P^T is the covariance in the picture, P the view's two rows.
+    """The ellipses of Gaussians of covariance [K, 3, 3] [m^2]: P Sigma P^T in the picture, P the view's two rows.
 
-    Args:
-        view: the camera.
-        covariance: [K, 3, 3] in the world [m^2].
-
-    Returns:
-        [K, 2] semi-axes of ``SIGMAS`` standard deviations, the longer first [m], and [K] the angle of the longer one,
-        from right towards up, in (-90, 90] [degrees].
+    Returns [K, 2] semi-axes of ``SIGMAS`` standard deviations, the longer first [m], and [K] the angle of the longer
+    one, from right towards up, in (-90, 90] [degrees].
     """
     P = np.stack([view.right, view.up])
     flat = P @ covariance @ P.T
@@ -244,8 +219,8 @@ def project(view: Projection, covariance: Array) -> tuple[Array, Array]:
     return axes, np.degrees(np.arctan2(2 * b, a - c) / 2)
 
 
-def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[Projection, Projection]:
-    """From above, and obliquely from behind the first of cameras [n, 4, 4], ``elevation`` over the horizon [degrees].
+def views_of(T_world_cam: Array) -> tuple[Projection, Projection]:
+    """From above, and obliquely from behind the first of cameras [n, 4, 4], ``ELEVATION`` over the horizon.
 
     Data sets differ in which axis points up; a camera's own up (-y) is right on average.
     """
@@ -255,7 +230,7 @@ def views_of(T_world_cam: Array, elevation: float = 35.0) -> tuple[Projection, P
     fallback = np.eye(3)[np.argmin(np.abs(up))]
     forward = _unit(first - up * (first @ up), _unit(fallback - up * (fallback @ up), fallback))
     right = np.cross(forward, up)
-    tilt = np.radians(elevation)
+    tilt = np.radians(ELEVATION)
     oblique = Projection(right, np.cos(tilt) * up + np.sin(tilt) * forward, "obliquely")
     return Projection(right, forward, "from above"), oblique
 

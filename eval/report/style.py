@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +17,7 @@ TITLE, LABEL, TICK = 11, 9, 8  # sizes of letters [pt]
 DPI = 130
 
 
-@dataclass(frozen=True)
-class Style:
+class Style(NamedTuple):
     """A line's colour (Okabe and Ito's, which the colour-blind tell apart) and mark (for print in grey)."""
 
     colour: str
@@ -57,11 +55,7 @@ def short_name(method: Method) -> str:
 
 
 def new_figure(width: float, height: float, title: str) -> Any:
-    """A figure with a title [inches].
-
-    Raises:
-        ImportError: matplotlib is missing; names the extra that brings it.
-    """
+    """A figure with a title [inches]."""
     require_matplotlib()
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -113,8 +107,8 @@ def spread_apart(places: Sequence[float], gap: float, low: float, high: float) -
 
 
 def label_ends(axes: Any, ends: Sequence[tuple[float, str, str]]) -> None:
-    """Names right of a panel, level with where their lines end, and apart from each other; call it when the limits of y
-    stand. An end is (y of the line's end, name, colour)."""
+    """Names right of a panel, level with where their lines end, and apart from each other, for final limits of y; an
+    end is (y of the line's end, name, colour)."""
     transform = axes.transData + axes.transAxes.inverted()
     x = axes.get_xlim()[1]
     wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _, _ in ends]
@@ -136,11 +130,7 @@ def stretch(axes: Any, values: Sequence[float], factor: float, **about_zero: flo
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, by its suffix (.svg or .png); the same figure gives the same bytes.
-
-    Raises:
-        OSError: see ``write_atomic``.
-    """
+    """Write a figure, by its suffix (.svg or .png); the same figure gives the same bytes."""
     matplotlib = require_matplotlib()
     kind = path.suffix.removeprefix(".")
     plain = {"Date": None} if kind == "svg" else {"Software": None}

@@ -59,23 +59,11 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table. Raises ValueError: a line has another number of cells than there are columns."""
 
-    Attributes:
-        name: of its files.
-        title: its caption.
-        first: heading of the labels.
-        columns: headings of the columns.
-        lines: the rows of all blocks.
-        notes: sentences below.
-
-    Raises:
-        ValueError: a line has another number of cells than there are columns.
-    """
-
-    name: str
+    name: str  # of its files
     title: str
-    first: str
+    first: str  # heading of the labels
     columns: Sequence[Column]
     lines: Sequence[Line]
     notes: Sequence[str] = ()
@@ -174,22 +162,24 @@ _LATEX = {
 
 def latex(table: Table) -> str:
     """A ``table`` environment, set as the paper's; the document needs the package booktabs."""
-    labels = [latex_text(line.label) for line in table.lines]
-    labels = [rf"\textbf{{{label}}}" if line.bold else label for label, line in zip(labels, table.lines, strict=True)]
-    columns: pd.Index = pd.Index([c.latex for c in table.columns], name=latex_text(table.first))
+    caption = " ".join([f"{latex_text(table.title)}.", *map(latex_text, table.notes)])
+    lines = [r"% needs \usepackage{booktabs}", r"\begin{table}[t]", r"\centering", rf"\caption{{{caption}}}"]
+    lines.append(rf"\label{{tab:{re.sub(r'[^A-Za-z0-9.-]+', '-', table.name)}}}")
+    lines += [rf"\begin{{tabular}}{{l{'c' * len(table.columns)}}}", r"\toprule"]
     if table.groups:
-        columns = pd.MultiIndex.from_arrays([[latex_text(c.group) for c in table.columns], columns])
-    cells = [list(map(_latex_cell, line.cells)) for line in table.lines]
-    text = pd.DataFrame(cells, index=labels, columns=columns, dtype=object).style.to_latex(
-        hrules=True,
-        column_format=f"l{'c' * len(table.columns)}",
-        position="t",
-        position_float="centering",
-        caption=" ".join([f"{latex_text(table.title)}.", *map(latex_text, table.notes)]),
-        label=f"tab:{re.sub(r'[^A-Za-z0-9.-]+', '-', table.name)}",
-        multicol_align="c",
-    )
-    return f"% needs \\usepackage{{booktabs}}\n{_ruled(table, text)}"
+        spans, rules, start = [], "", 2
+        for name, count in table.groups:
+            spans.append(rf"\multicolumn{{{count}}}{{c}}{{{latex_text(name)}}}" if count > 1 else latex_text(name))
+            rules += rf"\cmidrule(lr){{{start}-{start + count - 1}}}" if name else ""
+            start += count
+        lines += [_latex_row("", spans), rules]
+    lines += [_latex_row(latex_text(table.first), [column.latex for column in table.columns]), r"\midrule"]
+    for number_, block in enumerate(table.blocks):
+        lines += [r"\addlinespace"] if number_ else []
+        for line in block:
+            label = rf"\textbf{{{latex_text(line.label)}}}" if line.bold else latex_text(line.label)
+            lines.append(_latex_row(label, map(_latex_cell, line.cells)))
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
 
 
 def latex_text(text: str) -> str:
@@ -197,23 +187,8 @@ def latex_text(text: str) -> str:
     return "".join(_LATEX.get(character, character) for character in text)
 
 
-def _ruled(table: Table, text: str) -> str:
-    """The text of pandas' Styler with rules below the groups of columns, and a gap between blocks."""
-    top, body = text.split("\\midrule\n")
-    if table.groups:
-        rules, start = "", 2
-        for name, count in table.groups:
-            rules += rf"\cmidrule(lr){{{start}-{start + count - 1}}}" if name else ""
-            start += count
-        *above, heads = top.splitlines()
-        top = "\n".join([*above, rules, heads, ""])
-    rows = body.splitlines(keepends=True)
-    spaced = []
-    for number_, line in enumerate(table.lines):
-        if number_ and line.block != table.lines[number_ - 1].block:
-            spaced.append("\\addlinespace\n")
-        spaced.append(rows[number_])
-    return "".join([top, "\\midrule\n", *spaced, *rows[len(table.lines) :]])
+def _latex_row(label: str, cells: Iterable[str]) -> str:
+    return rf"{' & '.join([label, *cells])} \\"
 
 
 def _latex_cell(cell: Cell) -> str:

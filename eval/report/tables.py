@@ -222,13 +222,8 @@ def _cost_note(efficiency: Mapping[str, Any]) -> str:
 
 
 def write_tables(results: Results) -> list[Path]:
-    """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: main, extra and differences over all sequences and, where there
-    are several data sets, over those of each, ``sequences-DATASET`` for single sequences, and ``efficiency`` with the
-    paper's table 2 below ours where it was measured; their paths.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
+    """Write ``tables/NAME.md``, ``.tex`` and ``.csv``: those of :func:`overview`, ``sequences-DATASET`` for single
+    sequences, and ``efficiency`` with the paper's table 2 below ours where it was measured; their paths."""
     folder = results.out / "tables"
     folder.mkdir(exist_ok=True)
     written = []
@@ -244,11 +239,18 @@ def write_tables(results: Results) -> list[Path]:
     return written
 
 
-def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
+def overview(results: Results) -> dict[str, dict[str | None, Table]]:
+    """The main table, paired differences and further figures by title: over all sequences (None) and, where there are
+    several data sets, over those of each, as far as they are not empty."""
     each = results.datasets if len(results.datasets) > 1 else ()
-    for dataset in (None, *each):
-        for make in (main_table, extra_table, difference_table):
-            table = make(results, dataset)
+    makers = {"The main table": main_table, "Paired differences": difference_table, "Further figures": extra_table}
+    made = {title: {over: make(results, over) for over in (None, *each)} for title, make in makers.items()}
+    return {title: {k: table for k, table in tables.items() if not table.is_empty} for title, tables in made.items()}
+
+
+def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
+    for tables in overview(results).values():
+        for dataset, table in tables.items():
             yield table.name if dataset is None else f"{table.name}-{dataset}", [table]
     for dataset in results.datasets:
         yield f"sequences-{dataset}", sequence_tables(results, dataset)
@@ -259,11 +261,7 @@ def _table_files(results: Results) -> Iterator[tuple[str, list[Table]]]:
 
 def write_tidy(results: Results) -> list[Path]:
     """Write ``results.json``, ``results.csv`` (a line per figure) and ``table.csv`` (means over sequences; the data set
-    "*" stands for all together); their paths.
-
-    Raises:
-        OSError: a file cannot be written.
-    """
+    "*" stands for all together); their paths."""
     lines = [
         {**_of(record, record.dataset, record.sequence), "figure": key, "value": value}
         for record in results.records

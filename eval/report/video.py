@@ -13,37 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import colour_table, require_matplotlib
+from ufmstar_torch.eval.report.colours import FAINT, INK, colour_table, require_matplotlib
 from ufmstar_torch.eval.report.panels import FramePanel, MapColumn
 
 GAP, HEAD, FOOT, BAR = 4, 22, 36, 8  # pixels
-PAPER, INK, FAINT = (255, 255, 255), (26, 26, 26), (107, 107, 107)
 
 
-def preview_frame(
-    panel: FramePanel, columns: Sequence[MapColumn], *, cell_height: int | None = None
-) -> NDArray[np.uint8]:
-    """One video frame: the image and maps side by side, with names, colour bars and units.
-
-    Args:
-        panel: the frame.
-        columns: the maps, fixed for the whole video: ``map_columns`` of a few frames, say.
-        cell_height: height of each map [px], its width follows; None = 240, or less for maps wider than 16:9.
-
-    Returns:
-        [H, W, 3] uint8 RGB, H and W even.
-
-    Raises:
-        ImportError: Pillow or matplotlib is missing.
-    """
+def preview_frame(panel: FramePanel, columns: Sequence[MapColumn]) -> NDArray[np.uint8]:
+    """[H, W, 3] uint8 RGB, H and W even: the image and maps side by side, 240 px high (less if wider than 16:9), with
+    names, colour bars and units. Raises ImportError: Pillow or matplotlib is missing."""
     from PIL import Image, ImageDraw
 
-    height, width = panel.depth.shape
-    if cell_height is None:
-        cell_height = min(240, max(1, round(427 * height / width)))
+    height, width = panel.shape
+    cell_height = min(240, max(1, round(427 * height / width)))
     cell_width = max(1, round(cell_height * width / height))
     total = (1 + len(columns)) * (cell_width + GAP) - GAP
-    canvas = Image.new("RGB", (total + total % 2, (HEAD + cell_height + FOOT + 1) // 2 * 2), PAPER)
+    canvas = Image.new("RGB", (total + total % 2, (HEAD + cell_height + FOOT + 1) // 2 * 2), "white")
     draw = ImageDraw.Draw(canvas)
     pictures = [panel.image, *(column.rgb(panel) for column in columns)]
     for number, picture in enumerate(pictures):
@@ -75,16 +60,16 @@ def _draw_bar(canvas: Any, draw: Any, left: int, width: int, top: int, column: M
     _text(draw, (left + width - 1, top + BAR + 15), f"≥ {scale.high:.2g}", FAINT, "rm")
 
 
-def _text(draw: Any, at: tuple[int, int], text: str, colour: tuple[int, int, int], anchor: str) -> None:
-    draw.text(at, text, fill=colour, anchor=anchor, font=_font(12))
+def _text(draw: Any, at: tuple[int, int], text: str, colour: str, anchor: str) -> None:
+    draw.text(at, text, fill=colour, anchor=anchor, font=_font())
 
 
 @cache
-def _font(size: int) -> Any:
+def _font() -> Any:
     """DejaVu Sans, which matplotlib brings: Pillow's own font has neither σ nor ≥."""
     from PIL import ImageFont
 
-    return ImageFont.truetype(Path(require_matplotlib().get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
+    return ImageFont.truetype(Path(require_matplotlib().get_data_path()) / "fonts/ttf/DejaVuSans.ttf", 12)
 
 
 @contextmanager
@@ -92,8 +77,8 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[NDArray[np.u
     """Write an H.264 mp4 with imageio, ``fps`` frames per second; the value appends a frame [H, W, 3] uint8 RGB, H and
     W even and the same for all.
 
-    The file appears under its name (ending in .mp4, in an existing folder) when the block ends, also when it ends by
-    Ctrl-C or an error: it then holds the frames so far. Without a frame there is no file.
+    The file (.mp4, in an existing folder) takes its name when the block ends, also by Ctrl-C or an error: it then holds
+    the frames so far. Without a frame there is no file.
 
     Raises:
         ImportError: imageio or imageio-ffmpeg is missing; names the extra that brings it.

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.report.data import Results, load_results
+from ufmstar_torch.eval.report.figures_cost import draw_latency, draw_stages, draw_tradeoff
+from ufmstar_torch.eval.report.figures_curves import (
+    draw_calibration,
+    draw_entropy,
+    draw_error,
+    draw_sequence_calibration,
+)
+from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep, sweeps
+from ufmstar_torch.eval.report.page import write_page
+from ufmstar_torch.eval.report.pictures import Picture, pictures_of
+from ufmstar_torch.eval.report.style import save_figure
 from ufmstar_torch.eval.report.tables import write_tables, write_tidy
 from ufmstar_torch.eval.results.files import remove_temporaries, write_json_atomic
 
@@ -17,34 +30,23 @@ KINDS = ("svg", "png")
 _DRAWING_ERRORS = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
 
 
-@dataclass(frozen=True)
-class Report:
-    """A written report.
-
-    Attributes:
-        files: in the order in which they were written.
-        undrawn: reasons by name of the figures that could not be drawn.
-    """
+class Report(NamedTuple):
+    """The files of a report in the order in which they were written, and why some figures could not be drawn."""
 
     files: list[Path]
-    undrawn: Mapping[str, str] = field(default_factory=dict)
+    undrawn: Mapping[str, str]
 
 
 def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> Report:
-    """Write the report of an evaluation, finished or not.
+    """Write the report of an evaluation, finished or not, into its folder.
 
-    A figure that cannot be drawn is left out, and named on the page and in ``Report.undrawn``.
-
-    Args:
-        out: the folder of ``ufmstar eval``.
-        figures: False = tables and results alone, without a page; needs no matplotlib.
-        pictures: kind of the figures, "svg" or "png".
+    ``figures=False`` writes tables and results alone, without a page, and needs no matplotlib; ``pictures`` is the
+    format of figures, "svg" or "png". A figure that cannot be drawn is left out, and named on the page.
 
     Raises:
         ResultsError: the folder is no evaluation, or its records do not belong together.
         ValueError: another kind of figures, or a file with an example that cannot be read.
         ImportError: matplotlib, Pillow or Jinja2 is missing.
-        OSError: a file cannot be written.
     """
     if pictures not in KINDS:
         raise ValueError(f"figures must be {' or '.join(KINDS)}, got {pictures!r}")
@@ -59,13 +61,27 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> R
     return Report(files, undrawn)
 
 
+def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Name (its first word is the kind) and function of every figure; None where there is nothing to draw."""
+    for dataset in results.datasets:
+        yield f"calibration {dataset}", partial(draw_calibration, results, dataset)
+        for base in results.bases:
+            name = f"calibration sequences {dataset} {base}"
+            yield name, partial(draw_sequence_calibration, results, dataset, base)
+        yield f"error {dataset}", partial(draw_error, results, dataset)
+    for base in results.bases:
+        yield f"entropy {base}", partial(draw_entropy, results, base)
+    for base, name in sweeps(results):
+        yield f"sweep {base} {name}", partial(draw_sweep, results, base, name)
+    for base in results.bases:
+        yield f"sweep changes {base}", partial(draw_changes, results, base)
+    yield "latency", partial(draw_latency, results)
+    yield "latency stages", partial(draw_stages, results)
+    yield "tradeoff", partial(draw_tradeoff, results)
+
+
 def _draw(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:
     """Draw figures and pictures into ``figures/``, with an index of the pictures, and write the page; their paths."""
-    from ufmstar_torch.eval.report.figures import figures_of
-    from ufmstar_torch.eval.report.page import write_page
-    from ufmstar_torch.eval.report.pictures import Picture, pictures_of
-    from ufmstar_torch.eval.report.style import save_figure
-
     folder = results.out / "figures"
     folder.mkdir(exist_ok=True)
     figures: list[Path] = []

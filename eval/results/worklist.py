@@ -143,7 +143,7 @@ def _below(root: str) -> list[WorkItem]:
     dataset, path = (match["dataset"], match["path"]) if match else (None, root)
     if path.startswith(f"{TOUR}:"):
         return [WorkItem(dataset or TOUR, path, path, "auto")]
-    from ufmstar_torch.eval.sequences.find import find_sequences
+    from ufmstar_torch.eval.sequences.layout import find_sequences
 
     sequences = find_sequences(path)
     if not sequences:

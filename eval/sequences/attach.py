@@ -28,13 +28,14 @@ _MIN_STEP = 1e-3
 # [1] Share of images (or poses) with a partner from which on whole numbers are taken for frame numbers.
 _MOST = 0.5
 
-Poses = list[np.ndarray | None]
 # [4, 4] of a frame that gets its pose from a trajectory.
 UNKNOWN = np.full((4, 4), np.nan)
 
 
-def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options) -> Poses:
-    """The pose [4, 4] (camera-to-world) of each image, None where the trajectory has none.
+def attach(
+    frames: Sequence[Entry | Skipped], times: np.ndarray | None, trajectory: Trajectory, options: Options
+) -> list[Entry | Skipped]:
+    """The frames with the poses (camera-to-world) of a trajectory; those without a pose are skipped.
 
     Without timestamps in the trajectory, pose i belongs to the i-th image. With them, the pose is interpolated at the
     image's time. Whole numbers that are those in the images' names (``frame-000012``) are frame numbers, unless ``fps``
@@ -42,8 +43,8 @@ def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajector
     times only then.
 
     Args:
-        names: of all images on disk, in order.
-        times: [N] of the images [s], or None where only the names may hold them.
+        frames: all on disk, in order.
+        times: [N] of the frames [s], or None where only the names may hold them.
         trajectory: the poses.
         options: ``max_pose_gap``, ``fps`` and ``time_offset``.
 
@@ -51,57 +52,17 @@ def attach(names: Sequence[str], times: np.ndarray | None, trajectory: Trajector
         ValueError: more or fewer poses than images; the images' times are not known; no image has a pose (both time
             ranges are given).
     """
-    if trajectory.timestamps is None:
-        if len(trajectory) != len(names):
-            raise ValueError(
-                f"trajectory has {len(trajectory)} poses for {len(names)} images: without timestamps, there "
-                "must be one for each"
-            )
-        return list(trajectory.T_world_cam)
-    times, trajectory = _comparable(names, times, trajectory, options)
-    poses = [interpolate_pose(trajectory, float(time), options.max_pose_gap) for time in times]
-    if all(T is None for T in poses):
-        known = trajectory.timestamps
-        assert known is not None
-        gap = f", {np.median(np.diff(known)):.3g} s apart in the median" if len(known) > 1 else ""
-        raise ValueError(
-            f"no image has a pose: images lie at {times[0]:.3f} to {times[-1]:.3f} s, the trajectory's "
-            f"{len(known)} poses at {known[0]:.3f} to {known[-1]:.3f} s{gap}, used where they lie at most "
-            f"{options.max_pose_gap:g} s apart; see --max-pose-gap, --time-offset and --fps"
-        )
-    return poses
-
-
-def _comparable(
-    names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
-) -> tuple[np.ndarray, Trajectory]:
-    """Times of images and poses in the same unit: seconds or frame numbers; ValueError where they are not known."""
-    stamps = trajectory.timestamps
-    assert stamps is not None
-    numbers = None if options.fps is not None else _as_frame_numbers(names, stamps, times is not None)
-    if numbers is not None:
-        return numbers, trajectory
-    if times is None:
-        raise ValueError(
-            f"images: the name {names[0]!r} is no timestamp, there is no rgb.txt, and the trajectory's timestamps "
-            f"({stamps[0]:g}, ...) are no frame numbers of the images: pass fps (and time_offset)"
-        )
-    trajectory = in_seconds(trajectory, times)
-    if trajectory.timestamps is not None and not _meet(trajectory.timestamps, times):
-        numbers = None if options.fps is not None else _as_frame_numbers(names, stamps, False)
-    return (times if numbers is None else numbers), trajectory
-
-
-def _as_frame_numbers(names: Sequence[str], stamps: np.ndarray, timed: bool) -> np.ndarray | None:
-    """[N] the images' numbers, if the trajectory's timestamps are frame numbers.
-
-    ``timed`` images must have a pose each, most of them, since 0, 1, 2, ... could be seconds as well.
-    """
-    numbers = frame_numbers(names)
-    if numbers is None or not bool((stamps == np.floor(stamps)).all()):
-        return None
-    shares = [np.isin(numbers, stamps).mean(), np.isin(stamps, numbers).mean()]
-    return numbers if (shares[0] if timed else max(shares)) >= _MOST else None
+    poses = _poses([frame.name for frame in frames], times, trajectory, options)
+    attached: list[Entry | Skipped] = []
+    for i, (frame, T) in enumerate(zip(frames, poses, strict=True)):
+        if isinstance(frame, Skipped):
+            attached.append(frame)
+        elif T is None:
+            attached.append(Skipped(frame.name, f"no pose within {options.max_pose_gap:g} s around the image"))
+        else:
+            time = frame.timestamp if times is None else float(times[i])
+            attached.append(replace(frame, T_world_cam=T, timestamp=time))
+    return attached
 
 
 def attach_given(
@@ -117,29 +78,61 @@ def attach_given(
     """
     if options.trajectory is None:
         return list(frames)
-    names = [frame.name for frame in frames]
     if options.fps is not None:
-        numbers = frame_numbers(names)
-        times = (np.arange(len(names)) if numbers is None else numbers) / options.fps
+        numbers = frame_numbers([frame.name for frame in frames])
+        times = (np.arange(len(frames)) if numbers is None else numbers) / options.fps
     if times is not None:
         times = times + options.time_offset
-    trajectory = read_trajectory(resolve(root, options.trajectory))
-    poses = attach(names, times, trajectory, options)
-    out: list[Entry | Skipped] = []
-    for i, (frame, T) in enumerate(zip(frames, poses, strict=True)):
-        if isinstance(frame, Skipped):
-            out.append(frame)
-        elif T is None:
-            out.append(no_pose(frame.name, options))
-        else:
-            time = frame.timestamp if times is None else float(times[i])
-            out.append(replace(frame, T_world_cam=T, timestamp=time))
-    return out
+    return attach(frames, times, read_trajectory(resolve(root, options.trajectory)), options)
 
 
-def no_pose(name: str, options: Options) -> Skipped:
-    """An image without a pose, see ``interpolate_pose``."""
-    return Skipped(name, f"no pose within {options.max_pose_gap:g} s around the image")
+def _poses(
+    names: Sequence[str], times: np.ndarray | None, trajectory: Trajectory, options: Options
+) -> list[np.ndarray | None]:
+    """The pose [4, 4] of each image, None where the trajectory has none; ValueError: see ``attach``."""
+    if trajectory.timestamps is None:
+        if len(trajectory) != len(names):
+            raise ValueError(
+                f"trajectory has {len(trajectory)} poses for {len(names)} images: without timestamps, there "
+                "must be one for each"
+            )
+        return list(trajectory.T_world_cam)
+    times, stamps = _in_one_unit(names, times, trajectory.timestamps, options.fps)
+    trajectory = replace(trajectory, timestamps=stamps)
+    poses = [interpolate_pose(trajectory, float(time), options.max_pose_gap) for time in times]
+    if all(T is None for T in poses):
+        gap = f", {np.median(np.diff(stamps)):.3g} s apart in the median" if len(stamps) > 1 else ""
+        raise ValueError(
+            f"no image has a pose: images lie at {times[0]:.3f} to {times[-1]:.3f} s, the trajectory's "
+            f"{len(stamps)} poses at {stamps[0]:.3f} to {stamps[-1]:.3f} s{gap}, used where they lie at most "
+            f"{options.max_pose_gap:g} s apart; see --max-pose-gap, --time-offset and --fps"
+        )
+    return poses
+
+
+def _in_one_unit(
+    names: Sequence[str], times: np.ndarray | None, stamps: np.ndarray, fps: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times of images and poses in the same unit: seconds or frame numbers; ValueError where they are not known.
+
+    For ``stamps`` to be frame numbers, most timed images must have a pose each, since 0, 1, 2, ... could be seconds as
+    well; of images without times, or with times that do not meet the trajectory's, most images or most poses.
+    """
+    numbers = frame_numbers(names) if fps is None and bool((stamps == np.floor(stamps)).all()) else None
+    of_images = of_poses = 0.0
+    if numbers is not None:
+        of_images, of_poses = np.isin(numbers, stamps).mean(), np.isin(stamps, numbers).mean()
+    if numbers is not None and (of_images >= _MOST or (times is None and of_poses >= _MOST)):
+        return numbers, stamps
+    if times is None:
+        raise ValueError(
+            f"images: the name {names[0]!r} is no timestamp, there is no rgb.txt, and the trajectory's timestamps "
+            f"({stamps[0]:g}, ...) are no frame numbers of the images: pass fps (and time_offset)"
+        )
+    seconds = _in_seconds(stamps, times)
+    if not _meet(seconds, times) and numbers is not None and of_poses >= _MOST:
+        return numbers, stamps
+    return times, seconds
 
 
 def frame_numbers(names: Sequence[str]) -> np.ndarray | None:
@@ -161,14 +154,13 @@ def stem_times(names: Sequence[str]) -> np.ndarray | None:
     return times
 
 
-def in_seconds(trajectory: Trajectory, times: np.ndarray) -> Trajectory:
-    """The trajectory with timestamps in seconds, as ``times`` are, if another unit than its own makes the two meet."""
-    known = trajectory.timestamps
-    if known is None or len(known) < 2 or _meet(known, times):
-        return trajectory
-    step = float(np.median(np.diff(known)))
-    units = [unit for unit in _UNITS if _meet(known / unit, times) and step / unit >= _MIN_STEP]
-    return replace(trajectory, timestamps=known / units[0]) if units else trajectory
+def _in_seconds(stamps: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """[N] timestamps in seconds, as ``times`` are, if another unit than their own makes the two meet."""
+    if len(stamps) < 2 or _meet(stamps, times):
+        return stamps
+    step = float(np.median(np.diff(stamps)))
+    units = [unit for unit in _UNITS if _meet(stamps / unit, times) and step / unit >= _MIN_STEP]
+    return stamps / units[0] if units else stamps
 
 
 def _meet(first: np.ndarray, second: np.ndarray) -> bool:

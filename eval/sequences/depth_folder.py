@@ -109,14 +109,13 @@ def _maps(folder: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
 def _paired(folder: Path, files: list[Path], names: Sequence[str], orders: Sequence[Sequence[str]]) -> tuple[Path, ...]:
     pairs = pair_by_name(names, files)
     missing = [name for name in names if name not in pairs]
-    if not missing:
-        return tuple(pairs[name] for name in names)
-    for order in orders:
-        if len(files) == len(order):
-            by_order = dict(zip(order, files, strict=True))
-            return tuple(by_order[name] for name in names)
-    shown = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
-    raise ValueError(
-        f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); its {len(files)} files are "
-        f"named {files[0].name}, ..., and there are not as many as frames, so that order does not pair them"
-    )
+    if missing:
+        order = next((order for order in orders if len(order) == len(files)), None)
+        if order is None:
+            shown = ", ".join(missing[:10]) + (", ..." if len(missing) > 10 else "")
+            raise ValueError(
+                f"{folder}: no map for {len(missing)} of {len(names)} frames ({shown}); its {len(files)} files are "
+                f"named {files[0].name}, ..., and there are not as many as frames, so that order does not pair them"
+            )
+        pairs = dict(zip(order, files, strict=True))
+    return tuple(pairs[name] for name in names)

@@ -57,28 +57,16 @@ class FrameError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One posed frame.
+    """One posed frame."""
 
-    Attributes:
-        index: position in the sequence, 0-based.
-        name: the frame's name on disk without suffix; unique in its sequence.
-        image: [H, W, 3] uint8 RGB, or None.
-        depth: [Hd, Wd] float32 depth along z [m], 0 = invalid, or None where the frame has none.
-        T_world_cam: [4, 4] float64 camera-to-world [m].
-        intrinsics: [3, 3] float64 of the image [px].
-        depth_intrinsics: [3, 3] float64 of the depth map where it has a size or camera of its own, else
-            None (then ``intrinsics`` holds for it).
-        timestamp: [s], or None.
-    """
-
-    index: int
-    name: str
-    image: np.ndarray | None
-    depth: np.ndarray | None
-    T_world_cam: np.ndarray
-    intrinsics: np.ndarray
-    depth_intrinsics: np.ndarray | None = None
-    timestamp: float | None = None
+    index: int  # position in the sequence, 0-based
+    name: str  # on disk, without suffix; unique in its sequence
+    image: np.ndarray | None  # [H, W, 3] uint8 RGB
+    depth: np.ndarray | None  # [Hd, Wd] float32 along z [m], 0 = invalid
+    T_world_cam: np.ndarray  # [4, 4] float64 camera-to-world [m]
+    intrinsics: np.ndarray  # [3, 3] float64 of the image [px]
+    depth_intrinsics: np.ndarray | None = None  # [3, 3] of the depth map; None: those of the image hold for it
+    timestamp: float | None = None  # [s]
 
 
 @dataclass(frozen=True)
@@ -105,34 +93,21 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """Posed frames, decoded lazily. Build one with :func:`make_sequence`.
-
-    Attributes:
-        name: of the sequence.
-        layout: which reader opened it.
-        entries: the frames with a usable pose, in order.
-        intrinsics: [3, 3] of the images [px].
-        image_size: (H, W) of the images; an image of another size raises :class:`FrameError`.
-        depth_intrinsics: [3, 3] of the depth maps [px], where they differ from ``intrinsics``.
-        depth_size: (H, W) of the depth maps, or None where there are none.
-        skipped: the frames left out.
-        names_on_disk: every frame's name in order, skipped ones included.
-        posed: whether poses are known. Without, they are all the identity and mean nothing: single images, on which
-            a network can be judged but nothing that compares views.
-        folder: where it lies; None where it is no recording.
-    """
+    """Posed frames, decoded lazily. Build one with :func:`make_sequence`."""
 
     name: str
-    layout: str
-    entries: tuple[Entry, ...]
-    intrinsics: np.ndarray
-    image_size: Size | None = None
-    depth_intrinsics: np.ndarray | None = None
-    depth_size: Size | None = None
-    skipped: tuple[Skipped, ...] = ()
-    names_on_disk: tuple[str, ...] = ()
+    layout: str  # which reader opened it
+    entries: tuple[Entry, ...]  # the frames with a usable pose, in order
+    intrinsics: np.ndarray  # [3, 3] of the images [px]
+    image_size: Size | None = None  # (H, W) of the images; an image of another size raises FrameError
+    depth_intrinsics: np.ndarray | None = None  # [3, 3] of the depth maps [px], where they differ from ``intrinsics``
+    depth_size: Size | None = None  # (H, W) of the depth maps, None where there are none
+    skipped: tuple[Skipped, ...] = ()  # the frames left out
+    names_on_disk: tuple[str, ...] = ()  # every frame's name in order, skipped ones included
+    # Whether poses are known. Without, they are all the identity and mean nothing: single images, on which a network
+    # can be judged but nothing that compares views.
     posed: bool = True
-    folder: Path | None = None
+    folder: Path | None = None  # where it lies; None where it is no recording
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import attach, no_pose, pair_depth, stem_times
-from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Loader, Size, Skipped, make_sequence
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach, pair_depth, stem_times
+from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import (
     DEPTH_SUFFIXES,
     IMAGE_SUFFIXES,
@@ -22,6 +22,7 @@ from ufmstar_torch.eval.sequences.images import (
     depth_size,
     first_image_size,
     list_files,
+    list_images,
     read_color,
 )
 from ufmstar_torch.eval.sequences.intrinsics import depth_camera_matrix, read_intrinsics
@@ -34,14 +35,8 @@ from ufmstar_torch.eval.sequences.video import VIDEO_SUFFIXES, Video
 IMAGES = ("images", "image", "rgb", "color", "frames")
 DEPTHS = ("depth", "depths")
 TRAJECTORIES = (
-    "poses.txt",
-    "pose.txt",
-    "trajectory.txt",
-    "traj.txt",
-    "groundtruth.txt",
-    "CameraTrajectory.txt",
-    "KeyFrameTrajectory.txt",
-    "cam0_to_world.txt",
+    *("poses.txt", "pose.txt", "trajectory.txt", "traj.txt", "groundtruth.txt"),
+    *("CameraTrajectory.txt", "KeyFrameTrajectory.txt", "cam0_to_world.txt"),
 )
 INTRINSICS = ("K.txt", "intrinsics.txt", "intrinsic.txt", "camera.txt")
 LOOKED_FOR = f"images ({', '.join(IMAGES)}/ or a video), a trajectory ({', '.join(TRAJECTORIES)}), {INTRINSICS[0]}"
@@ -70,15 +65,9 @@ def read(path: Path, options: Options) -> FrameSequence:
             images; no image has a pose (both time ranges are given); depth maps that fit no image.
     """
     root = path if path.is_dir() else path.parent
-    names, loaders, size, times = _images(path, options)
+    images, size, times = _images(path, options)
     trajectory = read_trajectory(_given_or_found(root, options.trajectory, TRAJECTORIES, "trajectory"))
-    poses = attach(names, times, trajectory, options)
-    depth_files = _depth_files(root, names, times, options)
-    frames: list[Entry | Skipped] = []
-    for i, (name, T) in enumerate(zip(names, poses, strict=True)):
-        time = None if times is None else float(times[i])
-        load_depth = depth_loader(depth_files.get(name), options.depth_scale)
-        frames.append(no_pose(name, options) if T is None else Entry(name, T, loaders[i], load_depth, time))
+    frames = attach(_with_depth(images, root, times, options, options.depth_scale), times, trajectory, options)
     K, size_of_depth = _intrinsics(root, options), depth_size(frames)
     return make_sequence(
         path.resolve().stem if path.is_file() else path.resolve().name,
@@ -112,16 +101,13 @@ def open_unposed(path: Path, options: Options) -> FrameSequence:
     if not has_images_and_depth(path):
         raise ValueError(f"{path} must hold one of {', '.join(IMAGES)} and one of {', '.join(DEPTHS)}")
     first = next(name for name in IMAGES if (path / name).is_dir())
-    names, loaders, size, times = _images(path, replace(options, images=options.images or path / first))
-    files = _depth_files(path, names, times, options)
+    images, size, times = _images(path, replace(options, images=options.images or path / first))
     scale = options.depth_scale
     if scale is None and (path / "depth.txt").is_file():
         scale = TUM_SCALE
-    frames: list[Entry | Skipped] = [
-        Entry(name, np.eye(4), load, depth_loader(files[name], scale))
-        if name in files
-        else Skipped(name, "no depth map")
-        for name, load in zip(names, loaders, strict=True)
+    frames = [
+        replace(image, T_world_cam=np.eye(4)) if image.load_depth is not None else Skipped(image.name, "no depth map")
+        for image in _with_depth(images, path, times, options, scale)
     ]
     return make_sequence(
         path.resolve().name,
@@ -139,8 +125,8 @@ def _intrinsics(root: Path, options: Options) -> np.ndarray:
     return read_intrinsics(_given_or_found(root, None, INTRINSICS, "intrinsics") if given is None else given)
 
 
-def _images(path: Path, options: Options) -> tuple[list[str], list[Loader], Size | None, np.ndarray | None]:
-    """Names, loaders, (H, W) and timestamps (None where they are not known) of the images."""
+def _images(path: Path, options: Options) -> tuple[list[Entry], Size | None, np.ndarray | None]:
+    """The images without poses and depth, their (H, W), and timestamps [N] [s] (None where they are not known)."""
     source = path
     if options.images is not None:
         source = resolve(path, options.images)
@@ -152,24 +138,19 @@ def _images(path: Path, options: Options) -> tuple[list[str], list[Loader], Size
         source = result[0]
     if source.is_file():
         video = Video(source)
-        names = [f"{i:06d}" for i in range(len(video))]
-        times = np.arange(len(video)) / (options.fps or video.fps) + options.time_offset
-        return names, [partial(video.read, i) for i in range(len(video))], video.size, times
-    files = list_files(source, IMAGE_SUFFIXES)
+        images = [Entry(f"{i:06d}", UNKNOWN, partial(video.read, i)) for i in range(len(video))]
+        return images, video.size, np.arange(len(video)) / (options.fps or video.fps) + options.time_offset
+    files = list_images(source)
     if not files:
         raise ValueError(f"{source} holds no image ({', '.join(IMAGE_SUFFIXES)})")
-    loaders: list[Loader] = [partial(read_color, file) for file in files]
-    return [file.stem for file in files], loaders, first_image_size(files), _image_times(source, files, options)
+    images = [Entry(file.stem, UNKNOWN, partial(read_color, file)) for file in files]
+    return images, first_image_size(files), _image_times(source, files, options)
 
 
 def _image_sources(path: Path) -> list[Path]:
     """Folders with images, or else the folder itself, or else its video files."""
     folders = [path / name for name in IMAGES if (path / name).is_dir()]
-    if folders:
-        return folders
-    if list_files(path, IMAGE_SUFFIXES):
-        return [path]
-    return list_files(path, VIDEO_SUFFIXES)
+    return folders or ([path] if list_images(path) else list_files(path, VIDEO_SUFFIXES))
 
 
 def _image_times(folder: Path, files: list[Path], options: Options) -> np.ndarray | None:
@@ -179,15 +160,20 @@ def _image_times(folder: Path, files: list[Path], options: Options) -> np.ndarra
         absent = [file.name for file in files if file.name not in listed]
         if absent:
             raise ValueError(f"{listing} has no timestamp for {len(absent)} images: {absent[:3]}")
-        times = np.array([listed[file.name] for file in files])
+        times: np.ndarray | None = np.array([listed[file.name] for file in files])
     elif options.fps is not None:
         times = np.arange(len(files)) / options.fps
     else:
-        stamps = stem_times([file.stem for file in files])
-        if stamps is None:
-            return None
-        times = stamps
-    return times + options.time_offset
+        times = stem_times([file.stem for file in files])
+    return None if times is None else times + options.time_offset
+
+
+def _with_depth(
+    images: list[Entry], root: Path, times: np.ndarray | None, options: Options, scale: float | None
+) -> list[Entry]:
+    """The images with their depth maps, in ``scale`` [m per unit], where they have one."""
+    files = _depth_files(root, [image.name for image in images], times, options)
+    return [replace(image, load_depth=depth_loader(files.get(image.name), scale)) for image in images]
 
 
 def _depth_files(root: Path, names: list[str], times: np.ndarray | None, options: Options) -> dict[str, Path]:

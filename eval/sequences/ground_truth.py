@@ -58,19 +58,13 @@ def _source(mapping: bytes, size_from: Size, size: Size) -> tuple[NDArray[np.int
     return row.clip(0, height - 1) * width + column.clip(0, width - 1), None if inside.all() else inside
 
 
-def scaled_to_map(K: NDArray, image_size: Size | None, map_size: Size) -> NDArray:
-    """[3, 3] K of an image (H, W), for a map of the whole image at another size. Raises ValueError: the aspect ratios
-    differ, so that the map does not show the whole image."""
-    return K if image_size is None else scale_intrinsics(K, image_size, map_size)
-
-
 def depth_camera(frame: Frame) -> NDArray:
     """[3, 3] intrinsics of the frame's depth map [px]. Raises FrameError: depth and image have aspect ratios of their
     own, and no intrinsics are known for the depth."""
     if frame.depth_intrinsics is not None or frame.depth is None or frame.image is None:
         return frame.intrinsics if frame.depth_intrinsics is None else frame.depth_intrinsics
     try:
-        return scaled_to_map(frame.intrinsics, frame.image.shape[:2], frame.depth.shape[:2])
+        return scale_intrinsics(frame.intrinsics, frame.image.shape[:2], frame.depth.shape[:2])
     except ValueError as error:
         raise FrameError(frame.name, f"the depth map has no camera: {error}") from error
 

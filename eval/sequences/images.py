@@ -13,9 +13,8 @@ import zipfile
 from collections.abc import Iterable
 from contextlib import redirect_stdout, suppress
 from functools import lru_cache, partial
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -38,18 +37,13 @@ _MILLIMETRE = 1e-3
 _DEPTH_NAMES = ("Z", "depth", "V", "Y", "R")
 
 
-def read_color(path: str | Path) -> np.ndarray:
-    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped). Raises FrameError: missing, truncated,
-    corrupt, or not an 8-bit image."""
-    return decode_color(path, path)
-
-
-def decode_color(source: str | Path | BinaryIO, path: str | Path) -> np.ndarray:
-    """As :func:`read_color`, of an image that lies in a file or in memory; errors name ``path``."""
-    if isinstance(source, str | Path) and (plain := _plain_png(Path(source), _RGB)) is not None:
+def read_color(path: str | Path, content: bytes | None = None) -> np.ndarray:
+    """An 8-bit image as [H, W, 3] uint8 RGB (grey is repeated, alpha dropped), of a file or of the ``content`` of one.
+    Raises FrameError: missing, truncated, corrupt, or not an 8-bit image."""
+    if content is None and (plain := _plain_png(Path(path), _RGB)) is not None:
         return plain
     try:
-        with Image.open(source) as image:
+        with Image.open(path if content is None else BytesIO(content)) as image:
             if image.mode[0] in "IF":  # Pillow would clip these at 255 without a word
                 raise FrameError(path, f"expected an 8-bit colour or grey image, got mode {image.mode}")
             return np.array(image.convert("RGB"))
@@ -74,7 +68,7 @@ def read_depth(path: str | Path, scale: float | None = None, *, default_scale: f
         scale = named_scale or default_scale
     if values.dtype == np.uint16 and scale is not None:
         return _lengths(scale)[values]
-    return _positive(values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32))
+    return positive(values.astype(np.float32) if scale is None else (values * np.float64(scale)).astype(np.float32))
 
 
 def read_map(path: str | Path, key: str) -> tuple[np.ndarray, float | None]:
@@ -143,6 +137,11 @@ def depth_size(frames: Iterable[Entry | Skipped]) -> Size | None:
     return None
 
 
+def list_images(folder: Path) -> list[Path]:
+    """The folder's images, as :func:`list_files`."""
+    return list_files(folder, IMAGE_SUFFIXES)
+
+
 def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """The folder's files with one of the suffixes, numbers in names sorted by value (2 before 10).
 
@@ -174,10 +173,11 @@ def check_scale(depth_scale: float | None) -> None:
 @lru_cache(maxsize=4)
 def _lengths(scale: float) -> np.ndarray:
     """[65536] float32, the length of each 16-bit count [m]."""
-    return _positive((np.arange(2**16) * np.float64(scale)).astype(np.float32))
+    return positive((np.arange(2**16) * np.float64(scale)).astype(np.float32))
 
 
-def _positive(depth: np.ndarray) -> np.ndarray:
+def positive(depth: np.ndarray) -> np.ndarray:
+    """A depth map of float32 with 0 for what is not finite or not positive."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 

@@ -56,7 +56,7 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 
 def camera_matrix(given: IntrinsicsLike | None, known: np.ndarray, known_size: Size, size: Size | None) -> np.ndarray:
     """K [3, 3] of images of ``size``: the ``given`` one, or the layout's own of ``known_size``, scaled."""
-    return scale_intrinsics(known, known_size, size or known_size) if given is None else read_intrinsics(given)
+    return scale_intrinsics(known, known_size, size) if given is None else read_intrinsics(given)
 
 
 def depth_camera_matrix(
@@ -65,15 +65,13 @@ def depth_camera_matrix(
     """K [3, 3] of the depth maps, where it is given or follows from a size that is not the images'; else None."""
     if given is not None:
         return read_intrinsics(given)
-    if depth_size is None or size is None or depth_size == size:
-        return None
-    return scale_intrinsics(K, size, depth_size)
+    return None if size is None or depth_size in (None, size) else scale_intrinsics(K, size, depth_size)
 
 
-def scale_intrinsics(K: np.ndarray, old: Size, new: Size) -> np.ndarray:
-    """K [3, 3] of images (H, W) ``old`` after they were resized to ``new``. Raises ValueError: the aspect ratios
-    differ, so that the images were not only resized."""
-    if old == new:
+def scale_intrinsics(K: np.ndarray, old: Size | None, new: Size | None) -> np.ndarray:
+    """K [3, 3] of images (H, W) ``old`` after they were resized to ``new``; as it is where a size is not known. Raises
+    ValueError: the aspect ratios differ, so that the images were not only resized."""
+    if old is None or new is None or old == new:
         return K.copy()
     if abs((new[1] / new[0]) / (old[1] / old[0]) - 1) > _ASPECT_TOLERANCE:
         raise ValueError(

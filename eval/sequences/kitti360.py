@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -28,14 +28,7 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given, pair_depth
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.ground_truth import project
-from ufmstar_torch.eval.sequences.images import (
-    IMAGE_SUFFIXES,
-    depth_size,
-    first_image_size,
-    list_files,
-    read_color,
-    read_depth,
-)
+from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images, read_color
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, depth_camera_matrix
 from ufmstar_torch.eval.sequences.options import Options, resolve
 from ufmstar_torch.eval.sequences.poses import numbered_lines, read_matrix, read_trajectory
@@ -48,9 +41,6 @@ _SCALE = 1 / 256  # [m] per unit of 16-bit depth maps, as KITTI's
 _LASER = "calib_cam_to_velo.txt"
 _COLUMNS = 4
 _MIN_RANGE = 2.0  # [m] nearer returns are the car's own roof
-# A laser scan: its file; [4, 4] from the laser at the scan's time into the camera that looks [m]; and [4, 4] from the
-# laser one scan earlier into it now [m], None where it is not known: its points are then taken as they are.
-Scan = tuple[Path, np.ndarray, np.ndarray | None]
 
 
 def detect(path: Path) -> bool:
@@ -83,7 +73,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     if folder is None or folder.name not in _CAMERAS:
         raise ValueError(f"{path}: of KITTI-360, {' and '.join(_CAMERAS)} can be read; the others are fisheye cameras")
     root, drive, camera = folder.parents[2], folder.parent.name, folder.name.removeprefix("image_")
-    images = list_files(folder / "data_rect", IMAGE_SUFFIXES)
+    images = list_images(folder / "data_rect")
     if not images:
         raise ValueError(f"{folder / 'data_rect'} holds no image")
     size = first_image_size(images)
@@ -183,47 +173,61 @@ def _poses(root: Path, drive: str, camera: str) -> dict[int, np.ndarray]:
 
 def _depth(
     folder: Path, poses: dict[int, np.ndarray], names: list[str], options: Options, K: np.ndarray, size: Size
-) -> dict[str, Loader]:
+) -> dict[str, Loader | None]:
     """What loads the depth of each frame that has any."""
     if options.depth is not None:
         if options.scans is not None:
             raise ValueError("scans goes with depth from the laser, not with a folder of depth maps")
         pairs = pair_depth(names, resolve(folder, options.depth))
-        load = partial(read_depth, scale=options.depth_scale, default_scale=_SCALE)
-        return {name: partial(load, file) for name, file in pairs.items()}
-    calibration, camera = folder.parents[2] / "calibration", folder.name.removeprefix("image_")
+        return {name: depth_loader(file, options.depth_scale, _SCALE) for name, file in pairs.items()}
+    calibration = folder.parents[2] / "calibration"
     scans_folder = folder.parents[2] / "data_3d_raw" / folder.parent.name / "velodyne_points" / "data"
     if not scans_folder.is_dir() or not (calibration / _LASER).is_file():
         return {}
-    T_cam_laser = _T_rect_laser(calibration, camera)
-    scans = {int(file.stem): file for file in scans_folder.glob("*.bin") if file.stem.isdecimal()}
-    known = {number: T for number, T in poses.items() if np.isfinite(T).all()}
-    near = range(-(options.scans or 0), (options.scans or 0) + 1)
-    result: dict[str, Loader] = {}
-    for name in names:
-        if int(name) in scans and int(name) in known:
-            around = [n for n in (int(name) + step for step in near) if n in scans and n in known]
-            seen = [_scan(scans[n], n, int(name), known, T_cam_laser) for n in around]
-            result[name] = partial(_laser_depth, seen, K, size)
-    return result
+    laser = _Laser(
+        scans={int(file.stem): file for file in scans_folder.glob("*.bin") if file.stem.isdecimal()},
+        poses={number: T for number, T in poses.items() if np.isfinite(T).all()},
+        T_cam_laser=_T_rect_laser(calibration, folder.name.removeprefix("image_")),
+        K=K,
+        size=size,
+        beside=options.scans or 0,
+    )
+    return {name: partial(laser.depth, int(name)) for name in names if laser.sees(int(name))}
 
 
-def _scan(path: Path, of: int, at: int, poses: dict[int, np.ndarray], T_cam_laser: np.ndarray) -> Scan:
-    """Scan number ``of`` in the camera of frame ``at``."""
-    turn = None
-    for before, after in ((of - 1, of), (of, of + 1)):
-        if turn is None and before in poses and after in poses:
-            turn = np.linalg.inv(T_cam_laser) @ (np.linalg.inv(poses[after]) @ poses[before]) @ T_cam_laser
-    return path, np.linalg.inv(poses[at]) @ poses[of] @ T_cam_laser, turn
+@dataclass(frozen=True, eq=False)
+class _Laser:
+    """The scans of a drive, as one of its cameras sees them."""
 
+    scans: dict[int, Path]  # by frame number
+    poses: dict[int, np.ndarray]  # [4, 4] T_world_cam by frame number, finite ones
+    T_cam_laser: np.ndarray  # [4, 4]
+    K: np.ndarray  # [3, 3] of the camera [px]
+    size: Size  # of its images
+    beside: int  # so many scans before and after a frame are added to its own
 
-def _laser_depth(scans: list[Scan], K: np.ndarray, size: Size) -> np.ndarray:
-    """[H, W] float32 [m] that scans give: each pixel takes the nearest point that falls on it, 0 = none."""
-    points = []
-    for path, T_cam_laser, T_laser_before in scans:
-        own = read_scan(path) if T_laser_before is None else unroll(read_scan(path), T_laser_before)
-        points.append(T_cam_laser[:3, :3] @ own + T_cam_laser[:3, 3:])
-    return project(np.concatenate(points, axis=1), K, size)
+    def sees(self, number: int) -> bool:
+        """Whether a frame has a scan and a pose."""
+        return number in self.scans and number in self.poses
+
+    def depth(self, number: int) -> np.ndarray:
+        """[H, W] float32 [m] of a frame: each pixel takes the nearest point that falls on it, 0 = none."""
+        points = []
+        for other in filter(self.sees, range(number - self.beside, number + self.beside + 1)):
+            own, T_laser_before = read_scan(self.scans[other]), self._turn(other)
+            if T_laser_before is not None:
+                own = unroll(own, T_laser_before)
+            T = np.linalg.inv(self.poses[number]) @ self.poses[other] @ self.T_cam_laser
+            points.append(T[:3, :3] @ own + T[:3, 3:])
+        return project(np.concatenate(points, axis=1), self.K, self.size)
+
+    def _turn(self, number: int) -> np.ndarray | None:
+        """[4, 4] from the laser one scan earlier into it at a frame [m]; None where no neighbour has a pose."""
+        for before, after in ((number - 1, number), (number, number + 1)):
+            if before in self.poses and after in self.poses:
+                motion = np.linalg.inv(self.poses[after]) @ self.poses[before]
+                return np.linalg.inv(self.T_cam_laser) @ motion @ self.T_cam_laser
+        return None
 
 
 def _T_rect0_rect(calibration: Path, camera: str) -> np.ndarray:
@@ -235,8 +239,10 @@ def _T_rect0_rect(calibration: Path, camera: str) -> np.ndarray:
 
 def _T_rect_laser(calibration: Path, camera: str) -> np.ndarray:
     """[4, 4] from the laser into the rectified camera."""
-    T_laser_mounted = _affine(read_matrix(calibration / _LASER), calibration / _LASER)
-    T_rect0_laser = _T_rect_mounted(calibration, "00") @ np.linalg.inv(T_laser_mounted)
+    values = read_matrix(calibration / _LASER)
+    if values.size != 12 or not np.isfinite(values).all():
+        raise ValueError(f"{calibration / _LASER}: expected the 12 numbers of a 3x4 matrix, got {values.size}")
+    T_rect0_laser = _T_rect_mounted(calibration, "00") @ np.linalg.inv(_affine(values))
     return np.linalg.inv(_T_rect0_rect(calibration, camera)) @ T_rect0_laser
 
 
@@ -248,18 +254,18 @@ def _T_rect_mounted(calibration: Path, camera: str) -> np.ndarray:
 
 def _T_car_rect(calibration: Path, camera: str) -> np.ndarray:
     """[4, 4] from the rectified camera into the car, whose poses poses.txt holds."""
-    file = calibration / "calib_cam_to_pose.txt"
-    T_car_mounted = _affine(_values(file, f"image_{camera}", 12), file)
+    T_car_mounted = _affine(_values(calibration / "calib_cam_to_pose.txt", f"image_{camera}", 12))
     return T_car_mounted @ np.linalg.inv(_T_rect_mounted(calibration, camera))
 
 
-def _values(path: Path, key: str, count: int) -> np.ndarray:
-    """[count] the numbers behind ``key:`` in a calibration file.
+def _affine(values: np.ndarray) -> np.ndarray:
+    """[4, 4] of 3x4 numbers."""
+    return np.vstack([values.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
 
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no such line, or not as many numbers in it.
-    """
+
+def _values(path: Path, key: str, count: int) -> np.ndarray:
+    """[count] the numbers behind ``key:`` in a calibration file. Raises FileNotFoundError: no such file; ValueError: no
+    such line, or not as many numbers in it."""
     if not path.is_file():
         raise FileNotFoundError(f"KITTI-360's calibration is missing: no file {path}")
     for number, line in numbered_lines(path):
@@ -267,20 +273,13 @@ def _values(path: Path, key: str, count: int) -> np.ndarray:
         if name.strip() != key:
             continue
         try:
-            values = [float(word) for word in rest.split()]
+            values = np.array(rest.split(), dtype=np.float64)
         except ValueError:
-            values = []
+            values = np.empty(0)
         if len(values) != count or not np.isfinite(values).all():
             raise ValueError(f"{path}:{number}: expected {count} numbers behind {key!r}, got {rest.strip()!r}")
-        return np.array(values)
+        return values
     raise ValueError(f"{path}: no line {key!r}")
-
-
-def _affine(values: np.ndarray, path: Path) -> np.ndarray:
-    """[4, 4] of 3x4 numbers."""
-    if values.size != 12 or not np.isfinite(values).all():
-        raise ValueError(f"{path}: expected the 12 numbers of a 3x4 matrix, got {values.size}")
-    return np.concatenate([values.reshape(3, 4), [[0.0, 0.0, 0.0, 1.0]]])
 
 
 def read_scan(path: Path) -> np.ndarray:

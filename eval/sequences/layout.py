@@ -1,16 +1,18 @@
-"""``open_sequence``: detects a dataset's layout from the files on disk and opens it."""
+"""``open_sequence`` detects a dataset's layout from the files on disk and opens it; ``find_sequences`` lists all below
+a folder."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from ufmstar_torch.eval.sequences import generic, kitti360, nyu, scannet, sens, seven_scenes, tartanair, tum
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS, OURS, convert_poses
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.options import Options
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, OURS
 
 # Each module has ``detect(path)``, ``read(path, options)`` and LOOKED_FOR, the files that it detects.
 _READERS: dict[str, ModuleType] = {
@@ -35,6 +37,9 @@ _REFUSED = {
     "nyu": "trajectory images depth depth_intrinsics fps T_color_depth",
     "generic": "T_color_depth",
 }
+
+# Folders within one another have one name: ROOT/chess/seq-01 is "chess__seq-01".
+_BETWEEN = "__"
 
 
 def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, **options: Any) -> FrameSequence:
@@ -70,6 +75,19 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         chosen.reject(layout, "fps")
     sequence = _READERS[layout].read(path, chosen)
     return convert_poses(replace(sequence, folder=path if path.is_dir() else path.parent), poses)
+
+
+def convert_poses(sequence: FrameSequence, convention: str) -> FrameSequence:
+    """The sequence with its poses, which were written so, as camera-to-world ones with our axes. Raises ValueError: an
+    unknown convention, or a sequence without poses."""
+    if convention not in CONVENTIONS:
+        raise ValueError(f"poses must be one of {', '.join(CONVENTIONS)}, got {convention!r}")
+    if convention == OURS:
+        return sequence
+    if not sequence.posed:
+        raise ValueError(f"sequence {sequence.name!r} has no poses to convert from {convention}")
+    convert = CONVENTIONS[convention].convert
+    return replace(sequence, entries=tuple(replace(e, T_world_cam=convert(e.T_world_cam)) for e in sequence.entries))
 
 
 def _chosen(layout: str, path: Path, explicit: bool) -> str:
@@ -115,3 +133,76 @@ def parts_of(path: Path, layout: str) -> list[Path]:
     """The single sequences of a path that has this layout: itself, or folders in it that hold one each."""
     holding = {"tartanair": tartanair.trajectory_folders, "kitti360": kitti360.drives, "nyu": nyu.parts}
     return holding[layout](path) if layout in holding else [path]
+
+
+class Found(NamedTuple):
+    """A sequence on disk, not opened yet: its place below the root, "/" as "__" (unique), and the arguments of
+    ``open_sequence``."""
+
+    name: str
+    path: Path
+    layout: str
+
+
+def find_sequences(root: str | Path, max_depth: int = 4, layout: str = "auto") -> list[Found]:
+    """All sequences at or below ``root``, sorted by name.
+
+    A folder that is a sequence is not looked into, so that its own folders of images are none. Each folder on disk
+    counts once, whatever links lead to it (a folder before a link to it), so that links in a circle end too. Hidden
+    folders and those that may not be read are left out.
+
+    Args:
+        root: folder, or the file of one sequence.
+        max_depth: levels of folders below ``root`` that are looked at, at least 0.
+        layout: the only layout to look for; "auto": any.
+
+    Returns:
+        The sequences; empty where there is none.
+
+    Raises:
+        FileNotFoundError: no such root.
+        ValueError: ``max_depth`` is negative, an unknown layout, or a folder that fits several layouts.
+    """
+    root = Path(root)
+    if not root.exists():
+        raise FileNotFoundError(f"root: no such file or folder: {root}")
+    if max_depth < 0:
+        raise ValueError(f"max_depth must be at least 0, got {max_depth}")
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
+    return sorted(_below(root, root, max_depth, layout, set()), key=lambda result: result.name)
+
+
+def _below(path: Path, root: Path, depth: int, layout: str, seen: set[Path]) -> Iterator[Found]:
+    """The sequences at or below ``path``; ``seen`` gets every folder that was looked at."""
+    real = path.resolve()
+    if real in seen:
+        return
+    seen.add(real)
+    fitting = [name for name in layouts_of(path) if layout in ("auto", name)]
+    if len(fitting) > 1:
+        raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
+    if fitting:
+        for part in parts_of(path, fitting[0]):
+            if part == path or part.resolve() not in seen:
+                seen.add(part.resolve())
+                yield Found(_name(part, root), part, fitting[0])
+        return
+    if depth > 0:
+        for folder in _folders(path):
+            yield from _below(folder, root, depth - 1, layout, seen)
+
+
+def _folders(path: Path) -> list[Path]:
+    """The folders in a folder, links last; none where it may not be read."""
+    try:
+        folders = [p for p in path.iterdir() if not p.name.startswith(".") and p.is_dir()] if path.is_dir() else []
+    except PermissionError:  # "lost+found" at the top of a disk
+        return []
+    return sorted(folders, key=lambda p: (p.is_symlink(), p.name))
+
+
+def _name(path: Path, root: Path) -> str:
+    if path == root:
+        return path.resolve().stem if path.is_file() else path.resolve().name
+    return _BETWEEN.join(path.relative_to(root).parts)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, make_sequence
-from ufmstar_torch.eval.sequences.images import depth_size, natural_key
+from ufmstar_torch.eval.sequences.images import depth_size, natural_key, positive
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.options import Options
 
@@ -105,5 +105,4 @@ def _image(path: Path) -> np.ndarray:
 
 
 def _depth(path: Path, scale: float) -> np.ndarray:
-    depth = (read_h5(path)[1] * np.float64(scale)).astype(np.float32)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    return positive((read_h5(path)[1] * np.float64(scale)).astype(np.float32))

@@ -13,45 +13,30 @@ from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """What a user may override.
+    """What a user may override. Raises ValueError: a number is out of its range."""
 
-    Attributes:
-        intrinsics: instead of the layout's own [px]: a file, a 3x3 matrix, or fx, fy, cx, cy.
-        depth_intrinsics: the same of the depth maps (7-Scenes, ScanNet, generic).
-        trajectory: file in TUM or KITTI format whose camera-to-world poses, with our axes, replace the layout's own:
-            those of ORB-SLAM3, BundleFusion, ... Inside the sequence's folder, or else from the working folder.
-        images: folder of images or video file (generic).
-        depth: folder of depth maps (generic, KITTI-360).
-        depth_scale: metres per unit of the depth files, instead of the layout's own.
-        max_time_difference: between paired colour and depth images [s] (TUM, generic).
-        max_pose_gap: poses are interpolated between samples at most this far apart [s]; at 0.1 s a hand
-            that accelerates at 2 m/s^2 departs 2.5 mm from the straight line.
-        fps: frames per second of images without timestamps, or instead of the video's own, where a trajectory has
-            timestamps. Images of a layout that numbers them are counted by that number.
-        time_offset: added to the images' times [s].
-        register: warp 7-Scenes' depth into the colour camera.
-        T_color_depth: [4, 4] depth to colour camera [m] (7-Scenes).
-        drive: name or number of the drive, where the path is KITTI-360's root.
-        scans: laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving
-            things smear.
-
-    Raises:
-        ValueError: a number is out of its range.
-    """
-
+    # Instead of the layout's own [px]: a file, a 3x3 matrix, or fx, fy, cx, cy; and those of the depth maps (7-Scenes,
+    # ScanNet, generic).
     intrinsics: IntrinsicsLike | None = None
     depth_intrinsics: IntrinsicsLike | None = None
+    # File in TUM or KITTI format whose camera-to-world poses, with our axes, replace the layout's own: those of
+    # ORB-SLAM3, BundleFusion, ... Inside the sequence's folder, or else from the working folder.
     trajectory: str | Path | None = None
-    images: str | Path | None = None
-    depth: str | Path | None = None
-    depth_scale: float | None = None
-    max_time_difference: float = 0.02
+    images: str | Path | None = None  # folder of images or video file (generic)
+    depth: str | Path | None = None  # folder of depth maps (generic, KITTI-360)
+    depth_scale: float | None = None  # metres per unit of the depth files, instead of the layout's own
+    max_time_difference: float = 0.02  # between paired colour and depth images [s] (TUM, generic)
+    # Poses are interpolated between samples at most this far apart [s]; at 0.1 s a hand that accelerates at 2 m/s^2
+    # departs 2.5 mm from the straight line.
     max_pose_gap: float = 0.1
+    # Frames per second of images without timestamps, or instead of the video's own, where a trajectory has timestamps.
+    # Images of a layout that numbers them are counted by that number.
     fps: float | None = None
-    time_offset: float = 0.0
-    register: bool = True
-    T_color_depth: np.ndarray | None = None
-    drive: str | int | None = None
+    time_offset: float = 0.0  # added to the images' times [s]
+    register: bool = True  # warp 7-Scenes' depth into the colour camera
+    T_color_depth: np.ndarray | None = None  # [4, 4] depth to colour camera [m] (7-Scenes)
+    drive: str | int | None = None  # name or number of the drive, where the path is KITTI-360's root
+    # Laser scans of as many frames before and after a frame that are added to its own (KITTI-360); moving things smear.
     scans: int | None = None
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Trajectories: reading the common text formats, interpolation, association by timestamp.
+"""Poses: conventions, reading of trajectories in the common text formats, interpolation, association by timestamp.
 
 All poses are camera-to-world. The number of columns of a line is the format:
 
@@ -15,8 +15,10 @@ All poses are camera-to-world. The number of columns of a line is the format:
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -33,19 +35,37 @@ _NEAREST = 5e-3
 # printf on Windows writes NaN and infinity as 1.#IND, 1.#QNAN, 1.#INF.
 _WINDOWS_NON_FINITE = re.compile(r"[+-]?1\.?#(IND|QNAN|SNAN|INF)\d*", re.IGNORECASE)
 
+# Columns are our camera axes in a camera frame with x forward, y right, z down, or x right, y up, z backward.
+_NED_FROM_CAMERA = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_OPENGL_FROM_CAMERA = np.diag([1.0, -1, -1, 1])
+
+
+class Convention(NamedTuple):
+    """A way to write poses, in words, and the map of poses [..., 4, 4] to camera-to-world ones with our axes."""
+
+    description: str
+    convert: Callable[[np.ndarray], np.ndarray]
+
+
+OURS = "camera-to-world"
+CONVENTIONS = {
+    OURS: Convention("camera-to-world, x right, y down, z forward", lambda T: T),
+    "world-to-camera": Convention("world-to-camera (inverted)", np.linalg.inv),
+    "ned": Convention("camera-to-world with NED axes (x forward, y right, z down)", lambda T: T @ _NED_FROM_CAMERA),
+    "opengl": Convention(
+        "camera-to-world with OpenGL axes (x right, y up, z backward)", lambda T: T @ _OPENGL_FROM_CAMERA
+    ),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera-to-world poses, in order.
+    """Camera-to-world poses, in order."""
 
-    Attributes:
-        timestamps: [N] float64, strictly increasing [s] (or frame numbers, if the file has those), or None
-            where pose i belongs to frame i.
-        T_world_cam: [N, 4, 4] float64; a pose that was not finite in the file is all NaN.
-    """
-
+    # [N] float64, strictly increasing [s] (or frame numbers, if the file has those), or None where pose i belongs to
+    # frame i.
     timestamps: np.ndarray | None
-    T_world_cam: np.ndarray
+    T_world_cam: np.ndarray  # [N, 4, 4] float64; a pose that was not finite in the file is all NaN
 
     def __len__(self) -> int:
         return len(self.T_world_cam)
@@ -62,7 +82,13 @@ def read_trajectory(path: str | Path) -> Trajectory:
     """
     rows, lines = _numbers(path)
     for row, where in zip(rows, lines, strict=True):
-        _check_columns(len(row), len(rows[0]), where)
+        if len(row) not in (7, 8, 12, 13, 16, 17):
+            raise ValueError(
+                f"{where}: expected a pose of 7 or 8 (tx ty tz qx qy qz qw), 12 or 13 (3x4), 16 or 17 (4x4) "
+                f"numbers separated by spaces, got {len(row)}"
+            )
+        if len(row) != len(rows[0]):
+            raise ValueError(f"{where}: expected {len(rows[0])} numbers as in the first pose, got {len(row)}")
     if not rows:
         raise ValueError(f"{path}: no pose found, expected lines of 7, 8, 12, 13, 16 or 17 numbers")
     values = np.array(rows, dtype=np.float64)
@@ -190,16 +216,6 @@ def _poses_from_columns(values: np.ndarray, lines: list[str]) -> np.ndarray:
     T[finite, :3] = rows[finite, :3]
     T[finite, 3] = [0, 0, 0, 1]
     return T
-
-
-def _check_columns(count: int, expected: int, where: str) -> None:
-    if count not in (7, 8, 12, 13, 16, 17):
-        raise ValueError(
-            f"{where}: expected a pose of 7 or 8 (tx ty tz qx qy qz qw), 12 or 13 (3x4), 16 or 17 (4x4) "
-            f"numbers separated by spaces, got {count}"
-        )
-    if count != expected:
-        raise ValueError(f"{where}: expected {expected} numbers as in the first pose, got {count}")
 
 
 def _numbers(path: str | Path) -> tuple[list[list[float]], list[str]]:

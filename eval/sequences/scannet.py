@@ -13,14 +13,7 @@ import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits, make_sequence
-from ufmstar_torch.eval.sequences.images import (
-    IMAGE_SUFFIXES,
-    depth_loader,
-    depth_size,
-    first_image_size,
-    list_files,
-    read_color,
-)
+from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images, read_color
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.eval.sequences.poses import read_pose
@@ -44,7 +37,7 @@ def read(path: Path, options: Options) -> FrameSequence:
         ValueError: no usable frame, intrinsics that fit neither size, a malformed pose file.
         FileNotFoundError: no ``intrinsic_color.txt`` and ``intrinsics`` is not given.
     """
-    images = list_files(path / "color", IMAGE_SUFFIXES)
+    images = list_images(path / "color")
     frames = [_frame(path, image, options) for image in images]
     if not images:
         raise ValueError(f"scannet sequence {path.name!r}: the folder color/ holds no image")

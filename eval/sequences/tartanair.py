@@ -12,19 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from ufmstar_torch.eval.sequences.attach import attach_given
-from ufmstar_torch.eval.sequences.conventions import CONVENTIONS
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Skipped, make_sequence
-from ufmstar_torch.eval.sequences.images import (
-    IMAGE_SUFFIXES,
-    depth_loader,
-    depth_size,
-    first_image_size,
-    list_files,
-    read_color,
-)
+from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images, read_color
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import read_trajectory
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS, read_trajectory
 
 LOOKED_FOR = "pose_left.txt and image_left/ (also in a single sub-folder P000)"
 _NATIVE_SIZE = (480, 640)
@@ -46,7 +38,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     trajectory = read_trajectory(folder / "pose_left.txt")
     if trajectory.timestamps is not None:
         raise ValueError(f"{folder / 'pose_left.txt'}: expected 7 numbers in a line, tx ty tz qx qy qz qw")
-    images = list_files(folder / "image_left", IMAGE_SUFFIXES)
+    images = list_images(folder / "image_left")
     frames = _frames(folder, images, CONVENTIONS["ned"].convert(trajectory.T_world_cam), options.depth_scale)
     frames = attach_given(frames, folder, options)
     size = first_image_size(images) or _NATIVE_SIZE

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import attach, no_pose
+from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, read_color
 from ufmstar_torch.eval.sequences.intrinsics import pinhole, read_intrinsics, scale_intrinsics
@@ -45,19 +45,15 @@ def read(path: Path, options: Options) -> FrameSequence:
     given = options.trajectory
     color_times, color_files = read_file_list(path / "rgb.txt")
     trajectory = read_trajectory(path / "groundtruth.txt" if given is None else resolve(path, given))
-    times = color_times + options.time_offset
-    poses = attach([Path(file).stem for file in color_files], times, trajectory, options)
     depth_files = _paired_depth(path, color_times, options.max_time_difference)
     frames: list[Entry | Skipped] = []
-    for i, (T, file) in enumerate(zip(poses, color_files, strict=True)):
-        name = Path(file).stem
-        if not (path / file).is_file():
-            frames.append(Skipped(name, "missing image file"))
-        elif T is None:
-            frames.append(no_pose(name, options))
-        else:
+    for i, file in enumerate(color_files):
+        if (path / file).is_file():
             load_depth = depth_loader(depth_files.get(i), options.depth_scale, SCALE)
-            frames.append(Entry(name, T, partial(read_color, path / file), load_depth, float(times[i])))
+            frames.append(Entry(Path(file).stem, UNKNOWN, partial(read_color, path / file), load_depth))
+        else:
+            frames.append(Skipped(Path(file).stem, "missing image file"))
+    frames = attach(frames, color_times + options.time_offset, trajectory, options)
     size = first_image_size(path / file for file in color_files)
     K = _default_intrinsics(path, size) if options.intrinsics is None else read_intrinsics(options.intrinsics)
     return make_sequence(path.resolve().name, "tum", frames, K, image_size=size, depth_size=depth_size(frames))
@@ -95,7 +91,7 @@ def _default_intrinsics(path: Path, size: Size | None) -> np.ndarray:
     for text in (path.resolve().name, header):
         found = re.search(r"freiburg([123])", text)
         if found:
-            return scale_intrinsics(pinhole(*_INTRINSICS[found[1]]), _NATIVE_SIZE, size or _NATIVE_SIZE)
+            return scale_intrinsics(pinhole(*_INTRINSICS[found[1]]), _NATIVE_SIZE, size)
     raise ValueError(
         f"intrinsics: neither the folder name {path.resolve().name!r} nor rgb.txt names the camera "
         "(freiburg1, 2 or 3); pass intrinsics as fx fy cx cy"

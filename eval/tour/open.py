@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.eval.sequences import layout as on_disk
-from ufmstar_torch.eval.sequences.conventions import OURS, convert_poses
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size
+from ufmstar_torch.eval.sequences.poses import OURS
 from ufmstar_torch.eval.tour.sequence import tour_sequence
 from ufmstar_torch.eval.tour.style import STYLES
 
@@ -37,7 +37,7 @@ def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, 
         raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
     if options:
         raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
-    return convert_poses(open_tour(str(path)), poses)
+    return on_disk.convert_poses(open_tour(str(path)), poses)
 
 
 def open_tour(name: str) -> FrameSequence:

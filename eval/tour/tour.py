@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -90,7 +91,7 @@ class Tour:
 
 
 def make_tour(seed: int, style: str | TourStyle = "home") -> Tour:
-    """Makes the rooms of a seed; the same ones everywhere.
+    """Makes the rooms of a seed; the same ones everywhere. Those made last are kept in memory.
 
     Args:
         seed: at least 0.
@@ -101,8 +102,15 @@ def make_tour(seed: int, style: str | TourStyle = "home") -> Tour:
     """
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
-    chosen = style_of(style)
+    return _kept(seed, style) if isinstance(style, str) else _make(seed, style_of(style))
 
+
+@lru_cache(maxsize=8)
+def _kept(seed: int, style: str) -> Tour:
+    return _make(seed, style_of(style))
+
+
+def _make(seed: int, chosen: TourStyle) -> Tour:
     def stream(number: int) -> np.random.Generator:
         return np.random.default_rng([seed, number])
 

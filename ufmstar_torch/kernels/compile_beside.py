@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from numba.core import event
@@ -72,8 +73,9 @@ class Compiler(event.Listener):
 def _spare() -> bool:
     """Whether another process can be started, and has a core to run on."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    # The executable of a frozen program is the program itself.
-    return cores > 1 and bool(sys.executable) and not getattr(sys, "frozen", False)
+    # The executable of a frozen program, or of one that embeds Python, is the program itself.
+    interpreter = Path(sys.executable or "").stem.lower().startswith(("python", "pypy"))
+    return cores > 1 and interpreter and not getattr(sys, "frozen", False)
 
 
 def _started(jobs: Sequence[Job]) -> subprocess.Popen[bytes] | None:
@@ -88,8 +90,11 @@ def _started(jobs: Sequence[Job]) -> subprocess.Popen[bytes] | None:
 
 
 def main(jobs: str) -> None:
-    """Run jobs, as JSON."""
+    """Run jobs, as JSON, as long as the process lives that started this one."""
+    parent = os.getppid()
     for module, function, arguments in json.loads(jobs):
+        if os.getppid() != parent:
+            return
         getattr(importlib.import_module(module), function)(**arguments)
 
 

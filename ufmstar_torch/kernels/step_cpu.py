@@ -83,8 +83,8 @@ def step(
     mean_cam, covariance_cam = np.empty(slots[0].shape), np.empty(slots[1].shape)
     thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
     least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchored else 1.0)
-    reach, depth = (config.prior_weight, least if config.regression == "exact" else 0.0), array(frame.depth)
-    given = (camera, before, after, slots[:3], segments[:3], depth, thresholds, reach, mean_cam, covariance_cam)
+    reach = config.prior_weight, least if config.regression == "exact" else 0.0
+    given = (camera, before, after, slots[:3], segments[:3], frame.size, thresholds, reach, mean_cam, covariance_cam)
     with kernel("correspond"):
         pairs = [_Pairs(*found) for found in each(match, [(b, *given) for b in streams])]
     stage("correspond")

@@ -30,7 +30,7 @@ def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, wei
 
 
 @kernel
-def match(b, camera, before, after, mixture, segments, depth, thresholds, reach, mean_cam, covariance_cam):
+def match(b, camera, before, after, mixture, segments, size, thresholds, reach, mean_cam, covariance_cam):
     """Step 3 of stream ``b``: what the frame can reach of M_(i-1) [B, K] into the camera frame, written to ``mean_cam``
     and ``covariance_cam``, and its pairs with C_i [B, C].
 
@@ -39,7 +39,7 @@ def match(b, camera, before, after, mixture, segments, depth, thresholds, reach,
         before, after: of the state, camera-to-world [B, 4, 4] of the first camera, started, frames and skipped [B];
             ``after`` is written.
         mixture, segments: mean, covariance and weight.
-        depth: [B, H, W], 0 where there is none.
+        size: H, W of the image.
         thresholds: of :func:`matches`: eta, eta_occl, near plane, widening.
         reach: prior weight and epsilon of :func:`reached`.
 
@@ -57,7 +57,7 @@ def match(b, camera, before, after, mixture, segments, depth, thresholds, reach,
     mean_c, cov_c, weight_c = segments[0][b], segments[1][b], segments[2][b]
     moved, turned = mean_cam[b], covariance_cam[b]
     motion, pi, chosen = relative(first, present), np.zeros(weight.size), np.zeros(weight.size, np.bool_)
-    near, occupied = reached(motion, mean, covariance, weight, K, depth.shape[1:], reach[0], reach[1], weight_c.size)
+    near, occupied = reached(motion, mean, covariance, weight, K, size, reach[0], reach[1], weight_c.size)
     for k in near:
         pi[k], chosen[k] = weight[k], True
     for k in range(weight.size):
@@ -66,7 +66,7 @@ def match(b, camera, before, after, mixture, segments, depth, thresholds, reach,
             for j in range(3):
                 turned[k, i, j] = 0.0
     move(motion, mean, covariance, weight, weight.size, chosen, moved, turned)
-    c, k, overlap = matches(near, moved, turned, pi, mean_c, cov_c, weight_c, K, *depth.shape[1:], *thresholds)
+    c, k, overlap = matches(near, moved, turned, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
     new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
         new[c[i]] = False

@@ -1,0 +1,50 @@
+"""``compile_kernels.py float32|float64``: compiles what many tests need of the kernels, and keeps it on disk."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from pathlib import Path
+
+import torch
+
+from ufmstar_torch import UfMStar, UfMStarConfig, kernels
+from ufmstar_torch.anchors import Anchors
+from ufmstar_torch.eval.engine.warm_up import dense_anchors, preprocessing
+from ufmstar_torch.eval.metrics import SequenceMetrics
+from ufmstar_torch.kernels.select import compile_triangulation
+
+NEAR = UfMStarConfig(backend="numba", regression="neighbourhood")
+EXACT = UfMStarConfig(backend="numba", merge=1.0, merge_every=1)
+
+
+def two_frames(config: UfMStarConfig, dtype: torch.dtype) -> None:
+    """A wall seen twice, an average of its image, and metrics."""
+    depth, pose = torch.full((1, 24, 32), 2.0, dtype=dtype), torch.eye(4)
+    K = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+    row = depth[:, 0].double()
+    anchors = (
+        Anchors(torch.arange(32.0)[None, :, None].expand(1, 32, 2) / 2, row, row / 100) if config.anchored else None
+    )
+    ufm = UfMStar(config, dtype=dtype)
+    for _ in range(2):
+        ufm(depth, pose, K, anchors=anchors)
+    ufm.mean_uncertainty(depth, pose, K, anchors=anchors, pixels=3)
+    ufm.query(torch.zeros(1, 1, 3))
+    SequenceMetrics().update(depth, depth, depth)
+
+
+if __name__ == "__main__":
+    gc.disable()
+    if sys.argv[1] == "float32":
+        two_frames(NEAR, torch.float32)
+        two_frames(EXACT, torch.float32)
+        preprocessing()
+        compile_triangulation()
+        dense_anchors()
+    else:  # anchors first: what does not depend on the dtype is compiled by one of the two processes
+        two_frames(EXACT.replace(anchored=True, posterior=True), torch.float64)
+        two_frames(NEAR, torch.float64)
+    folder = Path(kernels.__file__).with_name("__pycache__")
+    folder.mkdir(exist_ok=True)
+    (folder / f"{sys.argv[1]}.compiled").touch()
