@@ -14,6 +14,7 @@ from ufmstar_torch.eval.bench.frames import FrameSource
 from ufmstar_torch.eval.bench.memory import state_memory
 from ufmstar_torch.eval.bench.step import FrameCounts
 from ufmstar_torch.eval.bench.timing import TimedCalls
+from ufmstar_torch.spill import Spilled
 
 _MEANS = ("in_view", "segments", "matched", "new")
 
@@ -46,13 +47,13 @@ def measure_long_run(
     if source.available is not None and source.available < frames:
         raise ValueError(f"a long run of {frames} frames was asked for, there are {source.available}")
     ufm, timed, counts = UfMStar(config), TimedCalls(), FrameCounts("segments", "matched", "new")
-    kept, out, read = [], [], []
+    kept, out, read = [], [], [0]
     for frame in timed.frames(source.frames(size, frames)):
         counts.add(timed.call({"step": ufm}, *frame)["step"].statistics, ufm, frame)
-        spilled = ufm.spilled
+        spilled = ufm.spilled or Spilled(pages=0, components=0, read=0)
         kept.append(int(ufm.mixture.components))
-        out.append(0 if spilled is None else spilled.components)
-        read.append(0 if spilled is None else spilled.read)
+        out.append(spilled.components)
+        read.append(spilled.read)
     wall, cpu = timed.times.wall["step"], timed.times.cpu["step"]
 
     def at(low: int) -> dict[str, Any]:
@@ -63,7 +64,7 @@ def measure_long_run(
             "step_cpu_median_ms": float(np.median(cpu[part])),
             "components": kept[end],
             "out": out[end],
-            "pages_read": read[end] - (read[low - 1] if low else 0),
+            "pages_read": read[low + window] - read[low],
             **{f"{name}_mean": float(np.mean(counts[name][part])) for name in _MEANS},
         }
 
