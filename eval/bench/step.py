@@ -102,12 +102,12 @@ def measure_step(
         **({} if backend == "torch" else {"ufm": UfM(UfMConfig(max_points=POINTS))}),
     }
     timed = TimedCalls(before=networks)
-    counts = FrameCounts("components", "segments", "matched", "new")
+    counts: list[dict[str, int]] = []
     for frame in timed.frames(frames, warm_up=warm_up):
-        counts.add(timed.call(calls, *frame)["step"].statistics, whole, frame)
+        counts.append(frame_counts(timed.call(calls, *frame)["step"].statistics, whole, frame))
     times = timed.times
     pairs = [*(("step", name) for name in (*networks, "ufm") if name in times.wall), ("mean_uncertainty", "step")]
-    spreads = {name: spread_of_counts(values[warm_up:]) for name, values in counts.items()}
+    spreads = {name: spread_of_counts([count[name] for count in counts[warm_up:]]) for name in counts[0]}
     return {
         "size": size,
         "backend": backend,
@@ -154,16 +154,10 @@ def first_steps(size: int) -> list[float]:
     return [1e-3 * ms for ms in timed.times.wall["step"]]
 
 
-class FrameCounts(dict[str, list[int]]):
-    """Statistics of the steps by name, and "in_view"."""
-
-    def __init__(self, *names: str) -> None:
-        super().__init__({name: [] for name in (*names, "in_view")})
-
-    def add(self, statistics: FrameStatistics, ufm: UfMStar, frame: PosedDepth) -> None:
-        """Those of one frame, and the components in view after it."""
-        for name, values in self.items():
-            values.append(components_in_view(ufm, frame) if name == "in_view" else int(getattr(statistics, name)))
+def frame_counts(statistics: FrameStatistics, ufm: UfMStar, frame: PosedDepth) -> dict[str, int]:
+    """Statistics of one step, and "in_view", the components in view after it."""
+    counts = {name: int(getattr(statistics, name)) for name in ("components", "segments", "matched", "new")}
+    return {**counts, "in_view": components_in_view(ufm, frame)}
 
 
 def components_in_view(ufm: UfMStar, frame: PosedDepth) -> int:
