@@ -224,7 +224,17 @@ class UfM(StatefulModule):
             self._store(kept)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
-        require_state(state, self.config.max_points)
+        """Also that no stream has more points than ``max_points``, and every covariance is one that points can have."""
+        n, b = len(state["moments"]) if state["moments"].dim() else 0, state["points"].numel()
+        shapes = {
+            "moments": (n, MOMENTS), "count": (n,), "points": (b,), "T_world_first": (b, 4, 4), "started": (b,),
+            "frames": (b,), "skipped": (b,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            if (given := tuple(state[name].shape)) != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {given}")
+        if state["moments"].device.type != "meta":
+            _require_values(state, self.config.max_points)
 
     def _advance(self, frame: FrameInput) -> tuple[Tensor, UfMStatistics]:
         """One frame, whose state is stored when all streams are through; variance [B, H, W]."""
@@ -288,32 +298,16 @@ class UfM(StatefulModule):
         return f"streams={len(self.points)}, points={self.points.tolist()}, max_points={self.config.max_points}"
 
 
-def require_state(state: Mapping[str, Tensor], max_points: int | None) -> None:
-    """Check tensors that come from elsewhere, a checkpoint say, before they become the state of UfM.
-
-    Raises:
-        ValueError: shapes that do not fit each other; values that are not finite or out of their range; covariances
-            that no points have; more points of a stream than ``max_points``.
-    """
-    if state["moments"].dim() != 2 or state["points"].dim() != 1:
-        raise ValueError(f"moments must be [N, {MOMENTS}] and points [B]")
-    n, b = len(state["moments"]), len(state["points"])
-    shapes = {
-        "moments": (n, MOMENTS), "count": (n,), "points": (b,), "T_world_first": (b, 4, 4), "started": (b,),
-        "frames": (b,), "skipped": (b,),
-    }  # fmt: skip
-    for name, shape in shapes.items():
-        if (given := tuple(state[name].shape)) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {given}")
-    if state["moments"].device.type == "meta":
-        return
+def _require_values(state: Mapping[str, Tensor], max_points: int | None) -> None:
+    """Raise ValueError for values of a state that are not finite or out of their range."""
+    n, largest = len(state["moments"]), max(state["points"].tolist(), default=0)
     for name in ("points", "frames", "skipped"):
         if bool((state[name] < 0).any()):
             raise ValueError(f"{name} holds negative values")
     if int(state["points"].sum()) != n:
         raise ValueError(f"points must add up to the {n} rows of moments, got {int(state['points'].sum())}")
-    if max_points is not None and b and int(state["points"].max()) > max_points:
-        raise ValueError(f"points: {int(state['points'].max())} exceed max_points = {max_points}")
+    if max_points is not None and largest > max_points:
+        raise ValueError(f"points: {largest} exceed max_points = {max_points}")
     if bool((state["count"] < 1).any()):
         raise ValueError("count must be at least 1")
     for name in ("moments", "T_world_first"):
@@ -325,8 +319,7 @@ def require_state(state: Mapping[str, Tensor], max_points: int | None) -> None:
     bound = (1 + _ROUNDING) * (variance[:, :, None] * variance[:, None, :]).sqrt()
     if bool((variance < 0).any()) or bool((covariance.abs() > bound + torch.finfo(torch.float32).tiny).any()):
         raise ValueError("moments hold covariances that are none")
-    R = state["T_world_first"][:, :3, :3]
-    if b and float(rotation_deviation(R).max()) > 1e-6:
+    if bool((rotation_deviation(state["T_world_first"][:, :3, :3]) > 1e-6).any()):
         raise ValueError("T_world_first holds matrices that are not rigid")
 
 
