@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixels import Pixels, check_maps, require_variance
+from ufmstar_torch.eval.metrics.pixels import Pixels, check_maps
 
 
 def gaussian_nll(depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
@@ -72,11 +72,8 @@ class EntropyHistogram(SumMetric):
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
         """See :meth:`SumMetric.update`; pixels without ground truth count too."""
-        variance = require_variance(variance, self.OF_VARIANCE)
         check_maps(depth, variance, target, valid)
-        predicted = torch.isfinite(depth) & torch.isfinite(variance) & (variance >= 0)
-        v = variance.detach()[predicted if valid is None else predicted & valid].double()
-        self.add(**self.sums_of(Pixels(v, v, v, predicted.sum())))
+        super().update(depth, variance, torch.ones_like(depth), valid)
 
     def sums_of(self, p: Pixels) -> dict[str, Tensor | float]:
         positive = p.variance[p.variance > 0]
