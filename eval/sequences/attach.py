@@ -10,14 +10,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.frame import Entry, Skipped
-from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, list_files
+from ufmstar_torch.eval.sequences.frame import Entry, Loader, Skipped
+from ufmstar_torch.eval.sequences.images import DEPTH_SUFFIXES, list_files, read_color
 from ufmstar_torch.eval.sequences.options import Options, resolve
-from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose, read_trajectory
+from ufmstar_torch.eval.sequences.poses import Trajectory, interpolate_pose, read_pose, read_trajectory
 
 # Integer timestamps as file names: EuRoC and ROS write nanoseconds, some cameras microseconds [units/s].
 _NANOSECONDS_ABOVE, _MICROSECONDS_ABOVE = 1e17, 1e14
@@ -84,6 +85,19 @@ def attach_given(
     if times is not None:
         times = times + options.time_offset
     return attach(frames, times, read_trajectory(resolve(root, options.trajectory)), options)
+
+
+def frame_of_files(
+    name: str, image: Path | None, pose: Path | None, load_depth: Loader | None, options: Options
+) -> Entry | Skipped:
+    """A frame with a pose file of its own, which is not read where ``options.trajectory`` replaces it; skipped where
+    the image or the pose is missing (None). Raises ValueError: a malformed pose file."""
+    if options.trajectory is None and pose is None:
+        return Skipped(name, "missing pose file")
+    if image is None:
+        return Skipped(name, "missing image file")
+    T = UNKNOWN if pose is None or options.trajectory is not None else read_pose(pose)
+    return Entry(name, T, partial(read_color, image), load_depth)
 
 
 def _poses(

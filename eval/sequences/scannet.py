@@ -6,17 +6,15 @@ could not track are -inf. https://github.com/ScanNet/ScanNet/tree/master/SensRea
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
+from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_files
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, Skipped, fits, make_sequence
-from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images, read_color
+from ufmstar_torch.eval.sequences.images import depth_loader, depth_size, first_image_size, list_images
 from ufmstar_torch.eval.sequences.intrinsics import IntrinsicsLike, read_intrinsics, scale_intrinsics
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import read_pose
 
 LOOKED_FOR = "color/, pose/ and intrinsic/ folders"
 _NATIVE_COLOR, _NATIVE_DEPTH = (968, 1296), (480, 640)
@@ -55,13 +53,9 @@ def read(path: Path, options: Options) -> FrameSequence:
 
 
 def _frame(path: Path, image: Path, options: Options) -> Entry | Skipped:
-    pose = path / "pose" / f"{image.stem}.txt"
-    if options.trajectory is None and not pose.is_file():
-        return Skipped(image.stem, "missing pose file")
-    T = read_pose(pose) if options.trajectory is None else UNKNOWN
-    depth = path / "depth" / f"{image.stem}.png"
+    pose, depth = path / "pose" / f"{image.stem}.txt", path / "depth" / f"{image.stem}.png"
     load_depth = depth_loader(depth if depth.is_file() else None, options.depth_scale)
-    return Entry(image.stem, T, partial(read_color, image), load_depth)
+    return frame_of_files(image.stem, image, pose if pose.is_file() else None, load_depth, options)
 
 
 def _intrinsics(given: IntrinsicsLike | None, file: Path, native: Size, size: Size) -> np.ndarray:

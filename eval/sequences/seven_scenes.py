@@ -17,13 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from ufmstar_torch.eval.sequences.attach import UNKNOWN, attach_given
+from ufmstar_torch.eval.sequences.attach import attach_given, frame_of_files
 from ufmstar_torch.eval.sequences.frame import Entry, FrameError, FrameSequence, Loader, Size, Skipped, make_sequence
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
-from ufmstar_torch.eval.sequences.images import depth_size, first_image_size, natural_key, read_color, read_map
+from ufmstar_torch.eval.sequences.images import depth_size, first_image_size, natural_key, read_map
 from ufmstar_torch.eval.sequences.intrinsics import camera_matrix, pinhole
 from ufmstar_torch.eval.sequences.options import Options
-from ufmstar_torch.eval.sequences.poses import read_pose
 
 LOOKED_FOR = "frame-NNNNNN.pose.txt files"
 _NATIVE_SIZE = (480, 640)
@@ -64,7 +63,8 @@ def read(path: Path, options: Options) -> FrameSequence:
     K_depth = camera_matrix(options.depth_intrinsics, pinhole(*_K_DEPTH), _NATIVE_SIZE, own_size)
     T_color_depth = _T_COLOR_DEPTH if options.T_color_depth is None else options.T_color_depth
     if options.register:
-        frames = [_registered(frame, K_depth, K_color, T_color_depth, color_size) for frame in frames]
+        cameras = K_depth, K_color, T_color_depth, color_size
+        frames = [_registered(frame, *cameras) if isinstance(frame, Entry) else frame for frame in frames]
     frames = attach_given(frames, path, options)
     return make_sequence(
         path.resolve().name,
@@ -77,7 +77,7 @@ def read(path: Path, options: Options) -> FrameSequence:
     )
 
 
-def read_kinect(path: Path, scale: float = _MILLIMETRE) -> np.ndarray:
+def _read_depth(path: Path, scale: float) -> np.ndarray:
     """A depth PNG [H, W] float32 [m] in which 65535 as well as 0 is invalid; errors as ``read_depth``."""
     values, _ = read_map(path, key="depth")
     if not np.issubdtype(values.dtype, np.integer):
@@ -86,20 +86,12 @@ def read_kinect(path: Path, scale: float = _MILLIMETRE) -> np.ndarray:
 
 
 def _frame(name: str, kinds: dict[str, Path], scale: float, options: Options) -> Entry | Skipped:
-    if options.trajectory is None and "pose" not in kinds:
-        return Skipped(name, "missing pose file")
-    if "color" not in kinds:
-        return Skipped(name, "missing image file")
-    T = read_pose(kinds["pose"]) if options.trajectory is None else UNKNOWN
-    load_depth = partial(read_kinect, kinds["depth"], scale) if "depth" in kinds else None
-    return Entry(name, T, partial(read_color, kinds["color"]), load_depth)
+    load_depth = partial(_read_depth, kinds["depth"], scale) if "depth" in kinds else None
+    return frame_of_files(name, kinds.get("color"), kinds.get("pose"), load_depth, options)
 
 
-def _registered(
-    frame: Entry | Skipped, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size
-) -> Entry | Skipped:
-    if isinstance(frame, Skipped):
-        return frame
+def _registered(frame: Entry, K_depth: np.ndarray, K_color: np.ndarray, T_color_depth: np.ndarray, size: Size) -> Entry:
+    """The frame of the depth camera as the colour camera's."""
     load = frame.load_depth and partial(_load_registered, frame.load_depth, K_depth, K_color, T_color_depth, size)
     return replace(frame, T_world_cam=frame.T_world_cam @ np.linalg.inv(T_color_depth), load_depth=load)
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ufmstar_torch.eval.tour.shapes import tilt, turn
+
 Array = NDArray[np.float64]
 
 # Nearer than this a box is rendered over the whole image instead of its projected outline, which needs
@@ -53,11 +55,8 @@ def intrinsics(height: int, width: int, fov_degrees: float = 70.0) -> Array:
 
 def look(position: tuple[float, float, float], yaw: float, pitch: float = 0.0) -> Array:
     """[4, 4] camera-to-world pose; yaw turns right about the vertical axis, pitch looks down [rad]."""
-    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-    R_yaw = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    R_pitch = np.array([[1, 0, 0], [0, cp, sp], [0, -sp, cp]])
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R_yaw @ R_pitch, position
+    T[:3, :3], T[:3, 3] = turn(yaw) @ tilt(pitch), position
     return T
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ufmstar_torch.eval.tour.palette import Palette
-from ufmstar_torch.eval.tour.shapes import Finish, Part, ball, box, tilt, tube, turn
+from ufmstar_torch.eval.tour.shapes import Finish, Part, ball, box, tube
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,8 +242,7 @@ def statue(rng: np.random.Generator, palette: Palette) -> Piece:
     elif what == 1:
         parts.append(tube((0, -1.05, 0.3), 0.2, 0.25, palette.finish("paint"), 0.05))
     else:
-        turned = turn(0.5) @ tilt(0.6)
-        parts.append(Part(1, np.array([0, -1.07, 0.3]), np.full(3, 0.16), palette.finish("paint"), turned))
+        parts.append(box((0, -1.07, 0.3), (0.16, 0.16, 0.16), palette.finish("paint"), yaw=0.5, pitch=0.6))
     return Piece("statue", parts, 0.5, 0.6, 1.35)
 
 

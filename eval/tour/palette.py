@@ -7,7 +7,7 @@ import colorsys
 import numpy as np
 
 from ufmstar_torch.eval.tour.shapes import Finish
-from ufmstar_torch.eval.tour.style import TourStyle
+from ufmstar_torch.eval.tour.style import Range, TourStyle
 
 Color = tuple[float, float, float]
 
@@ -15,7 +15,7 @@ Color = tuple[float, float, float]
 _PICTURES = ("books", "painting", "window")
 # What a surface may be made of: textures, ranges of saturation and value of its first colour, and of its
 # pattern's period [m].
-_ROLES: dict[str, tuple[tuple[str, ...], tuple[float, float], tuple[float, float], tuple[float, float]]] = {
+_ROLES: dict[str, tuple[tuple[str, ...], Range, Range, Range]] = {
     "wall": (
         ("plaster", "plaster", "plaster", "plain", "plain", "stripes", "bricks"),
         (0.03, 0.4),
@@ -75,9 +75,7 @@ class Palette:
         first, second = self._colors(saturation, value, hues)
         return Finish(texture, first, second, float(self._rng.uniform(*period)) * self._style.scale[0], glow)
 
-    def _colors(
-        self, saturation: tuple[float, float], value: tuple[float, float], hues: tuple[float, float]
-    ) -> tuple[Color, Color]:
+    def _colors(self, saturation: Range, value: Range, hues: Range) -> tuple[Color, Color]:
         """A colour, and one that goes with it: as a rule a darker or lighter one of nearly the same hue."""
         rng = self._rng
         h, s, v = rng.uniform(*hues), rng.uniform(*saturation), rng.uniform(*value)

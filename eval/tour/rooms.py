@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,11 @@ class Room:
         """[2] x and z [m]."""
         return (self.lower + self.upper) / 2
 
+    @property
+    def box(self) -> Array:
+        """[2, 3] lower and upper corner, y from the ceiling to 0 [m]."""
+        return np.array([[self.lower[0], -self.height, self.lower[1]], [self.upper[0], 0.0, self.upper[1]]])
+
 
 @dataclass(frozen=True, eq=False)
 class Door:
@@ -54,6 +59,18 @@ class Door:
         """[2] unit vector along the wall, towards larger coordinates."""
         return np.abs(self.normal[::-1])
 
+    def box(self, beside: float, through: float, above: float, below: float) -> Array:
+        """[2, 3] lower and upper corner of a box around the opening: ``through`` to either side of the wall's middle,
+        and so much larger than the opening beside, above and below it [m]."""
+        across = self.along * (self.width / 2 + beside) + np.abs(self.normal) * through
+        low, high = self.middle - across, self.middle + across
+        return np.array([[low[0], -self.height - above, low[1]], [high[0], below, high[1]]])
+
+
+def on_plan(axis: int, across: float, along: float) -> Array:
+    """[2] x and z of a place, from its coordinates across a wall, on an axis (0 = x, 1 = z), and along it."""
+    return np.array([across, along] if axis == 0 else [along, across], dtype=np.float64)
+
 
 def lay_out(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room], list[Door]]:
     """Draws the rooms; door i joins room i + 1 to an earlier one."""
@@ -68,10 +85,10 @@ def _try_layout(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room],
     styles = [style] * count
     if style.last is not None:
         styles[-1] = style.last
-    rooms = [_room(styles[0], np.zeros(2), rng)]
+    rooms = [_room(styles[0], rng)]
     doors: list[Door] = []
     for own in styles[1:]:
-        new = _room(own, np.zeros(2), rng)
+        new = _room(own, rng)
         for _ in range(_TRIES):
             parent = len(rooms) - 1 if rng.random() < 0.75 or own is not style else int(rng.integers(len(rooms)))
             attached = _attach(rooms, doors, parent, new, rng)
@@ -84,9 +101,9 @@ def _try_layout(style: TourStyle, rng: np.random.Generator) -> tuple[list[Room],
     return rooms, doors
 
 
-def _room(style: TourStyle, lower: Array, rng: np.random.Generator) -> Room:
+def _room(style: TourStyle, rng: np.random.Generator) -> Room:
     size = rng.uniform(*style.room_size, 2)
-    return Room(lower, lower + size, float(rng.uniform(*style.ceiling)), style)
+    return Room(np.zeros(2), size, float(rng.uniform(*style.ceiling)), style)
 
 
 def _attach(
@@ -98,11 +115,10 @@ def _attach(
     thickness, width = float(rng.uniform(0.12, 0.22)), float(rng.uniform(1.0, 1.25))
     along = 1 - axis
     wall = old.upper[axis] if sign > 0 else old.lower[axis]
-    middle, lower = np.zeros(2), np.zeros(2)
-    middle[axis] = wall + sign * thickness / 2
-    middle[along] = rng.uniform(old.lower[along] + _CORNER_TO_DOOR, old.upper[along] - _CORNER_TO_DOOR)
-    lower[axis] = wall + thickness if sign > 0 else wall - thickness - size[axis]
-    lower[along] = middle[along] - rng.uniform(_CORNER_TO_DOOR, size[along] - _CORNER_TO_DOOR)
+    at = rng.uniform(old.lower[along] + _CORNER_TO_DOOR, old.upper[along] - _CORNER_TO_DOOR)
+    start = at - rng.uniform(_CORNER_TO_DOOR, size[along] - _CORNER_TO_DOOR)
+    middle = on_plan(axis, wall + sign * thickness / 2, at)
+    lower = on_plan(axis, wall + thickness if sign > 0 else wall - thickness - size[axis], start)
     room = Room(lower, lower + size, new.height, new.style)
     for other in rooms:
         if (room.lower < other.upper + 0.1).all() and (room.upper > other.lower - 0.1).all():
@@ -110,36 +126,30 @@ def _attach(
     for door in doors:
         if parent in door.rooms and np.linalg.norm(door.middle - middle) < _DOOR_TO_DOOR:
             return None
-    normal = np.zeros(2)
-    normal[axis] = sign
     height = min(old.height, new.height, 2.3) - float(rng.uniform(0.15, 0.3))
-    return room, Door((parent, len(rooms)), middle, normal, width, height, thickness)
+    return room, Door((parent, len(rooms)), middle, on_plan(axis, sign, 0), width, height, thickness)
 
 
-def shell(index: int, room: Room, doors: list[Door], palette: Palette) -> Iterator[Part]:
-    """Floor, ceiling, walls around the openings, and skirting boards."""
+def shell(room: Room, doors: list[Door], palette: Palette) -> Iterator[Part]:
+    """Floor, ceiling, walls around the openings of the room's doors, and skirting boards."""
     x, z = room.centre
     half = (room.upper - room.lower) / 2 + _OVERLAP
-    own = (index, -1)
-    floor = part(QUAD, (x, 0, z), (half[0], 1, half[1]), palette.finish("floor"), label="floor")
-    yield replace(floor, rooms=own)
+    yield part(QUAD, (x, 0, z), (half[0], 1, half[1]), palette.finish("floor"), label="floor")
     over = np.diag([1.0, -1.0, -1.0])
-    ceiling = part(QUAD, (x, -room.height, z), (half[0], 1, half[1]), palette.finish("ceiling"), over, label="ceiling")
-    yield replace(ceiling, rooms=own)
+    yield part(QUAD, (x, -room.height, z), (half[0], 1, half[1]), palette.finish("ceiling"), over, label="ceiling")
     usual, special, board = palette.finish("wall"), palette.finish("wall"), palette.finish("paint")
     accent = int(room.lower.sum() * 1000) % 4
     for number, (axis, sign) in enumerate(((0, -1), (0, 1), (1, -1), (1, 1))):
         finish = special if number == accent else usual
-        for piece in _wall(room, axis, sign, _openings(index, room, axis, sign, doors), finish, board):
-            yield replace(piece, rooms=own)
+        yield from _wall(room, axis, sign, _openings(room, axis, sign, doors), finish, board)
 
 
-def _openings(index: int, room: Room, axis: int, sign: int, doors: list[Door]) -> list[tuple[float, float, float]]:
+def _openings(room: Room, axis: int, sign: int, doors: list[Door]) -> list[tuple[float, float, float]]:
     """(start, end, height) of the doorways in one wall, in order along it [m]."""
     wall = room.upper[axis] if sign > 0 else room.lower[axis]
     gaps = []
     for door in doors:
-        if index in door.rooms and abs(door.normal[axis]) > 0.5 and abs(door.middle[axis] - wall) < door.thickness:
+        if abs(door.normal[axis]) > 0.5 and abs(door.middle[axis] - wall) < door.thickness:
             s = float(door.middle[1 - axis])
             gaps.append((s - door.width / 2, s + door.width / 2, door.height))
     return sorted(gaps)
@@ -150,20 +160,20 @@ def _wall(
 ) -> Iterator[Part]:
     along = 1 - axis
     wall = float(room.upper[axis] if sign > 0 else room.lower[axis])
-    inward = np.zeros(3)
-    inward[2 * axis] = -sign
+
+    def spot(across: float, y: float, on: float) -> Array:
+        return np.insert(on_plan(axis, across, on), 1, y)
+
+    inward = spot(-sign, 0, 0)
     y_axis, z_axis = -inward, np.array([0.0, 1.0, 0.0])
     R = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis], axis=1)
 
     def rectangle(start: float, end: float, top: float, bottom: float) -> Part:
-        centre = np.zeros(3)
-        centre[2 * axis], centre[2 * along], centre[1] = wall, (start + end) / 2, (top + bottom) / 2
+        centre = spot(wall, (top + bottom) / 2, (start + end) / 2)
         return part(QUAD, centre, ((end - start) / 2, 1, (bottom - top) / 2), finish, R, label=f"wall {axis}{sign}")
 
     def skirting(start: float, end: float) -> Part:
-        centre, half = np.zeros(3), np.zeros(3)
-        centre[2 * axis], centre[2 * along], centre[1] = wall, (start + end) / 2, -0.04
-        half[2 * axis], half[2 * along], half[1] = 0.012, (end - start) / 2, 0.045
+        centre, half = spot(wall, -0.04, (start + end) / 2), spot(0.012, 0.045, (end - start) / 2)
         return part(BOX, centre, half, board, label="skirting")
 
     top, at = -room.height - _OVERLAP, float(room.lower[along]) - _OVERLAP
@@ -183,8 +193,7 @@ def frame(door: Door, finish: Finish) -> Iterator[Part]:
 
     def piece(offset: float, y: float, half_along: float, half_y: float, half_through: float) -> Part:
         centre, half = door.middle + a * offset, a * half_along + n * half_through
-        own = part(BOX, (centre[0], y, centre[1]), (half[0], half_y, half[1]), finish, label="door")
-        return replace(own, rooms=door.rooms)
+        return part(BOX, (centre[0], y, centre[1]), (half[0], half_y, half[1]), finish, label="door")
 
     for side in (-1, 1):
         yield piece(side * (door.width / 2 + 0.015), -door.height / 2, 0.035, door.height / 2 + 0.03, through)

@@ -21,36 +21,20 @@ TEXTURES = HOME_TEXTURES + HALL_TEXTURES
 
 @dataclass(frozen=True)
 class TourStyle:
-    """Sizes and looks of a tour's rooms; ranges are (lowest, highest), drawn uniformly.
+    """Sizes and looks of a tour's rooms; ranges are (lowest, highest), drawn uniformly. Raises ValueError: a value is
+    out of its range."""
 
-    Attributes:
-        name: of the rooms' style.
-        textures: the names of the surface textures that occur.
-        rooms: number of rooms, lowest and highest.
-        room_size: side of a room [m].
-        ceiling: its height [m].
-        camera_height: above the floor [m].
-        scale: of the furniture, 1 = usual.
-        furniture: pieces of furniture per m^2 of floor.
-        brightness: of the lights, 1 = a lit living room.
-        warmth: -1 (cold, blue) to 1 (warm, yellow) of the lights.
-        last: style of the last room; None = as the others.
-
-    Raises:
-        ValueError: a value is out of its range.
-    """
-
-    name: str = "home"
-    textures: tuple[str, ...] = HOME_TEXTURES
-    rooms: tuple[int, int] = (3, 5)
-    room_size: Range = (3.2, 6.0)
-    ceiling: Range = (2.3, 3.0)
-    camera_height: Range = (1.0, 1.6)
-    scale: Range = (0.9, 1.1)
-    furniture: float = 0.5
-    brightness: Range = (0.8, 1.2)
-    warmth: Range = (0.1, 0.9)
-    last: TourStyle | None = None
+    name: str = "home"  # of the rooms' style
+    textures: tuple[str, ...] = HOME_TEXTURES  # the names of the surface textures that occur
+    rooms: tuple[int, int] = (3, 5)  # number of rooms, lowest and highest
+    room_size: Range = (3.2, 6.0)  # side of a room [m]
+    ceiling: Range = (2.3, 3.0)  # its height [m]
+    camera_height: Range = (1.0, 1.6)  # above the floor [m]
+    scale: Range = (0.9, 1.1)  # of the furniture, 1 = usual
+    furniture: float = 0.5  # pieces of furniture per m^2 of floor
+    brightness: Range = (0.8, 1.2)  # of the lights, 1 = a lit living room
+    warmth: Range = (0.1, 0.9)  # -1 (cold, blue) to 1 (warm, yellow) of the lights
+    last: TourStyle | None = None  # style of the last room; None = as the others
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.textures) - set(TEXTURES))

@@ -37,24 +37,19 @@ class Patch:
 
     def mixed(self, share: Tensor, mean: float = 0.5) -> Tensor:
         """[3, P] from the first to the second colour; ``mean`` where the pattern is too fine to be seen."""
-        seen = (1.6 - 2.0 * self.pixel).clamp(0, 1)
-        return self.first + (self.second - self.first) * (mean + (share - mean) * seen)
+        return self.first + (self.second - self.first) * (mean + (share - mean) * self.seen())
 
     def gain(self, values: Tensor, contrast: float) -> Tensor:
         """[P] 1 + contrast times values in [0, 1] about their middle."""
-        seen = (1.6 - 2.0 * self.pixel).clamp(0, 1)
-        return 1 + contrast * seen * (values - 0.5)
+        return 1 + contrast * self.seen() * (values - 0.5)
 
-    def cell(self, i: Tensor, j: Tensor) -> Tensor:
-        """[P] a random number in [0, 1) for each cell (i, j) of integers."""
-        return self._look_up(i * _FINE, j * _FINE, _POSITIVE * _FINE)
+    def seen(self) -> Tensor:
+        """[P] how far the pattern is seen: 1 = sharp, 0 = too fine."""
+        return (1.6 - 2.0 * self.pixel).clamp(0, 1)
 
     def noise(self, u: Tensor, v: Tensor) -> Tensor:
-        """[P] smooth noise in [0, 1) with cells of size 1."""
-        return self._look_up(u * _FINE, v * _FINE, _POSITIVE * _FINE)
-
-    def _look_up(self, row: Tensor, column: Tensor, shift: float) -> Tensor:
-        i, j = (row + shift).long() & (_SIDE - 1), (column + shift).long() & (_SIDE - 1)
+        """[P] smooth noise in [0, 1) with cells of size 1; at integers, a random number of each cell."""
+        i, j = ((x * _FINE + _POSITIVE * _FINE).long() & (_SIDE - 1) for x in (u, v))
         return self.table.index_select(0, i.mul_(_SIDE).add_(j))
 
 
@@ -78,14 +73,19 @@ def _soft(edge: Tensor, pixel: Tensor) -> Tensor:
     return (edge / (pixel + 0.01) + 0.5).clamp(0, 1)
 
 
+def _centred(x: Tensor) -> Tensor:
+    """Coordinate from the middle between two integers, -0.5 to 0.5."""
+    return x - x.floor() - 0.5
+
+
 def _square(x: Tensor, pixel: Tensor) -> Tensor:
     """A square wave of period 1."""
-    return _soft(0.25 - (x - x.floor() - 0.5).abs(), pixel)
+    return _soft(0.25 - _centred(x).abs(), pixel)
 
 
 def _to_edge(x: Tensor) -> Tensor:
     """Distance to the nearest integer."""
-    return 0.5 - (x - x.floor() - 0.5).abs()
+    return 0.5 - _centred(x).abs()
 
 
 def _plain(p: Patch) -> Tensor:
@@ -99,8 +99,8 @@ def _plaster(p: Patch) -> Tensor:
 def _wood(p: Patch) -> Tensor:
     plank = p.v.floor()
     grain = p.noise(p.u * 0.9 + plank * 7, p.v * 11)
-    share = 0.65 * grain + 0.35 * p.cell(plank, (p.u * 0.18 + plank * 0.37).floor())
-    seam = 1 - 0.45 * (1 - _soft(_to_edge(p.v) - 0.04, p.pixel)) * (1.6 - 2 * p.pixel).clamp(0, 1)
+    share = 0.65 * grain + 0.35 * p.noise(plank, (p.u * 0.18 + plank * 0.37).floor())
+    seam = 1 - 0.45 * (1 - _soft(_to_edge(p.v) - 0.04, p.pixel)) * p.seen()
     return p.mixed(share) * seam
 
 
@@ -115,14 +115,14 @@ def _stripes(p: Patch) -> Tensor:
 
 def _tiles(p: Patch) -> Tensor:
     joint = _soft(torch.minimum(_to_edge(p.u), _to_edge(p.v)) - 0.03, p.pixel)
-    return p.mixed(1 - joint, 0.1) * p.gain(p.cell(p.u.floor(), p.v.floor()), 0.3)
+    return p.mixed(1 - joint, 0.1) * p.gain(p.noise(p.u.floor(), p.v.floor()), 0.3)
 
 
 def _bricks(p: Patch) -> Tensor:
     v = p.v * 3
     u = p.u + 0.5 * (v.floor() % 2)
     joint = _soft(torch.minimum(_to_edge(u) * 3, _to_edge(v)) - 0.09, p.pixel * 3)
-    return p.mixed(1 - joint, 0.25) * p.gain(p.cell(u.floor(), v.floor()), 0.5)
+    return p.mixed(1 - joint, 0.25) * p.gain(p.noise(u.floor(), v.floor()), 0.5)
 
 
 def _fabric(p: Patch) -> Tensor:
@@ -132,7 +132,7 @@ def _fabric(p: Patch) -> Tensor:
 
 def _books(p: Patch) -> Tensor:
     i = p.u.floor()
-    spine = torch.stack([p.cell(i, torch.full_like(i, k)) for k in (1, 2, 3)])
+    spine = torch.stack([p.noise(i, torch.full_like(i, k)) for k in (1, 2, 3)])
     band = 1 - 0.5 * _soft(0.12 - (p.own_v - 1.2).abs(), p.pixel)
     gap = 0.3 + 0.7 * _soft(_to_edge(p.u) - 0.08, p.pixel)
     return (0.1 + 0.6 * spine**1.5 + 0.2 * p.first) * (band * gap)
@@ -147,7 +147,7 @@ def _painting(p: Patch) -> Tensor:
     sky = p.first * (0.7 - 0.5 * p.own_v)
     ground = p.second * (0.5 + 0.5 * p.noise(p.u * 9, p.v * 9))
     landscape = (sky * (1 - hill) + ground * hill) * (1 - sun) + (1 - p.second * 0.3) * sun
-    field = p.cell((p.u * 3).floor(), (p.v * 2.2).floor())
+    field = p.noise((p.u * 3).floor(), (p.v * 2.2).floor())
     fields = p.first * (1 - field) + p.second * field + 0.25 * (field > 0.7)
     return torch.where(shift - shift.floor() < 0.5, landscape, fields)
 
@@ -163,12 +163,12 @@ def _window(p: Patch) -> Tensor:
 
 
 def _dots(p: Patch) -> Tensor:
-    distance = ((p.u - p.u.floor() - 0.5) ** 2 + (p.v - p.v.floor() - 0.5) ** 2).sqrt()
+    distance = (_centred(p.u) ** 2 + _centred(p.v) ** 2).sqrt()
     return p.mixed(_soft(0.28 - distance, p.pixel), 0.25)
 
 
 def _zigzag(p: Patch) -> Tensor:
-    return p.mixed(_square(p.v + 2 * (p.u / 2 - (p.u / 2).floor() - 0.5).abs(), p.pixel))
+    return p.mixed(_square(p.v + 2 * _centred(p.u / 2).abs(), p.pixel))
 
 
 def _marble(p: Patch) -> Tensor:
@@ -179,9 +179,9 @@ def _marble(p: Patch) -> Tensor:
 def _terrazzo(p: Patch) -> Tensor:
     u, v = p.u * 4, p.v * 4
     i, j = u.floor(), v.floor()
-    du, dv = u - i - 0.3 - 0.4 * p.cell(i, j), v - j - 0.3 - 0.4 * p.cell(j, i)
-    chip = _soft(0.16 + 0.14 * p.cell(i + 9, j) - (du * du + dv * dv).sqrt(), p.pixel * 4)
-    return p.mixed(chip, 0.2) * p.gain(p.cell(i, j + 5), 0.6)
+    du, dv = u - i - 0.3 - 0.4 * p.noise(i, j), v - j - 0.3 - 0.4 * p.noise(j, i)
+    chip = _soft(0.16 + 0.14 * p.noise(i + 9, j) - (du * du + dv * dv).sqrt(), p.pixel * 4)
+    return p.mixed(chip, 0.2) * p.gain(p.noise(i, j + 5), 0.6)
 
 
 def _hexagons(p: Patch) -> Tensor:
@@ -189,14 +189,13 @@ def _hexagons(p: Patch) -> Tensor:
     r = 3.0**0.5
     edges = []
     for shift in (0.0, 0.5):
-        x, y = p.u + shift, p.v / r + shift
-        x, y = (x - x.floor() - 0.5).abs(), (y - y.floor() - 0.5).abs() * r
+        x, y = _centred(p.u + shift).abs(), _centred(p.v / r + shift).abs() * r
         edges.append(0.5 - torch.maximum(x, 0.5 * x + 0.5 * r * y))
     return p.mixed(1 - _soft(torch.maximum(edges[0], edges[1]) - 0.06, p.pixel), 0.3)
 
 
 def _rings(p: Patch) -> Tensor:
-    u, v = p.u / 4 - (p.u / 4).floor() - 0.5, p.v / 4 - (p.v / 4).floor() - 0.5
+    u, v = _centred(p.u / 4), _centred(p.v / 4)
     return p.mixed(_square(4 * (u * u + v * v).sqrt(), p.pixel))
 
 

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.tour.furnish import LIGHTS, Light, furnish
 from ufmstar_torch.eval.tour.palette import Palette
 from ufmstar_torch.eval.tour.rooms import Door, Room, frame, lay_out, shell
 from ufmstar_torch.eval.tour.route import ways
-from ufmstar_torch.eval.tour.shapes import QUAD, Part, Surfaces, surfaces
+from ufmstar_torch.eval.tour.shapes import NOBODY, QUAD, Part, Surfaces, surfaces
 from ufmstar_torch.eval.tour.style import TourStyle, style_of
 from ufmstar_torch.eval.tour.texture import noise_table
 from ufmstar_torch.eval.tour.volume import light_volumes
@@ -30,37 +30,22 @@ _SHADOWLESS = ("window", "picture", "clock", "skirting")  # flat on the wall
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """Furnished rooms, and the ways through them. World axes: x right, y down, z forward [m], the floor at y = 0.
+    """Furnished rooms, and the ways through them. World axes: x right, y down, z forward [m], the floor at y = 0."""
 
-    Attributes:
-        seed: that it was made from.
-        style: likewise.
-        rooms: [R, 2, 3] float64 lower and upper corners (y from the ceiling to 0) [m].
-        room_styles: the name of each room's style.
-        doors: [D, 2, 3] float64 boxes around the openings [m].
-        door_rooms: [D, 2] the rooms that each one joins.
-        surfaces: the primitives.
-        labels: what each primitive is part of.
-        lights: [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark.
-        volumes: [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room.
-        noise: behind the textures, see ``texture.noise_table``.
-        ways: [M, 2] float64 closed ways of x and z [m], see ``route.ways``.
-        camera_height: above the floor [m].
-    """
-
+    # What it was made from.
     seed: int
     style: TourStyle
-    rooms: Tensor
-    room_styles: tuple[str, ...]
-    doors: Tensor
-    door_rooms: Tensor
-    surfaces: Surfaces
-    labels: tuple[str, ...]
-    lights: Tensor
-    volumes: Tensor
-    noise: Tensor
-    ways: tuple[Tensor, ...]
-    camera_height: float
+    rooms: Tensor  # [R, 2, 3] float64 lower and upper corners (y from the ceiling to 0) [m]
+    room_styles: tuple[str, ...]  # the name of each room's style
+    doors: Tensor  # [D, 2, 3] float64 boxes around the openings [m]
+    door_rooms: Tensor  # [D, 2] the rooms that each one joins
+    surfaces: Surfaces  # the primitives
+    labels: tuple[str, ...]  # what each primitive is part of
+    lights: Tensor  # [R, L, 7] float32: position [m], linear RGB, reach [m]; unused ones are dark
+    volumes: Tensor  # [R, L, Y, Z, X] float32 share of each light that reaches a grid of points in the room
+    noise: Tensor  # behind the textures, see ``texture.noise_table``
+    ways: tuple[Tensor, ...]  # [M, 2] float64 closed ways of x and z [m], see ``route.ways``
+    camera_height: float  # above the floor [m]
 
     @property
     def device(self) -> torch.device:
@@ -118,7 +103,8 @@ def _make(seed: int, chosen: TourStyle) -> Tour:
     routes = ways(rooms, doors)
     parts, lights = _fill(rooms, doors, np.concatenate(routes), stream(_LOOKS), stream(_THINGS))
     table = surfaces(parts, stream(_SHIFTS))
-    corners = torch.tensor(np.array([_corners(room) for room in rooms]))
+    corners = torch.tensor(np.array([room.box for room in rooms]))
+    openings = [door.box(_FRAME, door.thickness / 2 + _FRAME, _FRAME, _FRAME) for door in doors]
     light_table = _light_table(lights)
     casts = torch.tensor([p.kind != QUAD and p.finish.glow == 0 and p.label not in _SHADOWLESS for p in parts])
     sizes = torch.tensor([[light.size for light in of_room] + [0.0] * (LIGHTS - len(of_room)) for of_room in lights])
@@ -127,7 +113,7 @@ def _make(seed: int, chosen: TourStyle) -> Tour:
         style=chosen,
         rooms=corners,
         room_styles=tuple(room.style.name for room in rooms),
-        doors=torch.tensor(np.array([_opening(door) for door in doors]).reshape(-1, 2, 3)),
+        doors=torch.tensor(np.array(openings).reshape(-1, 2, 3)),
         door_rooms=torch.tensor([door.rooms for door in doors]).reshape(-1, 2),
         surfaces=table,
         labels=tuple(p.label for p in parts),
@@ -148,23 +134,13 @@ def _fill(
     palettes = [Palette(room.style, looks) for room in rooms]
     for index, room in enumerate(rooms):
         own = [door for door in doors if index in door.rooms]
-        parts += shell(index, room, own, palettes[index])
+        shell_parts = list(shell(room, own, palettes[index]))
         stock = furnish(room, own, way, palettes[index], things)
-        parts += [replace(p, rooms=(index, -1)) for p in stock.parts]
+        parts += [replace(p, rooms=(index, NOBODY)) for p in shell_parts + stock.parts]
         lights.append(stock.lights)
     for door in doors:
-        parts += frame(door, palettes[door.rooms[0]].finish("wood"))
+        parts += [replace(p, rooms=door.rooms) for p in frame(door, palettes[door.rooms[0]].finish("wood"))]
     return parts, lights
-
-
-def _corners(room: Room) -> list[list[float]]:
-    return [[room.lower[0], -room.height, room.lower[1]], [room.upper[0], 0.0, room.upper[1]]]
-
-
-def _opening(door: Door) -> list[list[float]]:
-    across = door.along * (door.width / 2 + _FRAME) + np.abs(door.normal) * (door.thickness / 2 + _FRAME)
-    low, high = door.middle - across, door.middle + across
-    return [[low[0], -door.height - _FRAME, low[1]], [high[0], _FRAME, high[1]]]
 
 
 def _light_table(lights: list[list[Light]]) -> Tensor:

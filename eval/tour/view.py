@@ -17,19 +17,12 @@ from ufmstar_torch.eval.tour.visibility import Window, surface_windows
 
 @dataclass(frozen=True, eq=False)
 class TourView:
-    """What a camera sees.
+    """What a camera sees."""
 
-    Attributes:
-        image: [H, W, 3] uint8 RGB.
-        depth: [H, W] float64 along z [m].
-        surface: [H, W] int64 which primitive, -1 where there is none.
-        valid: [H, W] bool whether there is one; everywhere, inside of a room.
-    """
-
-    image: Tensor
-    depth: Tensor
-    surface: Tensor
-    valid: Tensor
+    image: Tensor  # [H, W, 3] uint8 RGB
+    depth: Tensor  # [H, W] float64 along z [m]
+    surface: Tensor  # [H, W] int64 which primitive, -1 where there is none
+    valid: Tensor  # [H, W] bool whether there is one; everywhere, inside of a room
 
 
 def render(
