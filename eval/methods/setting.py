@@ -122,8 +122,8 @@ class Setting(Checked):
     @property
     def of_ufm_star(self) -> tuple[str, ...]:
         """Names of what is changed of UfM*, which other methods do without."""
-        own = ("ufm_preset",) if self.ufm_preset != DEFAULTS else ()
-        return (*self.overrides, *own, *(("aleatoric_in_h",) if self.aleatoric_in_h else ()))
+        own = ("ufm_preset", "aleatoric_in_h", "anchors", "recalibration")
+        return (*self.overrides, *(name for name in own if getattr(self, name) != getattr(DEFAULT, name)))
 
     @property
     def draws(self) -> bool:
@@ -165,12 +165,6 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
     setting = Setting(overrides=changed, **own)
     configured(setting)
     return setting
-
-
-def value_of(setting: Mapping[str, Any], name: str) -> Any:
-    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it has none. Raises
-    ValueError: an unknown name."""
-    return setting[name] if name in setting else default_of(name, setting.get("ufm_preset", DEFAULTS))
 
 
 def default_of(name: str, preset: str = DEFAULTS) -> Any:
