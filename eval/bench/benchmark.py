@@ -84,7 +84,7 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
             _on_cpu(options, report, progress)
         report["targets"] = targets(report)
     else:
-        report["device"] = measure_device(options.device, options.sizes, options.frames, options.seed, progress)
+        report["device"] = measure_device(options, progress)
         report["targets"] = []
     report["load_average"] = {"before": load, "after": machine.load_average()}
     if options.against is not None and options.device == "cpu":
@@ -115,10 +115,7 @@ def _on_cpu(options: BenchSettings, report: dict[str, Any], progress: Progress) 
         report["long_run"] = next((run for run in report["growth"] if run["world"] == "room"), None)
     if options.anchors is not None:
         progress(f"{options.anchors} corners and anchors")
-        report["anchors"] = measure_anchors(
-            source, config, points=options.anchors, frames=options.frames, history=options.history,
-            in_view=options.in_view, step_size=_TARGET_SIZE,
-        )  # fmt: skip
+        report["anchors"] = measure_anchors(options, source, config, _TARGET_SIZE)
 
 
 def _inputs(options: BenchSettings) -> tuple[FastDepth, FrameSource]:
