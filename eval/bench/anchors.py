@@ -62,7 +62,7 @@ class TrackedTour:
 
 
 def measure_anchors(options: BenchSettings, source: FrameSource, config: UfMStarConfig, size: int) -> dict[str, Any]:
-    """Time the tracker and the anchored step with ``options.anchors`` corners, on one thread of torch, numba and OpenCV.
+    """Time the tracker and the anchored step with ``options.anchors`` corners; torch, numba and OpenCV on one thread.
 
     Args:
         options: of the benchmark.
