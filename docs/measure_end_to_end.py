@@ -15,9 +15,10 @@ import numpy as np
 import torch
 
 from ufmstar_torch import UncertainDepth
-from ufmstar_torch.eval.commands.run import Progress, RunJob, run
+from ufmstar_torch.eval.commands.run import job_from, run
 from ufmstar_torch.eval.commands.run_command import read
-from ufmstar_torch.eval.commands.run_job import job_from
+from ufmstar_torch.eval.engine.progress import Progress
+from ufmstar_torch.eval.results.run_job import RunJob
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models import Preprocess
 

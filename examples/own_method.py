@@ -69,7 +69,7 @@ def main(words: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     ]
     metrics, coverage = {row.key: RunMetrics(row.key, {}) for row in rows}, Coverage()
     FrameStream(sequence, range(len(sequence)), rows).drive([*metrics.values(), coverage])
-    figures = {key: one.figures.figures()[UFM] for key, one in metrics.items()}
+    figures = {key: one.figures()[UFM] for key, one in metrics.items()}
     for key, values in figures.items():
         values["within 2 sigma"] = coverage.inside[key] / coverage.pixels[key]
         print(f"{key:8}", "  ".join(f"{name} {values[name]:.3f}" for name in ("rmse", "ece_delta", "within 2 sigma")))

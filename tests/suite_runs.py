@@ -12,11 +12,12 @@ from layouts import write_generic
 
 from ufmstar_torch.eval.engine.evaluate import BROKEN, RowResult, evaluate_sequences
 from ufmstar_torch.eval.engine.load import NetworkChoice
+from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.engine.stream import Stopped
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.work import EvalJob, WorkerContext, run_job
+from ufmstar_torch.eval.results.work import EvalJob, Worker, WorkerTask
 from ufmstar_torch.eval.results.worklist import find_work
 
 TRUTH = "depth_only=ground-truth:24x32"
@@ -63,7 +64,7 @@ class Stub:
             self.before(sequence.name, done)
             if stop():
                 raise Stopped
-            progress(done + 1, len(sequence))
+            progress(Progress("frames", done + 1, len(sequence)))
         return [_drawn(sequence, row) for row in rows]
 
 
@@ -91,13 +92,14 @@ def one_by_one(judge):
     return judge if judge is evaluate_sequences else evaluate
 
 
-def go(job, evaluate=None, *, resume=False, overwrite=False, **context):
-    """Open the folder and go through the sequences: (came to the end, lines that were reported)."""
+def go(job, evaluate=None, *, resume=False, overwrite=False, stop=lambda: False, progress=lambda *_: None, **part):
+    """Open the folder and go through the sequences: (came to the end, lines that were reported). ``part``: of the
+    ``WorkerTask``."""
     lines: list[str] = []
     networks = job.load(torch.device("cpu"))
     folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
-    context = WorkerContext(report=lines.append, evaluate=one_by_one(evaluate or Stub()), **context)
-    return run_job(job, folder, networks, context), lines
+    how = {"stop": stop, "report": lines.append, "progress": progress, "evaluate": one_by_one(evaluate or Stub())}
+    return Worker(WorkerTask(job, **part), folder, networks, **how).run(), lines
 
 
 def kept(out):

@@ -62,7 +62,7 @@ def test_anchored_without_anchors_is_plain():
         a.corrected()
 
 
-def test_a_common_bias_is_found_and_not_counted_twice():
+def test_a_common_bias_is_measured_and_counted_once():
     # 20 % too far everywhere, and 4 % flicker between frames: r = 1/1.2 - 1 on average.
     _, outputs, depths = walk(lambda z, i, rng: z * 1.2 * (1 + 0.04 * rng.standard_normal()))
     sums = np.zeros(4)
@@ -79,7 +79,7 @@ def test_a_common_bias_is_found_and_not_counted_twice():
     assert claimed_left < 0.7 * claimed  # M stays
 
 
-def test_different_biases_are_told_apart():
+def test_different_biases_are_separated():
     def predict(truth, i, rng):
         return np.where(truth > 2.5, truth * 1.3, truth)
 

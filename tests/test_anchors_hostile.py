@@ -44,7 +44,7 @@ def without():
     "spoilt",
     [(1e30, 1e-4), (1e200, 1e-4), (1e4, 1e-4), (1e-30, 0.0), (2.0, 1e300), (2.0, 1e4), (2.0, 4.0), (1e200, 1e300)],
 )
-def test_one_anchor_that_says_nothing_teaches_nothing(spoilt, without):
+def test_an_anchor_without_information_changes_nothing(spoilt, without):
     result, used = taught(spoilt)
     assert np.isfinite(result).all()
     assert used >= 30

@@ -42,8 +42,8 @@ def as_anchors(rows):
 
 @pytest.fixture(scope="module")
 def expected():
-    """Inputs and the oracle's answers of seven frames of a network that is 30 % too near, the third without anchors."""
-    depths, poses, K = scenes.sequence(7, HEIGHT, WIDTH, 0.04)
+    """Inputs and the oracle's answers of five frames of a network that is 30 % too near, the third without anchors."""
+    depths, poses, K = scenes.sequence(5, HEIGHT, WIDTH, 0.04)
     rng = np.random.default_rng(5)
     judge = AnchoredOracle(oracle_settings(SPGF), kappa=3.0, half_life=4.0)
     frames = []

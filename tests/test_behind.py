@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 import time
 from dataclasses import replace
@@ -56,7 +57,7 @@ def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
 
     class States(FrameSink):
         def take(self, result):
-            expected.append({name: value.clone() for name, value in plain.state().items()})
+            expected.append(copy.deepcopy(plain.state()["row"]))
 
     plain = stream_of(sequence)
     plain.drive([States()])
@@ -69,8 +70,8 @@ def test_every_frame_comes_in_order_with_the_state_after_it(sequence):
     assert first.ended
     assert second.ended
     for result, state in zip(first.results, expected, strict=True):
-        assert result.state.keys() == state.keys()
-        assert all(torch.equal(value, state[name]) for name, value in result.state.items())
+        assert result.state["row"].keys() == state.keys()
+        assert all(torch.equal(value, state[name]) for name, value in result.state["row"].items())
         assert result.ms.keys() == {"read", "predict", "truth", "cycle", "writing", "saving"}
         assert result.ms["writing"] >= 10
 

@@ -163,7 +163,7 @@ def test_what_was_not_measured_agrees_with_the_oracle(choice):
     config = CONFIG.replace(unmeasured=choice, **CHOICES[choice])
     tiers = [UfMStar(config.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]
     judge = oracle.Oracle(oracle_settings(SPGF), unmeasured=choice, **CHOICES[choice])
-    for i in range(4):
+    for i in range(3):
         V, _ = judge.step(DEPTHS[i], POSES[i], K_)
         share = judge.share()
         for ufm in tiers:

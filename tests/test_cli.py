@@ -33,21 +33,24 @@ def path(tmp_path_factory):
 
 @pytest.fixture
 def brightness(monkeypatch, tmp_path):
-    """Makes ``--model any --weights FILE`` load a network whose gain is the file's content; returns the files."""
+    """Makes ``--model any --weights FILE`` load a network whose gain is the file's content.
+
+    Returns the files, and what a test may set: what a network does at which call, and the width of its images.
+    """
+    fake = types.SimpleNamespace(
+        files=[tmp_path / "first.pt", tmp_path / "second.pt"], at=None, then=None, width=lambda: 32
+    )
+    for file, gain in zip(fake.files, ("1.0", "1.1"), strict=True):
+        file.write_text(gain)
 
     def load(name, weights, **options):
         assert (name, options) == ("any", {})
-        network = Brightness(float(weights.read_text()), spread=0.02)
-        network.preprocess = Preprocess(size=(24, 32))
-        loaded.append(network)
+        network = Brightness(float(weights.read_text()), spread=0.02, at=fake.at, then=fake.then)
+        network.preprocess = Preprocess(size=(24, fake.width()))
         return network
 
-    loaded = []
     monkeypatch.setattr(sources, "load_network", load)
-    files = [tmp_path / "first.pt", tmp_path / "second.pt"]
-    for file, gain in zip(files, ("1.0", "1.1"), strict=True):
-        file.write_text(gain)
-    return types.SimpleNamespace(files=files, loaded=loaded)
+    return fake
 
 
 QUICK = ("--no-video", "--no-sheet")
@@ -174,7 +177,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_told_in_one_line(ufmstar, path, tmp_path, mistake):
+def test_a_mistake_is_reported_in_one_line(ufmstar, path, tmp_path, mistake):
     words, expected = MISTAKES[mistake]
     code, out, err = ufmstar(*[word.format(path=path, out=tmp_path / "out") for word in words])
     assert (code, out) == (2, "")
@@ -202,7 +205,7 @@ def test_debug_shows_the_traceback(ufmstar, tmp_path):
     assert "Traceback" in err
 
 
-def test_an_unknown_key_in_a_file_is_told(ufmstar, path, tmp_path):
+def test_an_unknown_key_in_a_file_is_reported(ufmstar, path, tmp_path):
     for text, expected in (('{"ufm": {"etaa": 0.3}}', "etaa"), ('{"modell": "fastdepth"}', "modell")):
         (tmp_path / "c.json").write_text(text)
         words = ("run", path, "--depth", "self", "--config", tmp_path / "c.json", "--out", tmp_path / "out")
@@ -240,7 +243,7 @@ def test_poses_in_another_convention(ufmstar, path, tmp_path):
     assert mixtures[0]["components"] == mixtures[1]["components"]
 
 
-def test_settings_from_file_and_words(ufmstar, path, tmp_path):
+def test_settings_come_from_a_file_and_options(ufmstar, path, tmp_path):
     (tmp_path / "c.yaml").write_text("ufm:\n  eta: 0.4\n  ema_alpha: 1\n  segment:\n    min_rows: 2\nframes: '1:5:2'\n")
     words = ("--config", tmp_path / "c.yaml", "--ufm.eta", "0.3", "--preset", "tartanair_indoor")
     assert ufmstar("run", path, "--depth", "self", *words, *QUICK, "--out", tmp_path / "out")[0] == 0
@@ -303,7 +306,7 @@ def test_threads(ufmstar, path, tmp_path):
 
 
 @pytest.mark.parametrize("write", [write_tum, write_tartanair])
-def test_layouts_are_found(ufmstar, tmp_path, write):
+def test_layouts_are_detected(ufmstar, tmp_path, write):
     path, _ = write(tmp_path, frames=2)
     code, _, err = ufmstar("run", path, "--depth", "ground-truth", *QUICK, "--out", tmp_path / "out")
     assert code == 0, err
@@ -326,7 +329,7 @@ def test_options_of_every_command_are_read_before_anything_starts(ufmstar):
 # ---- runs ----
 
 
-def test_a_run_says_what_came_out(ufmstar, path, tmp_path, brightness):
+def test_a_run_prints_its_table_and_outputs(ufmstar, path, tmp_path, brightness):
     code, out, err = ufmstar(
         "run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out"
     )
@@ -368,40 +371,26 @@ def test_other_weights_under_the_same_name_do_not_go_on(ufmstar, path, tmp_path,
     assert ufmstar(*words, "--overwrite")[0] == 0
 
 
-def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness, monkeypatch):
-    load = sources.load_network
-
-    def other(name, weights, **options):
-        network = load(name, weights, **options)
-        network.preprocess = Preprocess(size=(24, 32 + len(brightness.loaded)))
-        return network
-
-    monkeypatch.setattr(sources, "load_network", other)
+def test_members_must_want_the_same_input(ufmstar, path, tmp_path, brightness):
+    brightness.width = iter((32, 33)).__next__
     code, _, err = ufmstar("run", path, "--model", "any", "--weights", *brightness.files, "--out", tmp_path / "out")
     assert code == 2
     assert "same input" in err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, brightness, monkeypatch, number):
+def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, brightness, number):
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK)
     assert ufmstar(*words, "--out", tmp_path / "whole")[0] == 0
-    load = sources.load_network
-
-    def loaded(name, weights, **options):
-        network = load(name, weights, **options)
-        network.at, network.then = 1, lambda: os.kill(os.getpid(), number)
-        return network
-
     before = signal.getsignal(number)
-    monkeypatch.setattr(sources, "load_network", loaded)
+    brightness.at, brightness.then = 1, lambda: os.kill(os.getpid(), number)
     code, _, err = ufmstar(*words, "--out", tmp_path / "out")
     assert code == 130
     assert "stopping after this frame" in err
     assert "interrupted: stopped by the user after 3 of 6 frames; --resume goes on" in err
     assert signal.getsignal(number) is before
     assert read_summary(tmp_path / "out")["state"] == "interrupted"
-    monkeypatch.setattr(sources, "load_network", load)
+    brightness.at = None
     assert ufmstar(*words, "--out", tmp_path / "out", "--resume")[0] == 0
     whole, resumed = outputs(tmp_path / "whole"), outputs(tmp_path / "out")
     for result in (whole, resumed):
@@ -409,18 +398,12 @@ def test_a_signal_ends_the_run_after_the_frame_in_hand(ufmstar, path, tmp_path, 
     assert whole == resumed
 
 
-def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness, monkeypatch):
+def test_a_second_signal_ends_it_at_once(ufmstar, path, tmp_path, brightness):
     def twice():
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
-    def loaded(name, weights, **options):
-        network = load(name, weights, **options)
-        network.at, network.then = 1, twice
-        return network
-
-    load = sources.load_network
-    monkeypatch.setattr(sources, "load_network", loaded)
+    brightness.at, brightness.then = 1, twice
     words = ("run", path, "--model", "any", "--weights", *brightness.files, *QUICK, "--out", tmp_path / "out")
     assert ufmstar(*words)[0] == 130
     assert read_summary(tmp_path / "out")["frames"]["done"] == 2
@@ -437,17 +420,11 @@ def test_a_full_disk(ufmstar, path, tmp_path, monkeypatch):
     assert read_summary(tmp_path / "out")["state"] == "failed"
 
 
-def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness, monkeypatch):
+def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness):
     def fail():
         raise RuntimeError("two\nlines")
 
-    def loaded(name, weights, **options):
-        network = load(name, weights, **options)
-        network.at, network.then = 0, fail
-        return network
-
-    load = sources.load_network
-    monkeypatch.setattr(sources, "load_network", loaded)
+    brightness.at, brightness.then = 0, fail
     words = ("run", path, "--model", "any", "--weights", brightness.files[0], *QUICK, "--out", tmp_path / "out")
     code, _, err = ufmstar(*words)
     assert code == 1
@@ -455,7 +432,7 @@ def test_an_error_inside_a_network(ufmstar, path, tmp_path, brightness, monkeypa
     assert "Traceback" not in err
 
 
-def test_skipped_frames_are_told(ufmstar, tmp_path):
+def test_skipped_frames_are_reported(ufmstar, tmp_path):
     path, _ = write_generic(tmp_path, frames=3)
     truncate(path / "images" / "8.png")
     code, out, _ = ufmstar("run", path, "--depth", "self", *QUICK, "--out", tmp_path / "out")

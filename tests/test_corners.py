@@ -92,7 +92,7 @@ def shifted(image, right):
     return cv2.warpAffine(image, np.array([[1.0, 0, right], [0, 1, 0]]), image.shape[::-1])
 
 
-def test_an_expected_position_finds_what_went_too_far():
+def test_an_expected_position_extends_the_search():
     before = textured(240, 480)
     after = shifted(before, 70.0)
     start = find(before, 60, 12.0, np.zeros((0, 2)))

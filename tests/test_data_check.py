@@ -121,7 +121,7 @@ def test_unregistered_depth(tour):
     assert any("--depth-intrinsics" in remedy for remedy in result.remedies)
 
 
-def test_broken_and_missing_frames_are_told(tour, capsys):
+def test_broken_and_missing_frames_are_reported(tour, capsys):
     layouts.truncate(tour / "images" / "000000.png")
     layouts.truncate(sorted((tour / "depth").iterdir())[13])
     lines = (tour / "poses.txt").read_text().splitlines()

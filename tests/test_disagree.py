@@ -96,7 +96,7 @@ def test_a_surface_seen_edge_on_stays_finite():
 
 
 def test_a_sequence_agrees_with_the_oracle():
-    depths, poses, K = scenes.sequence(8, HEIGHT, WIDTH, 0.04)
+    depths, poses, K = scenes.sequence(6, HEIGHT, WIDTH, 0.04)
     judge = oracle.Oracle(oracle_settings(SPGF), disagreement="overlap")
     config = UfMStarConfig(segment=SPGF, regression="exact", disagreement="overlap")
     tiers = [UfMStar(config.replace(backend=backend), dtype=torch.float64) for backend in ("torch", "numba")]

@@ -80,6 +80,7 @@ def test_what_is_compared_has_one_scale(script: Any, shot: Any) -> None:
     np.testing.assert_allclose(panels["true error"].images[0].get_array().filled(np.nan), shot.error)
 
 
+@pytest.mark.slow
 def test_the_command_draws_a_tour(script: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     out = tmp_path / "anchors.jpg"
     monkeypatch.setattr(sys, "argv", ["draw_anchors.py", "--tour", "tour:7?frames=5&size=48x64", "--out", str(out)])

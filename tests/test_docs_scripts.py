@@ -121,6 +121,7 @@ def test_the_scripts_run(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert len(draw.draw_factors({"both": figures}).axes) == 2
 
 
+@pytest.mark.slow
 def test_constants_of_anchors(script: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Each choice has a line with its figures; anchors change them, and a tracker that never answers does not."""
     measure = script("measure_anchors")

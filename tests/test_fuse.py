@@ -92,7 +92,7 @@ def test_equal_gaussians_disagree_by_nothing_in_float32():
     torch.testing.assert_close(fused.covariance, previous.covariance, rtol=1e-6, atol=1e-9)
 
 
-def test_append_reports_what_finds_no_room():
+def test_append_counts_what_has_no_slot():
     previous, current = mixture(2, 6, 5, empty=2), mixture(2, 5, 6, empty=0)
     new = torch.tensor([[True, False, True, False, True], [False, True, False, False, False]])
     filled, dropped = append(previous, current, new)

@@ -133,6 +133,7 @@ def test_geodesic_end_points():
         torch.testing.assert_close(cov, x, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_planar_gaussians_stay_positive_definite_over_a_thousand_fusions():
     floor = 1e-6
     flat = gaussian.floor_covariance(covariances(1000, 11, decades=9), torch.full((1000,), floor, dtype=torch.float64))

@@ -41,7 +41,7 @@ def pairs_of(previous, current, config, stream: int):
 
 @given(st.integers(0, 10**6), st.floats(0.05, 1.0), st.floats(0.05, 1.0))
 @settings(max_examples=30)
-def test_correspond(seed, eta, eta_occl):
+def test_correspond_agrees_with_the_reference(seed, eta, eta_occl):
     previous, current = mixture(2, 14, seed), mixture(2, 8, seed + 50)
     config = UfMStarConfig(eta=eta, eta_occlusion=eta_occl)
     reference = correspond(previous, current, K.expand(2, 3, 3), SIZE, config)
@@ -83,7 +83,7 @@ def fused(previous, current, pairs, config):
 @pytest.mark.parametrize("weighted", [False, True])
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=15)
-def test_fuse(weighted, seed):
+def test_fuse_agrees_with_the_reference(weighted, seed):
     previous, current = mixture(2, 6, seed, features=2), mixture(2, 5, seed + 50, features=2)
     pairs = random_pairs(2, previous, current, seed)
     config = UfMStarConfig(overlap_weighted=weighted)
@@ -144,7 +144,7 @@ def test_thin_wide_plates_survive_a_thousand_fusions_in_float32():
     run(functools.partial(fuse, rounds=1), 200)
 
 
-def test_without_numba_the_reference_serves_and_says_so_once(monkeypatch):
+def test_without_numba_the_reference_runs_and_warns_once(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     select.has_numba.cache_clear()
     try:

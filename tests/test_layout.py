@@ -184,7 +184,7 @@ def test_generic_names_are_not_importable(name, tmp_path):
     assert done.stdout.strip() == "None"
 
 
-def test_every_module_says_what_it_is_for():
+def test_every_module_has_a_docstring():
     for path in sources():
         assert ast.get_docstring(tree(path)) or path.read_text() == "", path
 

@@ -228,7 +228,7 @@ def test_gradients_reach_the_networks_own_variance_only():
     torch.testing.assert_close(a.grad, torch.ones_like(a))
 
 
-def test_layouts():
+def test_maps_with_and_without_a_channel_give_the_same():
     flat, channel = UfMStar(CONFIG), UfMStar(CONFIG)
     for i in range(2):
         depth, pose, intrinsics = frame(i)
@@ -245,7 +245,7 @@ def test_layouts():
     assert same(z.variance, x.variance)
 
 
-def test_reset():
+def test_reset_restores_the_start():
     ufm, fresh = UfMStar(CONFIG), UfMStar(CONFIG)
     for i in range(3):
         ufm(*frame(i))
@@ -314,7 +314,7 @@ def test_mean_uncertainty():
     assert unchanged(sampled, all_of_it.state_dict())  # the state does not depend on where it is read
 
 
-def test_the_standard_error_knows_that_pixels_are_drawn_once():
+def test_the_standard_error_is_of_pixels_drawn_without_replacement():
     ufm = UfMStar(CONFIG)
     ufm(*frame(0))
     every = ufm.mean_uncertainty(*frame(1), fraction=1.0)

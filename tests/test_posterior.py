@@ -265,7 +265,7 @@ def test_state_saved_and_loaded_goes_on_to_the_bit():
     assert bool(whole.posterior.any())
 
 
-def test_a_state_from_before_there_was_a_posterior_loads():
+def test_a_state_saved_before_posteriors_loads():
     old = UfMStar(UfMStarConfig(anchored=True))
     for depth, T, anchors in ufm_frames(2, streams=2):
         old(depth, T, K, anchors=anchors)

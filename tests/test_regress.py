@@ -247,7 +247,7 @@ def test_weights_average_between_components():
 
 @pytest.mark.parametrize("function", [smooth, regress_cpu.smooth], ids=["torch", "numba"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_smooth(function, dtype):
+def test_smooth_averages_where_both_are_known(function, dtype):
     nan = float("nan")
     before, now = torch.tensor([[[1.0, nan, 2.0, nan]]]), torch.tensor([[[3.0, 4.0, nan, nan]]], dtype=dtype)
     memory, shown = function(before, now, 0.25)

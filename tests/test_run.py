@@ -16,8 +16,9 @@ from layouts import truncate, write_depth_png, write_generic
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
 from ufmstar_torch import UfMStar, UncertainDepth, cli
-from ufmstar_torch.eval.commands.run import Progress, run
+from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
+from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.results import run_folder, writers
 from ufmstar_torch.eval.results.folder import FolderError
@@ -398,7 +399,7 @@ def test_an_error_of_the_network_is_in_the_summary(path, tmp_path):
 def test_a_full_disk_leaves_finished_frames_and_a_summary(path, tmp_path, uninterrupted, monkeypatch):
     out, reserve = tmp_path / "out", tmp_path / "out" / "resume" / "reserve"
     calls = []
-    write, write_json = writers.write_together, writers.write_json_atomic
+    write, write_json = writers.write_together, run_folder.write_json_atomic
 
     def full(files, **options):
         calls.append(1)
@@ -412,7 +413,7 @@ def test_a_full_disk_leaves_finished_frames_and_a_summary(path, tmp_path, uninte
         write_json(file, data)
 
     monkeypatch.setattr(writers, "write_together", full)
-    monkeypatch.setattr(writers, "write_json_atomic", full_json)
+    monkeypatch.setattr(run_folder, "write_json_atomic", full_json)
     summary = run(network_job(path, *pair()), out)
     assert (summary["state"], summary["frames"]["done"]) == ("failed", 4)
     assert "No space left on device" in summary["reason"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,8 @@ from tiny_suite import CPU, row
 from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, make_estimator
-from ufmstar_torch.eval.engine.evaluate import ProgressSink
 from ufmstar_torch.eval.engine.maps import own_depth
+from ufmstar_torch.eval.engine.progress import ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped
 from ufmstar_torch.eval.methods.setting import Setting
@@ -152,7 +153,10 @@ def test_it_stops_between_frames_and_goes_on(sequence):
     calls, seen = [], []
     stream = FrameStream(sequence, range(FRAMES), [in_turn()])
     with pytest.raises(Stopped):
-        stream.drive([Recorded("sink", calls), ProgressSink(lambda *at: seen.append(at))], stop=lambda: len(seen) > 2)
+        stream.drive(
+            [Recorded("sink", calls), ProgressSink(lambda now: seen.append((now.done, now.total)))],
+            stop=lambda: len(seen) > 2,
+        )
     assert calls == [("sink", "begin", 0), ("sink", "take", 0), ("sink", "take", 1)]
     assert seen == [(0, FRAMES), (1, FRAMES), (2, FRAMES)]
     sink = Recorded("sink", calls)
@@ -183,12 +187,14 @@ def test_a_state_taken_at_any_frame_gives_the_same_bits(tour):
 
     class States(FrameSink):
         def take(self, result):
-            states.append({name: value.clone() for name, value in whole.state().items()})
+            states.append(copy.deepcopy(whole.state()))
 
     whole.drive([sink, States()])
     for start in range(1, FRAMES):
-        stream = FrameStream(tour, range(FRAMES), rows_with_memory(), start=start)
-        stream.load_state(states[start - 1])
+        rows = rows_with_memory()
+        for one in rows:
+            one.load_state(states[start - 1][one.key])
+        stream = FrameStream(tour, range(FRAMES), rows, start=start)
         again = Recorded("again", [])
         stream.drive([again])
         assert len(again.results) == FRAMES - start
@@ -201,7 +207,7 @@ def test_a_state_taken_at_any_frame_gives_the_same_bits(tour):
                 np.testing.assert_array_equal(other.estimate.variance.numpy(), one.estimate.variance.numpy())
         last = stream.state()
         assert last.keys() == states[-1].keys()
-        assert all(torch.equal(value, states[-1][name]) for name, value in last.items())
+        assert all(torch.equal(value, states[-1][key][name]) for key in last for name, value in last[key].items())
 
 
 def test_the_state_of_another_estimator_is_refused(tour):

@@ -17,7 +17,6 @@ from ufmstar_torch.eval.engine.maps import own_depth
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped, drive_together
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.work import failures
 from ufmstar_torch.eval.sequences import FrameError
 from ufmstar_torch.eval.tour.open import open_tour
 from ufmstar_torch.models import Preprocess
@@ -103,7 +102,7 @@ def test_the_state_has_the_bits_of_a_sequence_alone(tours):
                 self.stream = stream
 
             def take(self, result):
-                seen[self.number].append(self.stream.state())
+                seen[self.number].append(self.stream.state()["row"])
 
         free = list(range(streams))
 
@@ -124,10 +123,10 @@ def test_the_state_has_the_bits_of_a_sequence_alone(tours):
         assert len(three[n]) == length
         for expected, actual in zip(one[n], three[n], strict=True):
             assert actual.keys() == expected.keys()
-            used = int((expected["row/ufm.weight"] > 0).sum())
+            used = int((expected["ufm.weight"] > 0).sum())
             assert used
             for name in UfMStarState.names():
-                a, b = (state[f"row/ufm.{name}"] for state in (expected, actual))
+                a, b = (state[f"ufm.{name}"] for state in (expected, actual))
                 slots = name in ("mean", "covariance", "weight", "disagreement", "count", "features")
                 assert torch.equal(*((a[:, :used], b[:, :used]) if slots else (a.nan_to_num(-1), b.nan_to_num(-1))))
 
@@ -226,5 +225,5 @@ def test_a_folder_is_the_same_and_what_was_stopped_goes_on(tmp_path):
     ended, lines = go(job, evaluate_sequences, resume=True)
     assert ended
     assert kept(job.out) == kept(whole.out)
-    assert not failures(EvalFolder(job.out, {}), job.items)
+    assert not EvalFolder(job.out).failures(job.items)
     assert [line.split(":")[0] for line in lines] == [f"rooms/{name}" for name in NAMES]

@@ -22,7 +22,7 @@ from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import load_results
-from ufmstar_torch.eval.results import launch, worker
+from ufmstar_torch.eval.results import launch, machine
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.launch import (
@@ -35,7 +35,8 @@ from ufmstar_torch.eval.results.launch import (
     run_slurm,
     tasks_of,
 )
-from ufmstar_torch.eval.results.worker import WorkerTask
+from ufmstar_torch.eval.results.work import WorkerTask
+from ufmstar_torch.eval.results.worklist import Shard
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
 
@@ -77,7 +78,7 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     given = {"network": network, "suite": str(tmp_path / "some.toml")}
     before = torch.get_num_threads()
     ended, message = quiet(options_for(rooms, tmp_path / "two", "--processes", "2", "--threads", "1", **given))
-    assert (ended.finished, ended.stopped, dict(ended.failed), ended.left) == (True, False, {}, 0), message
+    assert (ended.finished, ended.stopped, dict(ended.failed)) == (True, False, {}), message
     try:
         torch.set_num_threads(1)
         quiet(options_for(rooms, tmp_path / "one", **given))
@@ -95,9 +96,10 @@ SCRIPT = """
 import os, pickle, signal, sys, time
 task = pickle.load(sys.stdin.buffer)
 folder = task.job.out
-signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{task.index}", "w").close(), sys.exit(130)))
-open(f"{folder}/started{task.index}", "w").write(str(os.getpid()))
-os.rename(f"{folder}/started{task.index}", f"{folder}/pid{task.index}")
+signal.signal(signal.SIGTERM, lambda *_: (open(f"{folder}/ended{task.shard.index}", "w").close(), sys.exit(130)))
+number = task.shard.index
+open(f"{folder}/started{number}", "w").write(str(os.getpid()))
+os.rename(f"{folder}/started{number}", f"{folder}/pid{number}")
 while True:
     time.sleep(0.02)
 """
@@ -106,7 +108,7 @@ while True:
 def scripted(tmp_path, text, stop, count=3):
     """Processes that run a script: whether all came to their end, and the lines that were reported."""
     lines: list[str] = []
-    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), n + 1, count, n, "abc", 1) for n in range(count)]
+    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), Shard(n + 1, count), n, threads=1) for n in range(count)]
     return run_processes(tasks, stop=stop, report=lines.append, command=(sys.executable, "-c", text)), lines
 
 
@@ -134,7 +136,7 @@ def test_a_pool_whose_starter_fails_leaves_no_process(tmp_path):
 
 @pytest.mark.slow
 def test_a_pool_tells_of_a_process_that_was_killed_and_lets_the_others_finish(tmp_path):
-    text = "import os, pickle, sys\nif pickle.load(sys.stdin.buffer).index == 2: os.kill(os.getpid(), 9)"
+    text = "import os, pickle, sys\nif pickle.load(sys.stdin.buffer).shard.index == 2: os.kill(os.getpid(), 9)"
     assert scripted(tmp_path, text, lambda: False) == (False, ["process 2/3 ended early (signal 9)"])
     assert scripted(tmp_path, "import sys; sys.stdin.buffer.read()", lambda: False) == (True, [])
 
@@ -142,13 +144,13 @@ def test_a_pool_tells_of_a_process_that_was_killed_and_lets_the_others_finish(tm
 def test_threads_are_divided_and_devices_go_round(rooms, tmp_path, monkeypatch):
     monkeypatch.setattr(launch, "available_cores", lambda: 7)
     tasks = tasks_of(job_on(rooms, tmp_path), LaunchOptions(processes=3))
-    assert [(t.index, t.count, t.local, t.threads) for t in tasks] == [(1, 3, 0, 2), (2, 3, 1, 2), (3, 3, 2, 2)]
+    assert [(str(t.shard), t.local, t.threads) for t in tasks] == [("1/3", 0, 2), ("2/3", 1, 2), ("3/3", 2, 2)]
     assert len({t.launch for t in tasks}) == 1
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(worker, "require_device", lambda name: name)
-    assert [worker.device_of("cuda", t.local) for t in tasks] == ["cuda:0", "cuda:1", "cuda:0"]
-    assert worker.device_of("cuda:1", 0) == "cuda:1"
+    monkeypatch.setattr(machine, "require_device", lambda name: name)
+    assert [machine.device_of("cuda", t.local) for t in tasks] == ["cuda:0", "cuda:1", "cuda:0"]
+    assert machine.device_of("cuda:1", 0) == "cuda:1"
 
 
 def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
@@ -162,7 +164,7 @@ def test_a_job_is_the_same_in_another_process(rooms, tmp_path):
 
 def test_a_device_that_is_not_there():
     with pytest.raises(ValueError, match="--device abacus is not available"):
-        worker.device_of("abacus", 0)
+        machine.device_of("abacus", 0)
 
 
 # ---- torchrun ----
@@ -173,7 +175,7 @@ def as_rank(rank, world, options, result):
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(world), "LOCAL_RANK": str(rank)}
     stub = Stub(lambda *_: time.sleep(0.02))
     ended, _ = quiet(options, stub)
-    result.put((rank, ended.finished, ended.left, ended.reports, [name for name, _ in stub.asked]))
+    result.put((rank, ended.finished, ended.reports, [name for name, _ in stub.asked]))
 
 
 @pytest.mark.slow
@@ -189,9 +191,8 @@ def test_torchruns_processes_share_the_work_and_the_first_waits_for_the_rest(roo
     for child in children:
         child.join(60)
     assert [rank[:2] for rank in result] == [(0, True), (1, True)]
-    assert result[0][2:4] == (0, True)
-    assert not result[1][3]
-    assert sorted(result[0][4] + result[1][4]) == list(NAMES)
+    assert [rank[2] for rank in result] == [True, False]
+    assert sorted(result[0][3] + result[1][3]) == list(NAMES)
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")))
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
 
@@ -220,7 +221,7 @@ def test_what_contradicts_torchrun(rooms, tmp_path, monkeypatch, words):
 def test_the_first_waits_for_a_sequence_that_another_is_at(rooms, tmp_path):
     job = job_on(rooms, tmp_path / "out")
     go(replace(job, items=job.items[1:]))
-    claim, stub = EvalFolder(job.out, {}).claim(job.items[0], "other"), Stub()
+    claim, stub = EvalFolder(job.out).claim(job.items[0], "other"), Stub()
     waiter = threading.Thread(target=go, args=(job, stub), kwargs={"resume": True, "waits": True})
     waiter.start()
     time.sleep(0.5)
@@ -239,8 +240,8 @@ def test_parts_may_begin_in_any_order_and_share_a_folder(rooms, tmp_path):
     ends = []
     for part in ("2/2", "1/2"):
         ended, _ = quiet(options_for(rooms, tmp_path / "out", "--shard", part), Stub())
-        ends.append((ended.finished, ended.left))
-    assert ends == [(True, 2), (True, 0)]
+        ends.append((ended.finished, len(list((tmp_path / "out" / "records").glob("*/*")))))
+    assert ends == [(True, 1), (True, 3)]
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")))
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
     with pytest.raises(FolderError, match=r"other input: settings\.confident was 0\.5"):
@@ -259,7 +260,7 @@ def test_jobs_through_submitit(rooms, tmp_path):
         rooms, tmp_path / "out", "--slurm", "cluster=debug", "jobs=2", "partition=gpu", "timeout_min=5"
     )
     ended, message = quiet(options)
-    assert (ended.finished, ended.left) == (True, 0)
+    assert ended.finished
     assert message[0].startswith("jobs ")
     go(job_on(rooms, tmp_path / "whole", suite=suite_named("depth-only")), evaluate_sequences)
     assert kept(tmp_path / "out") == kept(tmp_path / "whole")
@@ -284,7 +285,7 @@ def test_what_slurm_is_told():
 
 
 def test_a_job_is_queued_again_with_the_same_task():
-    job = ClusterTask(WorkerTask(SimpleNamespace(out="x"), 1, 2, 0, "abc"))
+    job = ClusterTask(WorkerTask(SimpleNamespace(out="x"), Shard(1, 2)))
     again = job.checkpoint()
     assert again.function == job
 
@@ -305,7 +306,7 @@ class Submitted:
         return nullcontext()
 
     def submit(self, task):
-        end, number = self.ends.pop(0), task.task.index
+        end, number = self.ends.pop(0), task.task.shard.index
         return SimpleNamespace(
             job_id=str(number),
             done=lambda: end is not None,
@@ -329,7 +330,7 @@ def test_jobs_that_fail_are_reported_and_stopping_cancels_all(
 ):
     cluster, lines = Submitted(*ends), []
     monkeypatch.setitem(sys.modules, "submitit", cluster)
-    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), n + 1, 2, 0, "abc") for n in range(2)]
+    tasks = [WorkerTask(SimpleNamespace(out=tmp_path), Shard(n + 1, 2)) for n in range(2)]
     assert run_slurm(Slurm.parse(["jobs=2"]), tasks, stop=lambda: stops, report=lines.append) == finished
     assert lines == [f"jobs 1, 2; their output is in {tmp_path}/slurm", *failed]
     assert cluster.cancelled == cancelled
@@ -348,19 +349,20 @@ def test_without_submitit_the_error_names_what_to_install(rooms, tmp_path, monke
 @pytest.mark.slow
 def test_a_worker_reads_its_task_and_its_code_is_how_it_ended(rooms, tmp_path):
     def run(out, debug=False, **changes):
-        task = pickle.dumps(WorkerTask(job_on(rooms, out, **changes), 1, 2, 0, "abc", 1, debug))
-        command = (sys.executable, "-P", "-m", "ufmstar_torch.eval.results.worker")
-        ended = subprocess.run(command, input=task, capture_output=True, check=False)
+        task = pickle.dumps(
+            WorkerTask(job_on(rooms, out, **changes), Shard(1, 2), helps=True, launch="abc", threads=1, debug=debug)
+        )
+        ended = subprocess.run(launch.WORKER, input=task, capture_output=True, check=False)
         return ended.returncode, ended.stderr.decode()
 
     code, text = run(tmp_path / "out")
-    assert code == worker.DONE, text
+    assert code == launch.DONE, text
     assert "[1/2] rooms/ash: 4 rows, 4 frames" in text
     assert len(kept(tmp_path / "out")) == 12
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("x")
     code, text = run(tmp_path / "home")
-    assert code == worker.FAILED
+    assert code == launch.FAILED
     assert text.startswith("[1/2] failed: --out")
     assert "Traceback" in run(tmp_path / "home", debug=True)[1]
 

@@ -402,9 +402,8 @@ def test_a_sequence_that_cannot_be_used(networks, sequence, trouble):
         "no truth": "no frame has ground truth",
         "no frames": "selected of 5",
     }
-    with pytest.raises(SequenceError, match=message[trouble]) as raised:
+    with pytest.raises(SequenceError, match=message[trouble]):
         evaluate(replace(sequence, entries=entries), [row("Aleatoric")], networks, limit=limit)
-    assert raised.value.reason == str(raised.value)
 
 
 def test_asked_to_stop_it_stops_between_frames(networks, sequence):
@@ -415,8 +414,11 @@ def test_asked_to_stop_it_stops_between_frames(networks, sequence):
         stop.asked += 1
         return stop.asked > 3
 
+    def progress(now):
+        seen.append((now.done, now.total))
+
     with pytest.raises(Stopped):
-        evaluate(sequence, [row("Aleatoric")], networks, stop=asked, progress=lambda *at: seen.append(at))
+        evaluate(sequence, [row("Aleatoric")], networks, stop=asked, progress=progress)
     assert seen == [(n, FRAMES) for n in range(4)]
 
 

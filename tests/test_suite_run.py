@@ -23,12 +23,12 @@ from ufmstar_torch.eval.results.cache import CacheError
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.work import DIED, failures, with_references
+from ufmstar_torch.eval.results.work import DIED, with_references
 from ufmstar_torch.eval.results.worklist import Shard, content_digest
 
 
 def folder_of(job):
-    return EvalFolder(job.out, {})
+    return EvalFolder(job.out)
 
 
 def test_every_row_of_every_sequence_is_kept_as_a_record(rooms, tmp_path):
@@ -101,13 +101,13 @@ def test_a_broken_sequence_is_told_and_the_rest_goes_on(rooms, tmp_path):
     failed = json.loads((job.out / "records" / "rooms" / "birch" / "failed.json").read_text())
     assert (failed["sequence"], failed["dataset"], len(failed["rows"])) == ("birch", "rooms", 4)
     assert "poses.txt" in failed["reason"]
-    assert failures(folder_of(job), job.items).keys() == {"rooms/birch"}
+    assert folder_of(job).failures(job.items).keys() == {"rooms/birch"}
     # Mended, it is tried again.
     write_rooms(root, ["birch"])
     stub = Stub()
     assert go(job, stub, resume=True)[0]
     assert [name for name, _ in stub.asked] == ["birch"]
-    assert not failures(folder_of(job), job.items)
+    assert not folder_of(job).failures(job.items)
     go(job_on(rooms, tmp_path / "whole"))
     assert kept(job.out) == kept(tmp_path / "whole")
 
@@ -123,9 +123,9 @@ def test_what_the_judge_cannot_use_is_broken_and_what_it_cannot_write_ends_all(r
 
     job = job_on(rooms, tmp_path / "out")
     go(job, fails(SequenceError("no frame has ground truth")))
-    assert failures(folder_of(job), job.items) == {"rooms/birch": "no frame has ground truth"}
+    assert folder_of(job).failures(job.items) == {"rooms/birch": "no frame has ground truth"}
     go(job, fails(RuntimeError("out of memory")), resume=True)
-    assert failures(folder_of(job), job.items) == {"rooms/birch": "out of memory"}
+    assert folder_of(job).failures(job.items) == {"rooms/birch": "out of memory"}
     for error in (CacheError("disk full"), OSError("disk full"), TypeError("a mistake of ours")):
         with pytest.raises(type(error)):
             go(job, fails(error), resume=True)
@@ -139,7 +139,7 @@ def test_real_sequences_without_ground_truth_are_broken(rooms, tmp_path):
     (root / "ash" / "depth").rmdir()
     job = job_on(root, tmp_path / "out")
     assert go(job, evaluate_sequences)[0]
-    assert failures(folder_of(job), job.items) == {"rooms/ash": "no frame has ground truth"}
+    assert folder_of(job).failures(job.items) == {"rooms/ash": "no frame has ground truth"}
     assert len(kept(job.out)) == 4
 
 
@@ -269,7 +269,7 @@ def test_helpers_do_not_try_again_what_killed_one_of_them(rooms, tmp_path):
     ended, _ = go(job, stub, resume=True, launch="together", helps=True, shard=Shard(2, 2))
     assert ended
     assert [name for name, _ in stub.asked] == ["cedar"]
-    assert failures(folder_of(job), job.items) == {"rooms/birch": DIED}
+    assert folder_of(job).failures(job.items) == {"rooms/birch": DIED}
     # Nor what has failed for one of them.
     assert go(job, stub, resume=True, launch="together")[0]
     assert len(stub.asked) == 1

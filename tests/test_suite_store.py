@@ -185,8 +185,8 @@ def test_resuming_adds_rows_sequences_and_networks(tmp_path):
         "sequences": [{"dataset": "d", "sequence": "t"}],
         "missing_bases": ["aleatoric", "evidential"],
     }
-    about = EvalFolder.open(tmp_path, {**ABOUT, **more}, resume=True, overwrite=False).about
-    assert about == json.loads((tmp_path / "eval.json").read_text())
+    EvalFolder.open(tmp_path, {**ABOUT, **more}, resume=True, overwrite=False)
+    about = json.loads((tmp_path / "eval.json").read_text())
     assert about["networks"].keys() == {"aleatoric", "ensemble"}
     assert about["rows"] == [{"method": "A"}, {"method": "B"}]
     assert [s["sequence"] for s in about["sequences"]] == ["s", "t"]
@@ -281,7 +281,7 @@ def test_temporary_files_of_a_killed_process_are_removed(tmp_path):
 def test_a_row_without_its_sums_or_with_half_a_record_is_missing(tmp_path):
     job = job_on(write_rooms(tmp_path / "rooms", ["ash"]), tmp_path / "out")
     go(job)
-    folder, item, rows = EvalFolder(job.out, {}), job.items[0], job.suite.rows
+    folder, item, rows = EvalFolder(job.out), job.items[0], job.suite.rows
     assert folder.missing(item, rows) == []
     assert folder.missing(item, [Row(rows[3].method, Setting(skip=1))]) == [Row(rows[3].method, Setting(skip=1))]
     (folder.place(item) / "DepthOnly.pt").unlink()

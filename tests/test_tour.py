@@ -455,7 +455,7 @@ def test_path_seed_and_sensor_are_options_of_the_name():
         ("tour:1?frames=3&frames=4", "twice"),
     ],
 )
-def test_malformed_names_are_told_what_was_expected(name, expected):
+def test_malformed_names_raise_with_what_was_expected(name, expected):
     with pytest.raises(ValueError, match=expected):
         open_sequence(name)
 

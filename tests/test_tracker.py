@@ -255,7 +255,7 @@ def test_a_state_shares_the_image_and_stays_as_it_was(tour):
         np.testing.assert_array_equal(tracker.update(frame.image, frame.T_world_cam, frame.intrinsics).depth, depth)
 
 
-def test_anchors_lie_where_the_depth_map_says(tour):
+def test_anchors_lie_on_the_depth_map(tour):
     tracker = LandmarkTracker()
     for frame in tour[:8]:
         result = tracker.update(frame.image, frame.T_world_cam, frame.intrinsics)

@@ -136,7 +136,7 @@ def test_the_head_comes_to_state_what_ufmstar_computes(monkeypatch, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_fastdepth_comes_to_state_it_too(tmp_path, seed):
     """A tiny one, from nothing, on two tours that it is trained on."""
     size, lengths = (64, 96), {"tours": 2, "validation_tours": 1, "tour_frames": 8}
@@ -152,7 +152,7 @@ def test_a_fastdepth_comes_to_state_it_too(tmp_path, seed):
     assert train_member(job, 0) is None
     after = correlation(load_for_training(job.folder(0) / WEIGHTS)[0], batch)
     print(f"seed {seed}: Spearman {before:.2f} before, {after:.2f} after 200 steps")
-    # Measured over the four seeds: -.14 to .01 before, .32 to .50 after.
+    # Measured over four seeds: -.14 to .01 before, .32 to .50 after.
     assert after > before + 0.1
 
 

@@ -250,7 +250,7 @@ def test_pruning_takes_points_in_view_when_none_other_is_left():
     assert ufm.clouds()[0].mean[:, 0].tolist() == [1, 2, 3]
 
 
-def test_memory_per_point_is_what_the_documentation_says():
+def test_memory_per_point_is_as_documented():
     out = UfM()(*frame(0, dtype=torch.float32))
     assert out.statistics.memory.tolist() == [40 * int(out.statistics.points)]
     ufm = UfM(dtype=torch.float64)

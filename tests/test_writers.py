@@ -117,7 +117,7 @@ class TestFrames:
     def test_round_trip(self, tmp_path: Path) -> None:
         maps = frame()
         written = FrameWriter(tmp_path).write("1305031102.175304", **maps)
-        assert (written.depth_saturated, written.sigma_saturated) == (0, 0)
+        assert written == {"depth": 0, "sigma": 0}
         back = read_frame(tmp_path / "frames" / "1305031102.175304.npz")
         for name, value in maps.items():
             np.testing.assert_array_equal(back[name], value.numpy())
@@ -134,7 +134,7 @@ class TestFrames:
         writer = FrameWriter(tmp_path)
         writer.write("a", **frame(far=100.0))
         lost = writer.write("b", **frame(far=2.0))
-        assert lost.depth_saturated == 0
+        assert lost["depth"] == 0
         FrameWriter(tmp_path).write("c", **frame(far=2.0))
         for kind, unit in (("depth", 1 / 256), ("sigma", 1 / 2560)):
             assert [read_map(tmp_path / kind / f"{n}.png", "depth")[1] for n in "abc"] == [unit] * 3
@@ -144,9 +144,9 @@ class TestFrames:
         writer.write("near", **frame(far=8.0))
         maps |= {"valid": torch.ones_like(maps["valid"]), "variance": 200 * maps["variance"]}
         lost = writer.write("far", **maps)
-        assert lost.depth_saturated == int((maps["depth"].double() > (FULL + 0.5) * 1e-3).sum()) > 0
+        assert lost["depth"] == int((maps["depth"].double() > (FULL + 0.5) * 1e-3).sum()) > 0
         sigma = maps["variance"].double().sqrt()
-        assert lost.sigma_saturated == int((sigma > (FULL + 0.5) * 1e-4).sum()) > 0
+        assert lost["sigma"] == int((sigma > (FULL + 0.5) * 1e-4).sum()) > 0
 
     def test_finished_needs_every_file(self, tmp_path: Path) -> None:
         writer = FrameWriter(tmp_path)
@@ -181,7 +181,7 @@ class TestFullDisk:
     ) -> None:
         writer = FrameWriter(tmp_path)
         writer.write("a", **frame(0))
-        writer.write_summary({"frames": 1})
+        write_json_atomic(tmp_path / "summary.json", {"frames": 1})
         before, calls, replace = tree(tmp_path), [0], os.replace
 
         def replace_until_full(source: Path, target: Path) -> None:
@@ -195,7 +195,7 @@ class TestFullDisk:
             with pytest.raises(OSError, match="No space left"):
                 writer.write("b", **frame(1))
             with pytest.raises(OSError, match="No space left"):
-                writer.write_summary({"frames": 2})
+                write_json_atomic(tmp_path / "summary.json", {"frames": 2})
         after = tree(tmp_path)
         assert {name: after[name] for name in before} == before
         assert not writer.finished("b")

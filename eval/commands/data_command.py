@@ -75,12 +75,15 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
         ValueError: an option out of range, or nothing below the folder has a known layout.
     """
     from ufmstar_torch.eval.check.data_check import check_data
-    from ufmstar_torch.eval.sequences.layout import find_sequences
+    from ufmstar_torch.eval.sequences.layout import find_sequences, layouts_of, parts_of
     from ufmstar_torch.eval.sequences.options import Options
 
     path, opening = options.path, options.opening.given()
     Options(**{name: value for name, value in opening.items() if name not in ("layout", "poses")})
-    one = path.startswith("tour:") or any(name in opening for name in _OF_ONE) or _is_one(Path(path))
+    one = path.startswith("tour:") or any(name in opening for name in _OF_ONE)
+    if not one:  # a folder that fits several layouts is one too, whose layout must be named
+        fitting = layouts_of(Path(path))
+        one = len(fitting) > 1 or (len(fitting) == 1 and len(parts_of(Path(path), fitting[0])) == 1)
     result = [] if one else find_sequences(path, layout=options.opening.layout)
     if not one and not result and options.opening.layout == "auto":
         raise ValueError(f"{path} has no known layout, and nothing below it has; see docs/data.md, or --layout")
@@ -89,11 +92,3 @@ def _check(options: CheckOptions) -> tuple[list, bool]:
     return [
         check_data(item.path, item.name, options.pairs, **{**opening, "layout": item.layout}) for item in result
     ], True
-
-
-def _is_one(path: Path) -> bool:
-    """Whether the folder is a single sequence (or fits several layouts, of which one must be named)."""
-    from ufmstar_torch.eval.sequences.layout import layouts_of, parts_of
-
-    fitting = layouts_of(path)
-    return len(fitting) > 1 or (len(fitting) == 1 and len(parts_of(path, fitting[0])) == 1)

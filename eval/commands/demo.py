@@ -28,13 +28,13 @@ from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.camera import unproject
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.eval.commands.demo_command import DemoOptions
-from ufmstar_torch.eval.commands.run import Progress
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks, landmarks_of
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, Pointwise
 from ufmstar_torch.eval.engine.judge import RegionMetrics
 from ufmstar_torch.eval.engine.load import sha256
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.predictions import DepthSource
+from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
@@ -102,7 +102,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
         "points": int(rows[1].estimator.memory()["count"]),
         "versions": versions(),
     }
-    progress(Progress("pictures", 0, 1, None, 0))
+    progress(Progress("pictures", 0, 1))
     shown = demo_names(len(members))
     overall = {shown[method].strip(): values for method, values in metrics.overall().items()}
     title = f"ufmstar demo: {len(sequence)} frames, seed {options.seed}"
@@ -111,7 +111,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     outputs = write_pictures(options.out, walk.panels, overall, gaussians.ufm, title)
     summary |= {"outputs": outputs, "seconds": perf_counter() - started}
     write_json_atomic(options.out / SUMMARY, summary)
-    progress(Progress("pictures", 1, 1, None, 0))
+    progress(Progress("pictures", 1, 1))
     plain: dict[str, Any] = to_json(summary)
     return plain
 
@@ -166,11 +166,11 @@ class _RequireVariances(FrameSink):
 
 
 class _Walk(FrameSink):
-    """Collects the rows of the contact sheet and the times of every frame by row and stage [ms], and reports the
-    progress; ``unfamiliar``: of every frame, whether most of it shows an unfamiliar room."""
+    """Collects the rows of the contact sheet and the times of every frame by row and stage [ms]; ``unfamiliar``: of
+    every frame, whether most of it shows an unfamiliar room."""
 
-    def __init__(self, unfamiliar: list[bool], progress: Callable[[Progress], None]) -> None:
-        self._unfamiliar, self._progress = unfamiliar, progress
+    def __init__(self, unfamiliar: list[bool]) -> None:
+        self._unfamiliar = unfamiliar
         self._rows = sheet_rows(unfamiliar)
         self._panels: dict[int, FramePanel] = {}
         self.ms: dict[str, list[Mapping[str, float]]] = {}
@@ -180,18 +180,12 @@ class _Walk(FrameSink):
         """The rows of the sheet, in its order."""
         return [self._panels[index] for index in self._rows]
 
-    def begin(self, stream: FrameStream) -> None:
-        self._gaussians = next(row.estimator for row in stream.rows if row.key == UFM_STAR)
-        self._progress(Progress("frames", 0, len(self._unfamiliar), None, 0))
-
     def take(self, result: FrameResult) -> None:
         for key, row in result.rows.items():
             self.ms.setdefault(key, []).append(row.ms)
         if result.index in self._rows:
             note = list(KINDS.values())[self._unfamiliar[result.index]]
             self._panels[result.index] = panel(f"frame {result.index}", note, result)
-        components = int(self._gaussians.memory()["count"])
-        self._progress(Progress("frames", result.number + 1, len(self._unfamiliar), components, 0))
 
     def median_ms(self, key: str, *stages: str) -> float:
         """Of the typical frame, for those of the stages that the row has [ms]."""
@@ -213,8 +207,9 @@ def _walk(
         return torch.from_numpy(resample_nearest(kinds[result.index], result.frame.intrinsics, K, size))
 
     metrics = RegionMetrics([row.key for row in rows], list(KINDS.values()), kind_of)
-    walk = _Walk([bool(kind.mean() > 0.5) for kind in kinds], progress)
-    FrameStream(sequence, range(len(sequence)), rows, device=device).drive([metrics, walk])
+    walk = _Walk([bool(kind.mean() > 0.5) for kind in kinds])
+    sinks = [metrics, walk, ProgressSink(progress)]
+    FrameStream(sequence, range(len(sequence)), rows, device=device).drive(sinks)
     return rows, metrics, walk
 
 
@@ -225,48 +220,39 @@ def _rendered(sequence: FrameSequence, device: torch.device, progress: Callable[
 
     def compiling(done: int, total: int) -> None:
         if rendered.is_set():
-            progress(Progress("kernels", done, total, None, 0))
+            progress(Progress("kernels", done, total))
 
-    progress(Progress("rooms", 0, len(sequence), None, 0))
+    progress(Progress("rooms", 0, len(sequence)))
     with ThreadPoolExecutor(1) as beside:
         compiled = beside.submit(warm_up_command, _POSTERIOR, device, compiling, dense=True)
         for index in range(len(sequence)):
             frames.append(sequence[index])
-            progress(Progress("rooms", index + 1, len(sequence), None, 0))
-        progress(Progress("kernels", 0, 1, None, 0))
+            progress(Progress("rooms", index + 1, len(sequence)))
+        progress(Progress("kernels", 0, 1))
         rendered.set()
         compiled.result()
-    progress(Progress("kernels", 1, 1, None, 0))
+    progress(Progress("kernels", 1, 1))
     entries = [
-        replace(entry, load_image=partial(_same, frame.image), load_depth=partial(_same, frame.depth))
+        replace(entry, load_image=partial(np.asarray, frame.image), load_depth=partial(np.asarray, frame.depth))
         for entry, frame in zip(sequence.entries, frames, strict=True)
     ]
     return replace(sequence, entries=tuple(entries))
 
 
-def _same(array: np.ndarray | None) -> np.ndarray:
-    assert array is not None
-    return array
-
-
 def _methods(rows: list[RowRunner], metrics: RegionMetrics, walk: _Walk) -> dict[str, Any]:
-    """The rows of the table: figures, times and memory."""
-    overall = metrics.overall()
-    return {
-        row.key: {
+    """The rows of the table: figures, times, and the bytes on which the next frame depends, but for the map kept for
+    smoothing."""
+    overall, methods = metrics.overall(), {}
+    for row in rows:
+        kept = row.estimator.memory()
+        evidence = {} if row.anchors is None or row.anchors.tracks is None else row.anchors.tracks.state()
+        methods[row.key] = {
             "figures": overall[row.key].compute(),
             "network_ms": walk.median_ms(row.key, "network"),
-            "uncertainty_ms": walk.median_ms(row.key, "anchors", "uncertainty") if row.estimator.memory() else None,
-            "state_bytes": _state_bytes(row),
+            "uncertainty_ms": walk.median_ms(row.key, "anchors", "uncertainty") if kept else None,
+            "state_bytes": int(kept.get("bytes", 0)) + sum(value.nbytes for value in evidence.values()),
         }
-        for row in rows
-    }
-
-
-def _state_bytes(row: RowRunner) -> int:
-    """What the next frame depends on, but for the map kept for smoothing."""
-    evidence = {} if row.anchors is None or row.anchors.tracks is None else row.anchors.tracks.state()
-    return int(row.estimator.memory().get("bytes", 0)) + sum(value.nbytes for value in evidence.values())
+    return methods
 
 
 @contextmanager

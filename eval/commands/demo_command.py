@@ -59,12 +59,7 @@ def main(options: DemoOptions) -> int:
     from ufmstar_torch.eval.commands.terminal import Bars
     from ufmstar_torch.eval.report.text import demo_explanation, demo_table
     from ufmstar_torch.eval.results.folder import FolderError
-    from ufmstar_torch.eval.results.machine import require_device
 
-    try:
-        require_device(options.device)
-    except ValueError as error:
-        raise UsageError(error) from error
     try:
         with Bars() as bars:
             summary = demo.run_demo(options, bars.show)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.perturb import selects
@@ -34,7 +34,9 @@ def dry_run(job: EvalJob, networks: Mapping[str, DepthSource], shard: Shard) -> 
         lines.append(f"  {item.label}: {count} frames")
         sample = _bytes_per_file(sequence, networks) if sample is None else sample
         frames += count
-        size += _cached(job.suite.rows, networks, count, sample or {})
+        for base, bytes_ in (sample or {}).items():
+            rows = [row for row in job.suite.rows if row.method.base == base]
+            size += predictions(rows, networks[base], count) * bytes_
     lines.append(f"{frames} frames, {len(items) * len(job.suite.rows)} records")
     cached = "no frame can be read" if sample is None else f"up to {size / 1e6:.1f} MB"
     lines.append(f"cache of predictions: {cached}")
@@ -50,12 +52,6 @@ def predictions(rows: Iterable[Row], network: DepthSource, frames: int) -> int:
         how = row.setting.preprocess
         needed |= {(how, number, None if every else network.turn(place)) for place, number in enumerate(taken)}
     return len(needed)
-
-
-def _cached(rows: Sequence[Row], networks: Mapping[str, DepthSource], frames: int, sample: Mapping[str, int]) -> int:
-    """Bytes of the predictions of a sequence."""
-    by_base = {base: [row for row in rows if row.method.base == base] for base in sample}
-    return sum(predictions(own, networks[base], frames) * sample[base] for base, own in by_base.items())
 
 
 def _bytes_per_file(sequence: FrameSequence, networks: Mapping[str, DepthSource]) -> dict[str, int] | None:

@@ -14,6 +14,8 @@ from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, par
 from ufmstar_torch.eval.sequences.frame import parse_slice
 
 PRESETS = ("paper", "default")
+# Options that a job has under their names.
+_OF_JOB = ("device", "confident", "bins", "examples", "samples", "runtime", "precision", "streams")
 
 if TYPE_CHECKING:
     from ufmstar_torch.eval.methods.suite import Suite
@@ -201,7 +203,7 @@ def job_from(options: EvalOptions) -> EvalJob:
     from ufmstar_torch.eval.results.worklist import find_work, read_names
     from ufmstar_torch.eval.sequences.options import Options
 
-    what, data, output = options.what, options.data, options.output
+    what, data, output, values = options.what, options.data, options.output, as_dict(options)
     suite = _recalibrated(suite_named(str(what.suite), what.base, what.ufm_preset), what.recalibration)
     choices = [NetworkChoice.parse(text) for text in what.network]
     networks = {choice.base: choice for choice in choices}
@@ -219,14 +221,7 @@ def job_from(options: EvalOptions) -> EvalJob:
         missing_bases=tuple(base for base in suite.bases if base not in networks),
         frames=parse_slice(data.frames),
         cache=None if output.cache is None else Path(output.cache),
-        device=options.device,
-        confident=output.confident,
-        bins=output.bins,
-        examples=output.examples,
-        samples=what.samples,
-        runtime=what.runtime,
-        precision=what.precision,
-        streams=options.streams,
+        **{name: values[name] for name in _OF_JOB},
     )
 
 
@@ -281,17 +276,16 @@ def _evaluate(options: EvalOptions) -> int:
             warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
         outcome = evaluate_suite(job, launch, stop=stop, report=bars.say, progress=bars.frames)
     if outcome.reports:
-        return _report(outcome, options.threads, draws=not options.output.no_report)
+        return _report(job, outcome, options.threads, draws=not options.output.no_report)
     return 0 if outcome.finished else 130
 
 
-def _report(outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
+def _report(job: EvalJob, outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
     """Print the table, make the measurements and pictures that belong to it, name what failed; the exit code."""
     from ufmstar_torch.eval.report.data import ResultsError, load_results
     from ufmstar_torch.eval.report.text import summary, written
     from ufmstar_torch.eval.report.write import write_report
 
-    job = outcome.job
     try:
         print(summary(load_results(job.out, with_sums=False)))
     except ResultsError as error:
@@ -309,9 +303,8 @@ def _report(outcome: EvalOutcome, threads: int | None, *, draws: bool) -> int:
     for label, reason in outcome.failed.items():
         print(f"ufmstar eval: {label} failed: {reason}", file=sys.stderr)
     if outcome.stopped:
-        print(
-            f"ufmstar eval: stopped; finished rows are kept in {job.out / 'records'}; --resume goes on", file=sys.stderr
-        )
+        kept = f"finished rows are kept in {job.out / 'records'}; --resume goes on"
+        print(f"ufmstar eval: stopped; {kept}", file=sys.stderr)
         return 130
     if outcome.failed or not outcome.finished:
         print("ufmstar eval: not all sequences are complete; --resume tries the rest again", file=sys.stderr)

@@ -71,35 +71,19 @@ def option(default: Any = MISSING, **how: Any) -> Any:
 class _Fields:
     """The arguments of :func:`fields_of`."""
 
-    config: type
-    prefix: str
-    without: tuple[str, ...]
-    unset: bool
-    defaults: Mapping[str, Any]
+    config: type  # a dataclass. ``choices``, ``symbol``, ``unit`` and ``range`` in its fields' metadata are used.
+    # of the options' names; with a dot (``ufm.``) the names keep their underscores, and a configuration file has the
+    # values below that key.
+    prefix: str = ""
+    without: Sequence[str] = ()  # fields that are no options
+    unset: bool = False  # leave out what is not given, instead of the class's own default
+    defaults: Mapping[str, Any] = field(default_factory=dict)  # other defaults than the class's own
 
 
-def fields_of(
-    config: type,
-    prefix: str = "",
-    *,
-    without: Sequence[str] = (),
-    unset: bool = False,
-    defaults: Mapping[str, Any] | None = None,
-) -> Any:
-    """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included.
-
-    The value of a bool is written out: ``--ufm.add_aleatoric false``.
-
-    Args:
-        config: a dataclass. ``choices``, ``symbol``, ``unit`` and ``range`` in its fields' metadata are used.
-        prefix: of the options' names; with a dot (``ufm.``) the names keep their underscores, and a configuration
-            file has the values below that key.
-        without: fields that are no options.
-        unset: leave out what is not given, instead of the class's own default.
-        defaults: other defaults than the class's own.
-    """
-    how = _Fields(config, prefix, tuple(without), unset, defaults or {})
-    return field(default_factory=dict, metadata={"fields_of": how})
+def fields_of(config: type, prefix: str = "", **how: Any) -> Any:
+    """A field of type ``dict[str, Any]``: an option for every field of a settings class, nested ones included; the
+    arguments are :class:`_Fields`'s. The value of a bool is written out: ``--ufm.add_aleatoric false``."""
+    return field(default_factory=dict, metadata={"fields_of": _Fields(config, prefix, **how)})
 
 
 def parse(options: type[T], words: Sequence[str], prog: str, defaults: Mapping[str, Any] | None = None) -> T:
@@ -208,7 +192,7 @@ def _add_fields(group: Any, wanted: _Fields) -> None:
         if f.name in wanted.without:
             continue
         if is_dataclass(hints[f.name]):
-            _add_fields(group, _Fields(hints[f.name], f"{wanted.prefix}{f.name}.", (), wanted.unset, {}))
+            _add_fields(group, _Fields(hints[f.name], f"{wanted.prefix}{f.name}.", unset=wanted.unset))
             continue
         parts = get_args(hints[f.name]) if get_origin(hints[f.name]) in (Union, types.UnionType) else (hints[f.name],)
         parts += (types.NoneType,) if wanted.unset else ()

@@ -180,8 +180,7 @@ def read(words: Sequence[str]) -> RunOptions:
 
 def main(options: RunOptions) -> int:
     """Run, and print the results' table; the exit code."""
-    from ufmstar_torch.eval.commands.run import run as run_job
-    from ufmstar_torch.eval.commands.run_job import job_from
+    from ufmstar_torch.eval.commands.run import job_from, run
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
     from ufmstar_torch.eval.results.folder import FolderError
     from ufmstar_torch.eval.results.machine import share_threads
@@ -194,9 +193,8 @@ def main(options: RunOptions) -> int:
         raise UsageError(error) from error
     try:
         with Bars() as bars, stop_signals(bars.say) as stop:
-            summary = run_job(
-                job, options.out, resume=options.resume, overwrite=options.overwrite, progress=bars.show, stop=stop
-            )
+            how = {"resume": options.resume, "overwrite": options.overwrite}
+            summary = run(job, options.out, **how, progress=bars.show, stop=stop)
     except FolderError as error:
         raise UsageError(error) from error
     return _report(summary, options.out)

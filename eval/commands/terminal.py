@@ -6,50 +6,48 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ufmstar_torch.eval.commands.run import Progress
+    from ufmstar_torch.eval.engine.progress import Progress
 
 
 class Bars:
-    """A progress bar for each stage of a run."""
+    """A progress bar for each stage of a run, or for each sequence in hand."""
 
     def __init__(self) -> None:
-        self._bar: Any = None
-        self._stage = ""
-        self._sequences: dict[str, Any] = {}
+        self._bars: dict[str, Any] = {}
 
     def show(self, progress: Progress) -> None:
-        """Bring the bar of the stage up to date."""
+        """Bring the bar of the stage up to date; those of earlier stages stay as they are."""
         from tqdm import tqdm
 
-        if progress.stage != self._stage:
+        stage = progress.stage
+        if stage not in self._bars:
             self._close()
-            first = progress.done if progress.components is None and progress.stage == "frames" else 0
-            unit = "frame" if progress.stage == "frames" else "step"
-            self._bar = tqdm(total=progress.total, initial=first, desc=progress.stage, unit=unit, dynamic_ncols=True)
-            if progress.stage == "kernels":
-                self._bar.set_postfix_str("compiled on the first run")
-            self._stage = progress.stage
-        self._bar.total = progress.total
+            first = progress.done if progress.components is None and stage == "frames" else 0
+            unit = "frame" if stage == "frames" else "step"
+            bar = tqdm(total=progress.total, initial=first, desc=stage, unit=unit, dynamic_ncols=True)
+            if stage == "kernels":
+                bar.set_postfix_str("compiled on the first run")
+            self._bars = {stage: bar}
+        bar = self._bars[stage]
+        bar.total = progress.total
         if progress.components is not None:
             skipped = {"skipped": progress.skipped} if progress.skipped else {}
-            self._bar.set_postfix(K=progress.components, refresh=False, **skipped)
-        self._bar.update(progress.done - self._bar.n)
+            bar.set_postfix(K=progress.components, refresh=False, **skipped)
+        bar.update(progress.done - bar.n)
 
     def frames(self, label: str, done: int, total: int) -> None:
         """Bring the bar of a sequence's frames up to date; it goes when they are done."""
         from tqdm import tqdm
 
-        if label not in self._sequences:
-            new = tqdm(total=total, desc=label, unit="frame", dynamic_ncols=True, leave=False, disable=None)
-            self._sequences[label] = new
-        bar = self._sequences[label]
-        bar.update(done - bar.n)
+        if label not in self._bars:
+            how = {"unit": "frame", "dynamic_ncols": True, "leave": False, "disable": None}
+            self._bars[label] = tqdm(total=total, desc=label, **how)
+        self._bars[label].update(done - self._bars[label].n)
         if done == total:
-            self._sequences.pop(label).close()
+            self._bars.pop(label).close()
 
     def say(self, text: str) -> None:
         """Print a line without breaking the bar."""
@@ -60,16 +58,12 @@ class Bars:
     def __enter__(self) -> Bars:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
-        for bar in self._sequences.values():
-            bar.close()
 
     def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        for bar in self._bars.values():
+            bar.close()
 
 
 @contextmanager

@@ -58,7 +58,8 @@ class Behind(FrameSink):
         """Queue a frame; waits where the sinks are too far behind. Raises BaseException: what a sink raised for an
         earlier frame."""
         self._wait(_WAITING)
-        state = {name: value.clone() for name, value in self._stream.state().items()}
+        rows = self._stream.state().items()
+        state = {key: {name: value.clone() for name, value in own.items()} for key, own in rows}
         now = perf_counter()
         result.ms["cycle"] = 1000 * (now - self._last)
         self._last = now

@@ -285,7 +285,9 @@ class Gaussians(Estimator):
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
         """See :meth:`Estimator.load_state`; one of several streams raises ValueError."""
-        _load(self._streams.sole(), state)
+        if self.streams > 1:
+            raise ValueError(f"a state goes into a UfM* of one stream, this one has {self.streams}")
+        _load(self.ufm, state)
 
 
 def _variances(prediction: Prediction, used: bool) -> tuple[Tensor | None, Tensor | None]:

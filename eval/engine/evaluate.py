@@ -24,6 +24,7 @@ from ufmstar_torch.eval.engine.anchors import anchor_sources
 from ufmstar_torch.eval.engine.estimators import Estimator, Gaussians, make_estimator
 from ufmstar_torch.eval.engine.judge import RowMetrics, references
 from ufmstar_torch.eval.engine.predictions import DepthSource, PredictionStore
+from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream, drive_together
 from ufmstar_torch.eval.methods.method import ALONE
@@ -36,15 +37,7 @@ _TOLERANCE = UfMStarConfig().rotation_tolerance
 
 
 class SequenceError(Exception):
-    """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth.
-
-    Attributes:
-        reason: why.
-    """
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason)
-        self.reason = reason
+    """A sequence cannot be used as a whole: no frame can be read, or there is no ground truth."""
 
 
 # Errors of a sequence that cannot be used. Any other error is a mistake in this program, and ends it.
@@ -74,8 +67,7 @@ class SequenceTask:
     sequence: FrameSequence  # posed frames with ground truth
     rows: Sequence[Row]  # different ones
     sinks: Sequence[FrameSink] = ()  # take the frames after the metrics; a row's key is its slug
-    # called with the frames that are done and all of them, at the start and after every one.
-    progress: Callable[[int, int], None] = lambda done, total: None
+    progress: Callable[[Progress], object] = lambda _: None  # called at the start and after every frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,9 +145,8 @@ class _Evaluation:
     def __init__(self, task: SequenceTask, judge: Judge, shared: dict[Row, Gaussians], slot: int) -> None:
         self.task, self.slot = task, slot
         sequence, rows = task.sequence, task.rows
-        _check_rows(rows, judge.networks)
         indices = range(len(sequence))[judge.limit]
-        _check_sequence(sequence, rows, indices)
+        _check(sequence, rows, indices, judge.networks)
         expected = dict.fromkeys((row.method.base, row.setting.preprocess) for row in rows)
         sources = {(base, how): judge.networks[base].prepared(how) for base, how in expected}
         anchors = anchor_sources(rows, sequence.folder)
@@ -179,11 +170,29 @@ class _Evaluation:
 
     def outcome(self) -> list[RowResult] | Exception:
         """After the last frame: a result for each row, or why there is none."""
-        rows = self._accounts.rows
         try:
-            return [_result(row, rows[row.slug], self._metrics, self.task.sequence) for row in self.task.rows]
+            return [self._result(row) for row in self.task.rows]
         except BROKEN as error:
             return error
+
+    def _result(self, row: Row) -> RowResult:
+        """What a row leaves behind. Raises SequenceError: it has judged nothing."""
+        key, metrics, accounts = row.slug, self._metrics, self._accounts
+        frames = accounts.frames(key, metrics.judged[key])
+        if not frames["judged"]:
+            reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
+            none = "none of those that were read has ground truth"
+            raise SequenceError(f"no frame could be judged: {reasons or none}")
+        opened = Counter(skipped.reason for skipped in self.task.sequence.skipped)
+        return RowResult(
+            row=row,
+            frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
+            figures=metrics.figures(key),
+            curves=metrics.curves(key),
+            state=accounts.state(key),
+            ms=accounts.median_ms(key),
+            sums=metrics.sums(key),
+        )
 
 
 def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) -> None:
@@ -201,78 +210,55 @@ def _check_frame(frame: Frame, sources: Collection[DepthSource], tracked: bool) 
         raise FrameError(frame.name, FRAME_FAULTS[int(checked.fault[0])])
 
 
-class ProgressSink(FrameSink):
-    """Calls ``progress`` with the frames that are done and all of them, at the start and after every frame."""
-
-    def __init__(self, progress: Callable[[int, int], None]) -> None:
-        self._progress, self._total = progress, 0
+class _Accounts(FrameSink):
+    """Counts, times and memory of every row over a sequence, by key."""
 
     def begin(self, stream: FrameStream) -> None:
-        self._total = len(stream.indices)
-        self._progress(stream.position, self._total)
+        self._rows = {row.key: row for row in stream.rows}
+        self._reasons: dict[str, Counter[str]] = {key: Counter() for key in self._rows}
+        self._ms: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
+        self._memory: dict[str, list[Mapping[str, float]]] = {key: [] for key in self._rows}
 
     def take(self, result: FrameResult) -> None:
-        self._progress(result.number + 1, self._total)
+        for key, reason in result.skipped.items():
+            self._reasons[key][reason] += 1
+        for key, row in result.rows.items():
+            self._ms[key].append(row.ms)
+            self._memory[key].append(self._rows[key].estimator.memory())
 
-
-@dataclass
-class _Account:
-    """Counts, times and memory of a row over a sequence."""
-
-    reasons: Counter[str] = field(default_factory=Counter)
-    ms: list[Mapping[str, float]] = field(default_factory=list)
-    memory: list[Mapping[str, float]] = field(default_factory=list)
-
-    def frames(self, judged: int) -> dict[str, Any]:
+    def frames(self, key: str, judged: int) -> dict[str, Any]:
         """Counts, as ``Record`` has them."""
-        skipped, done = sum(self.reasons.values()), len(self.ms)
+        reasons, done = self._reasons[key], len(self._ms[key])
+        skipped = sum(reasons.values())
         counts = {"selected": done + skipped, "done": done, "judged": judged, "skipped": skipped}
-        return {**counts, "reasons": dict(sorted(self.reasons.items()))}
+        return {**counts, "reasons": dict(sorted(reasons.items()))}
 
-    def state(self) -> dict[str, float]:
+    def state(self, key: str) -> dict[str, float]:
         """What the method kept over the sequence, as ``Record`` has it."""
         state: dict[str, float] = {}
-        for name, end in (self.memory[-1] if self.memory else {}).items():
-            values = [kept[name] for kept in self.memory]
+        for name, end in (self._memory[key][-1] if self._memory[key] else {}).items():
+            values = [kept[name] for kept in self._memory[key]]
             if name in ("bytes", "count"):
                 state |= {f"{name}_mean": sum(values) / len(values), f"{name}_max": max(values), f"{name}_end": end}
             else:
                 state |= {"anchors_mean": sum(values) / len(values)} if name == "anchors" else {name: end}
         return state
 
-    def median_ms(self) -> dict[str, float]:
+    def median_ms(self, key: str) -> dict[str, float]:
         """Of the typical frame, by stage [ms]."""
         stages = ("network", "anchors", "uncertainty")
-        times = {stage: [ms[stage] for ms in self.ms if stage in ms] for stage in stages}
+        times = {stage: [ms[stage] for ms in self._ms[key] if stage in ms] for stage in stages}
         return {stage: median(values) for stage, values in times.items() if values}
 
 
-class _Accounts(FrameSink):
-    """The account of every row, by key."""
-
-    def begin(self, stream: FrameStream) -> None:
-        self._runners = {row.key: row for row in stream.rows}
-        self.rows = {key: _Account() for key in self._runners}
-
-    def take(self, result: FrameResult) -> None:
-        for key, reason in result.skipped.items():
-            self.rows[key].reasons[reason] += 1
-        for key, row in result.rows.items():
-            self.rows[key].ms.append(row.ms)
-            self.rows[key].memory.append(self._runners[key].estimator.memory())
-
-
-def _check_rows(rows: Sequence[Row], networks: Mapping[str, DepthSource]) -> None:
-    """Raises ValueError for rows that cannot be judged, whatever the sequence."""
+def _check(sequence: FrameSequence, rows: Sequence[Row], indices: range, networks: Mapping[str, DepthSource]) -> None:
+    """Raises ValueError for rows that cannot be judged on any sequence, and SequenceError where no frame of this one
+    can be judged, or the poses that rows compare views by are not known."""
     if not rows or len({row.slug for row in rows}) < len(rows):
         raise ValueError(f"rows must be one or more different ones, got {[row.label for row in rows]}")
     missing = sorted({row.method.base for row in rows} - networks.keys())
     if missing:
         raise ValueError(f"networks must hold one for each base of the rows, {', '.join(missing)} is missing")
-
-
-def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range) -> None:
-    """Raises SequenceError where no frame can be judged, or the poses that rows compare views by are not known."""
     if not indices:
         raise SequenceError(f"no frame is selected of {len(sequence)}")
     if all(sequence.entries[index].load_depth is None for index in indices):
@@ -280,21 +266,3 @@ def _check_sequence(sequence: FrameSequence, rows: Sequence[Row], indices: range
     comparing = [row.method.name for row in rows if row.method.fusion != ALONE]
     if comparing and not sequence.posed:
         raise SequenceError(f"single images without poses, on which {', '.join(comparing)} cannot compare views")
-
-
-def _result(row: Row, account: _Account, metrics: RowMetrics, sequence: FrameSequence) -> RowResult:
-    """What a row leaves behind. Raises SequenceError: it has judged nothing."""
-    key, frames = row.slug, account.frames(metrics.judged[row.slug])
-    if not frames["judged"]:
-        reasons = "; ".join(f"{count} x {reason}" for reason, count in list(frames["reasons"].items())[:3])
-        raise SequenceError(f"no frame could be judged: {reasons or 'none of those that were read has ground truth'}")
-    opened = Counter(skipped.reason for skipped in sequence.skipped)
-    return RowResult(
-        row=row,
-        frames={**frames, "left_out_on_opening": dict(sorted(opened.items()))},
-        figures=metrics.figures(key),
-        curves=metrics.curves(key),
-        state=account.state(),
-        ms=account.median_ms(),
-        sums=metrics.sums(key),
-    )

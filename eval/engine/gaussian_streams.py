@@ -59,12 +59,6 @@ class UfMStarStreams:
         if len(module.mean):
             module.reset([stream])
 
-    def sole(self) -> UfMStar:
-        """The module of a single stream. Raises ValueError: it has several."""
-        if self._count > 1:
-            raise ValueError(f"a state goes into a UfM* of one stream, this one has {self._count}")
-        return self._modules[None]
-
     def choose(self, stream: int, size: tuple[int, int]) -> UfMStar:
         """The module of a stream, which the size (h, w) of its first map decides."""
         chosen = self._of[stream]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -30,41 +30,13 @@ METRICS, BY_ERROR = "metrics", "nll_by_error"
 Key = TypeVar("Key", bound=Hashable)
 
 
-class Figures(Generic[Key]):
-    """``SequenceMetrics`` by key, each made when its first frame with ground truth comes.
+def metrics_of(known: dict[Key, SequenceMetrics], key: Key, **how: Any) -> SequenceMetrics:
+    """The metrics of a key, made now (see ``SequenceMetrics``) if there are none."""
+    from ufmstar_torch.eval.metrics import SequenceMetrics
 
-    Args:
-        bins: see ``SequenceMetrics``.
-    """
-
-    def __init__(self, bins: str = "ours") -> None:
-        self._metrics: dict[Key, SequenceMetrics] = {}
-        self._bins = bins
-
-    def of(self, key: Key, *, with_variance: bool = True) -> SequenceMetrics:
-        """The metrics of a key, made now if there are none."""
-        from ufmstar_torch.eval.metrics import SequenceMetrics
-
-        if key not in self._metrics:
-            self._metrics[key] = SequenceMetrics(with_variance=with_variance, bins=self._bins)
-        return self._metrics[key]
-
-    def state(self) -> dict[Key, dict[str, Tensor]]:
-        """The sums, by key and name. They are exchanged by updates, never changed in place."""
-        return {key: metrics.sums() for key, metrics in self._metrics.items()}
-
-    def load_state(self, state: Mapping[Key, Mapping[str, Tensor]]) -> None:
-        """Add up further where ``state`` was taken."""
-        for key, sums in state.items():
-            self.of(key).load_state_dict(dict(sums))
-
-    def figures(self) -> dict[Key, dict[str, float]]:
-        """delta1, nll, ece_delta, ece_q, spearman, ... by key; without ground truth nothing."""
-        return {key: metrics.compute() for key, metrics in self._metrics.items()}
-
-    def curves(self) -> dict[Key, dict[str, Any]]:
-        """Calibration and sparsification curves and the entropy histogram, by key."""
-        return {key: metrics.curves() for key, metrics in self._metrics.items()}
+    if key not in known:
+        known[key] = SequenceMetrics(**how)
+    return known[key]
 
 
 class RunMetrics(FrameSink):
@@ -75,22 +47,34 @@ class RunMetrics(FrameSink):
 
     def __init__(self, key: str, sums: Mapping[str, Mapping[str, Tensor]]) -> None:
         self._key = key
-        self.figures: Figures[str] = Figures()
-        self.figures.load_state(sums)
+        self._metrics: dict[str, SequenceMetrics] = {}
+        for name, own in sums.items():
+            metrics_of(self._metrics, name).load_state_dict(dict(own))
+
+    def sums(self) -> dict[str, dict[str, Tensor]]:
+        """By name. They are exchanged by updates, never changed in place."""
+        return {name: metrics.sums() for name, metrics in self._metrics.items()}
+
+    def figures(self) -> dict[str, dict[str, float]]:
+        """delta1, nll, ece_delta, ece_q, spearman, ... by name; without ground truth nothing."""
+        return {name: metrics.compute() for name, metrics in self._metrics.items()}
+
+    def curves(self) -> dict[str, dict[str, Any]]:
+        """Calibration and sparsification curves and the entropy histogram, by name."""
+        return {name: metrics.curves() for name, metrics in self._metrics.items()}
 
     def take(self, result: FrameResult) -> None:
         """Add a frame."""
         row = result.rows.get(self._key)
         if row is None or row.truth is None:
             return
-        target, estimate = torch.from_numpy(row.truth), row.estimate
-        self.figures.of(UFM).update(estimate.depth, estimate.variance, target, estimate.valid)
-        own = row.prediction.variance
-        if own is not None:
-            self.figures.of(ALONE).update(estimate.depth, own.cpu(), target, estimate.valid)
+        target, estimate, own = torch.from_numpy(row.truth), row.estimate, row.prediction.variance
+        maps: dict[str, tuple[Tensor, Tensor | None]] = {UFM: (estimate.depth, estimate.variance)}
+        maps |= {} if own is None else {ALONE: (estimate.depth, own.cpu())}
         if estimate.posterior_depth is not None:
-            depth, variance = estimate.posterior_depth, estimate.posterior_variance
-            self.figures.of(POSTERIOR).update(depth, variance, target, estimate.valid)
+            maps[POSTERIOR] = estimate.posterior_depth, estimate.posterior_variance
+        for name, (depth, variance) in maps.items():
+            metrics_of(self._metrics, name).update(depth, variance, target, estimate.valid)
 
 
 class RowMetrics(FrameSink):
@@ -109,7 +93,8 @@ class RowMetrics(FrameSink):
 
     def __init__(self, references: Mapping[str, Mapping[str, str]], confident: float, bins: str = "ours") -> None:
         self._references, self._confident = references, confident
-        self._figures: Figures[str] = Figures(bins)
+        self._metrics: dict[str, SequenceMetrics] = {}
+        self._bins = bins
         self._by_error: dict[str, dict[str, NLLByError]] = {}
         self.judged = dict.fromkeys(references, 0)
 
@@ -129,7 +114,7 @@ class RowMetrics(FrameSink):
         self.judged[key] += 1
         estimate = row.estimate
         depth = torch.where(estimate.valid, estimate.depth, torch.nan)
-        metrics = self._figures.of(key, with_variance=estimate.variance is not None)
+        metrics = metrics_of(self._metrics, key, with_variance=estimate.variance is not None, bins=self._bins)
         metrics.update(depth, estimate.variance, target)
         if estimate.variance is None:
             return
@@ -140,18 +125,18 @@ class RowMetrics(FrameSink):
 
     def figures(self, key: str) -> dict[str, float]:
         """``SequenceMetrics.compute`` of a judged row."""
-        return self._figures.of(key).compute()
+        return self._metrics[key].compute()
 
     def curves(self, key: str) -> dict[str, Any]:
         """``SequenceMetrics.curves`` of a judged row, and its NLL and error by reference."""
-        curves: dict[str, Any] = self._figures.of(key).curves()
+        curves: dict[str, Any] = self._metrics[key].curves()
         for reference, by_error in self._by_error.get(key, {}).items():
             curves |= {f"{name}:{reference}": curve.tolist() for name, curve in by_error.compute().items()}
         return curves
 
     def sums(self, key: str) -> dict[str, dict[str, Tensor]]:
         """States of a judged row's metrics on the CPU by name: "metrics" and "nll_by_error:REFERENCE"."""
-        named: dict[str, Any] = {METRICS: self._figures.of(key)}
+        named: dict[str, Any] = {METRICS: self._metrics[key]}
         named |= {f"{BY_ERROR}:{reference}": binned for reference, binned in self._by_error.get(key, {}).items()}
         return {name: {entry: value.cpu() for entry, value in m.state_dict().items()} for name, m in named.items()}
 
@@ -164,7 +149,7 @@ class RegionMetrics(FrameSink):
         self, rows: Sequence[str], regions: Sequence[str], region_of: Callable[[FrameResult, RowFrame], Tensor]
     ) -> None:
         self._rows, self._regions, self._region_of = tuple(rows), tuple(regions), region_of
-        self._figures: Figures[tuple[str, str]] = Figures()
+        self._metrics: dict[tuple[str, str], SequenceMetrics] = {}
         pairs = [(row, region) for row in rows for region in regions]
         self._variance = dict.fromkeys(pairs, (0.0, 0))
 
@@ -182,7 +167,7 @@ class RegionMetrics(FrameSink):
     def _add(self, pair: tuple[str, str], row: RowFrame, target: Tensor, use: Tensor) -> None:
         estimate = row.estimate
         assert estimate.variance is not None
-        self._figures.of(pair).update(estimate.depth, estimate.variance, target, use)
+        metrics_of(self._metrics, pair).update(estimate.depth, estimate.variance, target, use)
         chosen = estimate.variance[use].double()
         total, pixels = self._variance[pair]
         self._variance[pair] = (total + float(chosen.sum()), pixels + chosen.numel())
@@ -195,33 +180,39 @@ class RegionMetrics(FrameSink):
         for row in self._rows:
             merged[row] = SequenceMetrics()
             for region in self._regions:
-                merged[row].merge_state(self._figures.of((row, region)))
+                merged[row].merge_state(metrics_of(self._metrics, (row, region)))
         return merged
 
     def by_region(self) -> dict[str, dict[str, dict[str, float]]]:
         """By region and row: "rmse" [m], "rms_sigma" (root of the mean variance) [m] and the other figures."""
-        return {
-            region: {
-                row: {**self._figures.of((row, region)).compute(), "rms_sigma": self._rms_sigma(row, region)}
-                for row in self._rows
-            }
-            for region in self._regions
-        }
 
-    def _rms_sigma(self, row: str, region: str) -> float:
-        total, pixels = self._variance[row, region]
-        return (total / pixels) ** 0.5 if pixels else float("nan")
+        def figures(row: str, region: str) -> dict[str, float]:
+            pair = row, region
+            total, pixels = self._variance[pair]
+            return {
+                **metrics_of(self._metrics, pair).compute(),
+                "rms_sigma": (total / pixels) ** 0.5 if pixels else math.nan,
+            }
+
+        return {region: {row: figures(row, region) for row in self._rows} for region in self._regions}
 
 
 def references(row: Row, rows: Sequence[Row]) -> list[Row]:
     """Whose confidence a row is judged by: its base alone, and behind UfM with the fewest points that are among
     ``rows`` and see the same frames; of several settings the row's own, or else the default."""
-    same = [other for other in rows if other.method.base == row.method.base and _frames(other) == _frames(row)]
+
+    def seen(other: Row) -> tuple[str, int, str]:  # from which frames, and which part of them
+        return other.method.base, other.setting.skip, other.setting.preprocess
+
+    def points(other: Row) -> float:
+        return math.inf if other.method.max_points is None else other.method.max_points
+
+    same = [other for other in rows if seen(other) == seen(row)]
     alone = [other for other in same if other.method.fusion == method.ALONE and other.method.uses_aleatoric]
     pointwise = [other for other in same if other.method.fusion == method.UFM and not other.method.full]
-    fewest = min((_points(other) for other in pointwise), default=0)
+    fewest = min((points(other) for other in pointwise), default=0)
     chosen = []
-    for kind in (alone, [other for other in pointwise if _points(other) == fewest]):
+    for kind in (alone, [other for other in pointwise if points(other) == fewest]):
         if kind:
             chosen.append(
                 min(kind, key=lambda other: (other.setting.pose_noise != row.setting.pose_noise, other.setting.slug))
@@ -239,12 +230,3 @@ def confident_pixels(estimate: Estimate, truth: Tensor, share: float) -> Tensor:
         return judged
     threshold = values.kthvalue(max(1, math.ceil(share * len(values)))).values
     return judged & (torch.where(judged, estimate.variance, torch.inf) <= threshold)
-
-
-def _frames(row: Row) -> tuple[int, str]:
-    """What decides which frames a row sees, and which part of them."""
-    return row.setting.skip, row.setting.preprocess
-
-
-def _points(row: Row) -> float:
-    return math.inf if row.method.max_points is None else row.method.max_points

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ class NetworkChoice:
             raise ValueError(f"model must be one of {known}, got {self.model!r}; expected {_FORM}")
         if not self.weights:
             raise ValueError(f"{self.base}={self.model} needs the file of its weights: {_FORM}")
-        if len([file for file in self.files if _is_spec(file)]) > 1:
+        if len(self.files) - len(self.weights) > 1:
             raise ValueError(f"{self.base}={self.model} takes one spec, got {self.files}")
 
     @classmethod
@@ -77,12 +77,12 @@ class NetworkChoice:
     @property
     def weights(self) -> tuple[str, ...]:
         """The files without the spec."""
-        return tuple(file for file in self.files if not _is_spec(file))
+        return tuple(file for file in self.files if not file.endswith(".json"))
 
     @property
     def spec(self) -> str | None:
         """The file that declares what the weights do not say."""
-        return next((file for file in self.files if _is_spec(file)), None)
+        return next((file for file in self.files if file.endswith(".json")), None)
 
     @property
     def size(self) -> Size | None:
@@ -104,9 +104,7 @@ class NetworkChoice:
             inference: runtime and precision.
 
         Raises:
-            FileNotFoundError: a file is missing.
-            ValueError: files that do not fit, or a network that does not predict what its base is about; see
-                ``check_members``.
+            FileNotFoundError, ValueError: as :func:`load_members`, or as ``check_members``.
         """
         if self.model == TRUTH:
             label = self.label or "ground truth"
@@ -114,12 +112,13 @@ class NetworkChoice:
             return own_depth(self.size, identity, label=label, digest=_digest(identity))
         members, sampling = self._members(inference, device), self.base == "mc_dropout"
         check_members(self.base, members, device)
-        files = [_identity(file) for file in self.weights]
+        named = [(Path(path), member) for path, member in map(_path, self.weights)]
+        files = [{"name": path.name, "sha256": sha256(path), "member": member} for path, member in named]
         spec = None if self.spec is None else sha256(Path(self.spec))
         run_by = _run_by(members, inference)
         made_of = {"model": self.model, "files": [file | {"name": None} for file in files], "spec": spec}
         drawn = {"samples": samples} if sampling else {}
-        label = self.label or _label(self.model, Path(_path(self.weights[0])[0]), members[0])
+        label = self.label or _label(self.model, named[0][0], members[0])
         identity = {
             "model": self.model, "label": label, "files": files, "spec": spec, "members": len(members),
             **run_by, **drawn,
@@ -155,45 +154,43 @@ def network_source(
     model: str,
     weights: Iterable[str | Path],
     *,
-    spec: str | Path | None = None,
     mode: str = "alternate",
     samples: int | None = None,
-    offload: bool = False,
+    spec: str | Path | None = None,
     inference: Inference = _AS_USERS,
     device: str = "cpu",
+    **how: Any,
 ) -> NetworkSource:
     """One network, or the members of an ensemble, from files, as ``ufmstar run`` runs them.
 
     Args:
-        model: a name that ``load_network`` accepts.
-        weights: one file for each member (a directory for networks of ``transformers``); those of "trained" may hold
-            several.
-        spec: declares what an ONNX file or saved program does not say.
+        model, weights, spec, inference, **how: as :func:`load_members` takes them.
         mode: "alternate" (one member per image in turn) or "full" (all of them on every image, or ``samples``
             passes of a network that samples).
         samples: None: as many as the paper's baseline.
-        offload: of "trained": weights stay in host memory and come to the device for their turn only.
-        inference: runtime, precision and threads.
         device: "cpu", "cuda", ...
 
     Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: unknown model, files that do not fit it, members that want different inputs, mode "full"
-            of one network that does not sample, ``samples`` for any other.
+        FileNotFoundError, ValueError: as :func:`load_members`; mode "full" of one network that does not sample, or
+            ``samples`` for any other.
     """
-    files = [Path(file) for file in weights]
-    where = torch.device(device)
-    members = load_members(model, files, spec=spec, offload=offload, inference=inference, device=where)
-    samples = _passes(members, mode, samples)
+    files, where = [Path(file) for file in weights], torch.device(device)
+    members = load_members(model, files, spec=spec, inference=inference, device=where, **how)
+    alone = len(members) == 1 and mode == "full"
+    if alone and not stochastic(members):
+        raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
+    if samples is not None and not alone:
+        raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
+    passes = (samples or SAMPLES) if alone else None
     identity = {
         "model": model,
         "weights": [{"name": file.name, "sha256": sha256(file)} for file in files],
         "mode": mode,
-        "samples": samples,
+        "samples": passes,
         "spec": None if spec is None else sha256(Path(spec)),
         **_run_by(members, inference),
     }
-    turns = NetworksInTurn(members, samples=samples, preprocess=members[0].preprocess)
+    turns = NetworksInTurn(members, samples=passes, preprocess=members[0].preprocess)
     return NetworkSource(turns, where, identity, precision=inference.precision)
 
 
@@ -206,8 +203,20 @@ def load_members(
     inference: Inference = _AS_USERS,
     device: torch.device = _CPU,
 ) -> list[DepthNetwork]:
-    """The networks in the files, in their order, in eval mode and on the CPU, for a device. They want the same input.
-    Arguments and errors as :func:`network_source`."""
+    """The networks in files, in their order, in eval mode and on the CPU.
+
+    Args:
+        model: a name that ``load_network`` accepts.
+        files: one for each member (a directory for networks of ``transformers``); those of "trained" may hold several.
+        spec: declares what an ONNX file or saved program does not say.
+        offload: of "trained": weights stay in host memory and come to the device for their turn only.
+        inference: runtime, precision and threads.
+        device: where they will run.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: unknown model, files that do not fit it, members that want different inputs.
+    """
     paths = [Path(file) for file in files]
     for folder in paths if model in DIRECTORIES else []:
         if not folder.is_dir():
@@ -216,23 +225,20 @@ def load_members(
     for file in [*(paths if model not in DIRECTORIES else []), *([Path(spec)] if spec is not None else [])]:
         if not file.is_file():
             raise FileNotFoundError(f"no such file: {file}")
-    options = {} if spec is None else {"spec": spec}
+    options: dict[str, Any] = {} if spec is None else {"spec": spec}
     members: list[DepthNetwork] = []
     for path in paths:
-        loaded = _loaded(model, path, options | inference.options(model, device), offload)
+        how = options | inference.options(model, device)
+        if model == "trained" and not how:
+            loaded = load_trained([path], offload=offload)
+        else:
+            try:
+                loaded = [load_network(model, path, **how)]
+            except TypeError as error:
+                raise ValueError(f"model {model!r} does not take {sorted(how)}: {error}") from error
         members += [inference.ready(network, path, device) for network in loaded]
     _require_same_input(members)
     return members
-
-
-def _loaded(model: str, file: Path, options: Mapping[str, Any], offload: bool) -> list[DepthNetwork]:
-    """The networks in a file. Raises ValueError, as :func:`network_source`."""
-    if model == "trained" and not options:
-        return load_trained([file], offload=offload)
-    try:
-        return [load_network(model, file, **options)]
-    except TypeError as error:
-        raise ValueError(f"model {model!r} does not take {sorted(options)}: {error}") from error
 
 
 def _run_by(members: Iterable[DepthNetwork], inference: Inference) -> dict[str, str]:
@@ -246,17 +252,6 @@ def _require_same_input(members: Iterable[DepthNetwork]) -> None:
     expected = [member.preprocess for member in members]
     if any(other != expected[0] for other in expected[1:]):
         raise ValueError(f"weights: the members of an ensemble must want the same input, got {expected}")
-
-
-def _passes(members: list[DepthNetwork], mode: str, samples: int | None) -> int | None:
-    """Passes per image of a network that samples, None of others. Raises ValueError: mode or samples ask for what the
-    members cannot do."""
-    alone = len(members) == 1 and mode == "full"
-    if alone and not stochastic(members):
-        raise ValueError("mode 'full' needs several members, or one with dropout that samples; there is one without")
-    if samples is not None and not alone:
-        raise ValueError(f"samples goes with mode 'full' and one network that samples, there are {len(members)}")
-    return (samples or SAMPLES) if alone else None
 
 
 def sha256(file: Path) -> str:
@@ -288,15 +283,6 @@ def _path(file: str) -> tuple[str, int | None]:
     if mark and path and number.isdecimal() and not Path(file).exists():
         return path, int(number)
     return file, None
-
-
-def _identity(file: str) -> dict[str, Any]:
-    path, member = _path(file)
-    return {"name": Path(path).name, "sha256": sha256(Path(path)), "member": member}
-
-
-def _is_spec(file: str) -> bool:
-    return file.endswith(".json")
 
 
 def _digest(values: dict[str, Any]) -> str:

@@ -115,8 +115,11 @@ class NetworkSource(DepthSource):
         Raises:
             FrameError: a frame has no image.
         """
+        if self._seeding == "frame" and self._seeded is not frames[-1]:  # a frame seeds once for all members
+            self._generator.manual_seed(frames[-1].index)
+            self._seeded = frames[-1]
         with torch.no_grad():
-            inputs = self._prepared(frames)
+            inputs = [self._input(frame) for frame in frames]
             if len({x.shape for x, _ in inputs}) > 1:
                 return [self._inference([given], n)[0] for given in inputs]
             if self._seeding == "sample":
@@ -137,15 +140,8 @@ class NetworkSource(DepthSource):
         if self._device.type == "cpu" and frame.image is not None:
             self._input(frame)
 
-    def _prepared(self, frames: Sequence[Frame]) -> list[tuple[Tensor, Tensor]]:
-        """The networks' inputs [1, 3, h, w] and their intrinsics [1, 3, 3]; a frame seeds once for all members."""
-        if self._seeding == "frame" and self._seeded is not frames[-1]:
-            self._generator.manual_seed(frames[-1].index)
-            self._seeded = frames[-1]
-        return [self._input(frame) for frame in frames]
-
     def _input(self, frame: Frame) -> tuple[Tensor, Tensor]:
-        """Computed once, as long as the frame is used."""
+        """The networks' input [1, 3, h, w] and its intrinsics [1, 3, 3], computed once as long as the frame is used."""
         if frame not in self._inputs:
             image, K = image_tensor(frame).to(self._device), torch.from_numpy(frame.intrinsics)[None]
             with torch.no_grad():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -56,11 +56,6 @@ class Prediction:
         return {name: value for name, value in named.items() if value is not None}
 
     @classmethod
-    def of(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> Prediction:
-        """What a network returned for one image, [1, h, w]; ``intrinsics`` [3, 3]."""
-        return cls.each(prediction, intrinsics[None], ms)[0]
-
-    @classmethod
     def each(cls, prediction: DepthPrediction, intrinsics: Tensor, ms: float | None) -> list[Prediction]:
         """What a network returned for B images, [B, h, w]; ``intrinsics`` [B, 3, 3], ``ms`` of all together."""
         share = None if ms is None else ms / len(intrinsics)
@@ -82,7 +77,8 @@ def combined(predictions: Sequence[Prediction]) -> Prediction:
 
     joint = combine([DepthPrediction(p.depth[None], batch(p.aleatoric), batch(p.epistemic)) for p in predictions])
     times = [p.ms for p in predictions if p.ms is not None]
-    return Prediction.of(joint, predictions[0].intrinsics, sum(times) if len(times) == len(predictions) else None)
+    ms = sum(times) if len(times) == len(predictions) else None
+    return Prediction.each(joint, predictions[0].intrinsics[None], ms)[0]
 
 
 class DepthSource(ABC):
@@ -169,68 +165,57 @@ class FramePredictions:
     def __init__(self, frame: Frame, device: torch.device, store: PredictionStore | None, sequence: str) -> None:
         self.frame, self._device, self._store, self._sequence = frame, device, store, sequence
         self._content = "" if store is None else frame_digest(frame)
+        # By source: what rows asked for, by member ("0", "1", ... or "all"), and single inferences.
         self._known: dict[tuple[object, str], Prediction] = {}
+        self._inferences: dict[tuple[object, int], Prediction] = {}
 
     def of(self, source: DepthSource, position: int, every: bool) -> Prediction:
         """What a row gets that has used ``position`` images before: of all members, or of the one in turn. Raises
         FrameError: the frame has nothing to predict from."""
-        n = _pass(source, position, every)
-        known = self._looked_up(source, n)
+        member, passes = _asked(source, position, every)
+        known = self._looked_up(source, member)
         if known is None:
+            for n in self._left(source, passes):
+                self.add(source, n, source.one(self.frame, n))
             # Members that other rows use alone are not run again; the store keeps only what a row asked for.
-            passes = range(source.passes) if n is None else [n]
-            made = [self._inference(source, i) for i in passes]
-            known = self._known[_key(source, n)] = combined(made) if n is None else made[0]
+            made = [self._inferences[source.digest or source, n] for n in passes]
+            known = self._known[source.digest or source, member] = combined(made) if member == _ALL else made[0]
             if self._store is not None and source.cacheable:
-                self._store.store(self._stored_as(source, n), known)
+                self._store.store(self._stored_as(source, member), known)
         return known
 
     def missing(self, source: DepthSource, position: int, every: bool) -> list[int]:
         """The inferences that :meth:`of` has to make; arguments as there."""
-        n = _pass(source, position, every)
-        if self._looked_up(source, n) is not None:
-            return []
-        passes = range(source.passes) if n is None else [n]
-        return [i for i in passes if _inference_key(source, i) not in self._known]
+        member, passes = _asked(source, position, every)
+        return self._left(source, passes) if self._looked_up(source, member) is None else []
 
-    def add(self, source: DepthSource, n: int, made: Prediction) -> Prediction:
-        """Use an inference of member (or sample) n; the prediction as it is used."""
+    def add(self, source: DepthSource, n: int, made: Prediction) -> None:
+        """Use an inference of member (or sample) n."""
         made = made.to(self._device)
-        used = self._known[_inference_key(source, n)] = made.to(torch.float32) if source.cacheable else made
-        return used
+        self._inferences[source.digest or source, n] = made.to(torch.float32) if source.cacheable else made
 
-    def _looked_up(self, source: DepthSource, n: int | None) -> Prediction | None:
+    def _left(self, source: DepthSource, passes: Iterable[int]) -> list[int]:
+        return [n for n in passes if (source.digest or source, n) not in self._inferences]
+
+    def _looked_up(self, source: DepthSource, member: str) -> Prediction | None:
         """In memory, then in the store."""
-        key = _key(source, n)
+        key = (source.digest or source, member)
         if key not in self._known and self._store is not None and source.cacheable:
-            stored = self._store.load(self._stored_as(source, n), self._device)
+            stored = self._store.load(self._stored_as(source, member), self._device)
             if stored is not None:
                 self._known[key] = stored
         return self._known.get(key)
 
-    def _inference(self, source: DepthSource, n: int) -> Prediction:
-        known = self._known.get(_inference_key(source, n))
-        return self.add(source, n, source.one(self.frame, n)) if known is None else known
-
-    def _stored_as(self, source: DepthSource, n: int | None) -> PredictionKey:
-        return PredictionKey(source.digest, self._sequence, self.frame.name, _member(n), self._content)
+    def _stored_as(self, source: DepthSource, member: str) -> PredictionKey:
+        return PredictionKey(source.digest, self._sequence, self.frame.name, member, self._content)
 
 
-def _pass(source: DepthSource, position: int, every: bool) -> int | None:
-    """The member (or sample) in turn; None = all combined."""
-    return None if every and source.passes > 1 else source.turn(position)
-
-
-def _member(n: int | None) -> str:
-    return _ALL if n is None else str(n)
-
-
-def _key(source: DepthSource, n: int | None) -> tuple[object, str]:
-    return source.digest or source, _member(n)
-
-
-def _inference_key(source: DepthSource, n: int) -> tuple[object, str]:
-    return source.digest or source, f"inference {n}"
+def _asked(source: DepthSource, position: int, every: bool) -> tuple[str, Sequence[int]]:
+    """The member's name in a store, and the inferences that its prediction takes."""
+    if every and source.passes > 1:
+        return _ALL, range(source.passes)
+    n = source.turn(position)
+    return str(n), [n]
 
 
 def sequence_digest(sequence: FrameSequence) -> str:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ufmstar_torch.eval.engine.anchors import AnchorSource, FrameAnchors
 from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput
-from ufmstar_torch.eval.engine.predictions import DepthSource, FramePredictions, Prediction
-from ufmstar_torch.eval.methods.perturb import Drift, perturbed, selects
+from ufmstar_torch.eval.engine.predictions import DepthSource, Prediction
+from ufmstar_torch.eval.methods.perturb import Drift, perturbed
 from ufmstar_torch.eval.methods.setting import DEFAULT, Setting
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError
 from ufmstar_torch.frame import FRAME_FAULTS
@@ -22,32 +22,27 @@ from ufmstar_torch.frame import FRAME_FAULTS
 _IMAGES, _ESTIMATOR, _TRACKER, _DRIFT = "image_index", "ufm.", "tracker.", "drift."
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class RowFrame:
-    """A frame that a row has taken in."""
+    """A frame as a row sees it, and what the row makes of it."""
 
+    row: RowRunner
     prediction: Prediction  # the depth map, on the estimator's device
-    estimate: Estimate  # what the row makes of it, on the CPU
     # [h, w] ground truth at the prediction's pixels [m], 0 = none; None without a depth map.
     truth: NDArray[np.float32] | None
     T_world_cam: NDArray[np.float64]  # [4, 4] the pose as the row sees it [m]
     member: int | None  # which network predicted; None where all did, and of maps
     anchors: FrameAnchors | None  # of the frame; None of a row without anchors
-    ms: Mapping[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
-
-
-@dataclass(eq=False)
-class Update:
-    """A frame on its way into a row, for the row's estimator; further attributes as of :class:`RowFrame`."""
-
-    row: RowRunner
-    prediction: Prediction
-    truth: NDArray[np.float32] | None
-    T_world_cam: NDArray[np.float64]
-    member: int | None
-    anchors: FrameAnchors | None
+    ms: dict[str, float]  # "network" where one ran, "anchors" where some were tracked, and "uncertainty" [ms]
     answer: Estimate | RuntimeError | ValueError | None = None  # of the estimator, or the error that the frame raises
-    ms: float = 0.0  # of the estimator; of a batch, divided by its frames [ms]
+
+    @property
+    def estimate(self) -> Estimate:
+        """What the row makes of the frame, on the CPU. Raises RuntimeError, ValueError: what the estimator raised."""
+        assert self.answer is not None
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
 
     def of_estimator(self) -> EstimatorInput:
         """What the row's estimator gets."""
@@ -92,44 +87,29 @@ class RowRunner:
         self.device = device or torch.device("cpu")
         self._drift = Drift(setting)
 
-    def selects(self, number: int) -> bool:
-        """Whether the row uses image ``number`` of those that the stream selects."""
-        return selects(self.setting, number)
-
-    def predict(self, predictions: FramePredictions) -> Prediction:
-        """The prediction that the row gets for the next frame. Raises FrameError: the frame has nothing to predict
-        from."""
-        return predictions.of(self.source, self.images, self.every)
-
-    def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> Update:
+    def begin(self, frame: Frame, prediction: Prediction, truth: NDArray[np.float32] | None) -> RowFrame:
         """The next frame as the row sees it; its ground truth is for anchors of it alone."""
         T = perturbed(self._drift.of(frame.T_world_cam, frame.index), self.setting, frame.index)
         anchors = None if self.anchors is None else self.anchors.of(frame, T, prediction, truth)
         single = self.source.networks and not self.every
         member = self.source.turn(self.images) if single else None
-        return Update(self, prediction, truth, T, member, anchors)
+        times = {"network": prediction.ms, "anchors": None if anchors is None else anchors.ms}
+        known = {stage: time for stage, time in times.items() if time is not None}
+        return RowFrame(self, prediction, truth, T, member, anchors, known)
 
-    def finish(self, frame: Frame, update: Update) -> RowFrame:
-        """Process the next frame, which :meth:`begin` returned and the estimator has answered.
+    def finish(self, taken: RowFrame, name: str) -> None:
+        """Process the next frame, of this name, which :meth:`begin` returned and the estimator has answered.
 
         Raises:
             FrameError: the estimator refuses the pose or the intrinsics, and the row skips such frames.
             RuntimeError, ValueError: as the estimator.
         """
-        estimate = update.answer
-        assert estimate is not None
-        if isinstance(estimate, Exception):
-            raise estimate
+        statistics = taken.estimate.statistics
         self.images += 1
-        if self._skips_faults and estimate.statistics is not None and int(estimate.statistics.fault[0]):
+        if self._skips_faults and statistics is not None and int(statistics.fault[0]):
             if self._tracks is not None:
                 self._tracks.undo()
-            raise FrameError(frame.name, FRAME_FAULTS[int(estimate.statistics.fault[0])])
-        tracking = None if update.anchors is None else update.anchors.ms
-        times = {"uncertainty": update.ms, "network": update.prediction.ms, "anchors": tracking}
-        known = {stage: time for stage, time in times.items() if time is not None}
-        u = update
-        return RowFrame(u.prediction, estimate, u.truth, u.T_world_cam, u.member, u.anchors, known)
+            raise FrameError(name, FRAME_FAULTS[int(statistics.fault[0])])
 
     def state(self) -> dict[str, Tensor]:
         """All tensors on which the next frame depends, networks left aside: they remember nothing."""

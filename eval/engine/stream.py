@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +21,9 @@ from torch import Tensor
 from ufmstar_torch.eval.engine.ahead import FramesAhead
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.predictions import FramePredictions, Prediction, PredictionStore, sequence_digest
-from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner, Update
-from ufmstar_torch.eval.engine.together import Inference, infer_together, update_together
+from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
+from ufmstar_torch.eval.engine.together import infer_together, update_together
+from ufmstar_torch.eval.methods.perturb import selects
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 
@@ -44,7 +46,7 @@ class FrameResult:
     # "truth", and the stages of the sinks that came before [ms].
     ms: dict[str, float] = field(default_factory=dict)
     # the stream's after the frame (``FrameStream.state``), for sinks that work behind the loop; else empty.
-    state: Mapping[str, Tensor] = field(default_factory=dict)
+    state: Mapping[str, Mapping[str, Tensor]] = field(default_factory=dict)
 
 
 class FrameSink(ABC):
@@ -115,21 +117,14 @@ class FrameStream:
         for _ in drive_together(iter([(self, sinks)]), stop=stop):
             pass
 
-    def state(self) -> dict[str, Tensor]:
-        """All tensors on which the next frame depends, by row: "KEY/NAME"."""
-        return {f"{row.key}/{name}": value for row in self.rows for name, value in row.state().items()}
-
-    def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Bring the rows to where ``state`` was taken; :attr:`position` is the caller's. Raises ValueError: it is the
-        state of other rows."""
-        for row in self.rows:
-            prefix = f"{row.key}/"
-            row.load_state({name[len(prefix) :]: v for name, v in state.items() if name.startswith(prefix)})
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """All tensors on which the next frame depends, by row."""
+        return {row.key: row.state() for row in self.rows}
 
     def needed(self) -> list[int]:
         """Of the frames that are left, those that a row selects; without rows all."""
         left = range(self.position, len(self.indices))
-        return [self.indices[n] for n in left if not self.rows or any(row.selects(n) for row in self.rows)]
+        return [self.indices[n] for n in left if not self.rows or any(selects(row.setting, n) for row in self.rows)]
 
     def prepare(self, frame: Frame) -> None:
         """The networks' input, unless a store may have all predictions; in the thread that reads ahead.
@@ -142,11 +137,12 @@ class FrameStream:
                 row.source.prepare(frame)
 
     def next(self, frames: FramesAhead) -> _Frame:
-        """The way of the next frame: yields the inferences, which may be made meanwhile, and then the updates, which
-        must be answered; returns what came of the frame. Raises FrameError: without rows, the frame cannot be read."""
+        """The way of the next frame: yields (predictions, row) whose inferences may be made meanwhile, and then the
+        rows' frames, which must be answered; returns what came of it. Raises FrameError: without rows, the frame cannot
+        be read."""
         number, index = self.position, self.indices[self.position]
         name = self._names[index]
-        active = [row for row in self.rows if row.selects(number)]
+        active = [row for row in self.rows if selects(row.setting, number)]
         self.timer.take()
         self.position += 1
         if self.rows and not active:
@@ -157,9 +153,9 @@ class FrameStream:
                 if self._check is not None:
                     self._check(frame)
             known = FramePredictions(frame, self._device, self._store, self._digest)
-            yield [Inference(known, row) for row in active]
+            yield [(known, row) for row in active]
             with self.timer.stage("predict"):
-                predictions = {row.key: row.predict(known) for row in active}
+                predictions = {row.key: known.of(row.source, row.images, row.every) for row in active}
             with self.timer.stage("truth"):
                 truths = _truths(frame, predictions)
         except FrameError as error:
@@ -173,13 +169,14 @@ class FrameStream:
         skipped: dict[str, str] = {}
         for one in updates:
             try:
-                taken[one.row.key] = one.row.finish(frame, one)
+                one.row.finish(one, name)
+                taken[one.row.key] = one
             except FrameError as error:
                 skipped[one.row.key] = error.reason
         return FrameResult(number, index, name, frame, taken, skipped, ms)
 
 
-_Frame = Generator[Sequence[Inference | Update], None, FrameResult]
+_Frame = Generator[Sequence[Any], None, FrameResult]
 
 
 def drive_together(
@@ -242,7 +239,7 @@ class _Lane:
         done = self._frame is None and self.stream.position >= len(self.stream.indices)
         return done or self.error is not None
 
-    def advance(self) -> Sequence[Inference | Update]:
+    def advance(self) -> Sequence[Any]:
         """Bring the frame in hand, or the next one, to its next stop: what it needs there. At its end the sinks get
         what came of it."""
         if self.over:
@@ -284,11 +281,11 @@ class _Lane:
 
 def _one_frame_of_each(lanes: Sequence[_Lane]) -> None:
     """All frames to their first stop, there the inferences; to their second stop, there the updates; to their end."""
-    wanted = [one for lane in lanes for one in lane.advance()]
-    while any(lane.waits for lane in lanes):
-        infer_together([one for one in wanted if isinstance(one, Inference)])
-        update_together([one for one in wanted if isinstance(one, Update)])
-        wanted = [one for lane in lanes if lane.waits for one in lane.advance()]
+    infer_together([one for lane in lanes for one in lane.advance()])
+    update_together([one for lane in lanes if lane.waits for one in lane.advance()])
+    for lane in lanes:
+        if lane.waits:
+            lane.advance()
 
 
 def hand_over(result: FrameResult, sinks: Sequence[FrameSink], timer: StageTimer) -> None:

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from ufmstar_torch.eval.engine.clock import StageTimer
 from ufmstar_torch.eval.engine.estimators import Estimate, Estimator, EstimatorInput, Gaussians
 from ufmstar_torch.eval.engine.networks import NetworkSource
 from ufmstar_torch.eval.engine.predictions import FramePredictions
-from ufmstar_torch.eval.engine.rows import RowRunner, Update
+from ufmstar_torch.eval.engine.rows import RowFrame, RowRunner
 
 
-class Inference(NamedTuple):
-    """A frame's predictions, and the row that needs one of them."""
-
-    predictions: FramePredictions
-    row: RowRunner
-
-
-def infer_together(wanted: Sequence[Inference]) -> None:
-    """Make the inferences of several frames, as one batch of every network; those of one frame are left to it.
-
-    Inferences that fail together are left to each frame as well, which then meets its own error.
+def infer_together(wanted: Sequence[tuple[FramePredictions, RowRunner]]) -> None:
+    """Make the inferences of several frames, each of which a row needs, as one batch of every network; those of one
+    frame are left to it. Inferences that fail together are left to each frame as well, which then meets its own error.
     """
-    if len({one.predictions for one in wanted}) < 2:
+    if len({predictions for predictions, _ in wanted}) < 2:
         return
     frames: dict[tuple[object, int], dict[FramePredictions, NetworkSource]] = {}
     for predictions, row in wanted:
@@ -43,9 +34,9 @@ def infer_together(wanted: Sequence[Inference]) -> None:
                 known.add(source, n, prediction)
 
 
-def update_together(updates: Sequence[Update]) -> None:
+def update_together(updates: Sequence[RowFrame]) -> None:
     """Answer updates of different estimators; streams of one UfM* are one batch."""
-    batches: dict[object, list[Update]] = {}
+    batches: dict[object, list[RowFrame]] = {}
     for n, update in enumerate(updates):
         estimator = update.row.estimator
         batch = estimator.batch(update.prediction) if isinstance(estimator, Gaussians) else n
@@ -56,7 +47,7 @@ def update_together(updates: Sequence[Update]) -> None:
             answers = _answers([one.row.estimator for one in batch], [one.of_estimator() for one in batch])
         ms = timer.take()["uncertainty"] / len(batch)
         for update, answer in zip(batch, answers, strict=True):
-            update.answer, update.ms = answer, ms
+            update.answer, update.ms["uncertainty"] = answer, ms
 
 
 def _answers(

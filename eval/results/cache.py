@@ -30,18 +30,12 @@ class PredictionCache:
     Args:
         folder: made if it does not exist.
 
-    Attributes:
-        hits: predictions that were read.
-        misses: that were not there, or belong to another image of that name.
-        damaged: files that were cut off or changed; they are written anew.
-
     Raises:
         CacheError: the folder cannot be made or written.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.hits = self.misses = self.damaged = 0
         try:
             folder.mkdir(parents=True, exist_ok=True)
             # Asked by writing: permissions do not tell of file systems that are mounted read-only.
@@ -51,24 +45,18 @@ class PredictionCache:
             raise CacheError(_cannot(folder, error)) from error
 
     def load(self, key: PredictionKey, device: torch.device) -> Prediction | None:
-        """The prediction, or None where it has to be made."""
+        """The prediction, or None where it has to be made: there is no file, it belongs to another image of that name,
+        was cut off or changed, or cannot be read."""
         try:
             content = (self.folder / key.path).read_bytes()
-        except FileNotFoundError:
-            self.misses += 1
-            return None
-        except OSError:  # a bad disk: as good as a damaged file
-            self.damaged += 1
+        except OSError:
             return None
         if len(content) < _DIGEST or hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
-            self.damaged += 1
             return None
         with np.load(io.BytesIO(content[_DIGEST:]), allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         if bytes(arrays.pop("content")).decode() != key.content:
-            self.misses += 1
             return None
-        self.hits += 1
         K = torch.from_numpy(arrays.pop("intrinsics"))
         maps = {name: torch.from_numpy(value).to(device) for name, value in arrays.items()}
         return Prediction(maps["depth"], maps.get("aleatoric"), maps.get("epistemic"), K)

@@ -106,10 +106,16 @@ def _holds(path: Path, holder: dict[str, Any] | None) -> bool:
     """Whether the process behind a claim may still be alive."""
     this = _this_process()
     if os.name == "posix" and holder is not None and holder.get("host") == this["host"]:
-        return _alive(int(holder["pid"]), holder.get("started"))
+        try:
+            with suppress(PermissionError):  # a process of another user
+                os.kill(int(holder["pid"]), 0)
+        except ProcessLookupError:
+            return False
+        now, then = _started(int(holder["pid"])), holder.get("started")
+        return now is None or then is None or now == then
     try:
-        with tempfile.TemporaryFile(dir=path.parent) as now:  # the clock of the file system, not of this computer
-            return os.fstat(now.fileno()).st_mtime - path.stat().st_mtime < ABANDONED_SECONDS
+        with tempfile.TemporaryFile(dir=path.parent) as new:  # the clock of the file system, not of this computer
+            return os.fstat(new.fileno()).st_mtime - path.stat().st_mtime < ABANDONED_SECONDS
     except FileNotFoundError:
         return True  # replaced meanwhile
 
@@ -122,17 +128,6 @@ def _this_process() -> dict[str, Any]:
     with suppress(OSError):  # only Linux has them
         parts += [boot.read_text().strip(), os.readlink(namespace)]
     return {"host": " ".join(parts), "pid": os.getpid(), "started": _started(os.getpid())}
-
-
-def _alive(pid: int, started: str | None) -> bool:
-    """Whether the process runs on this computer, and is the one that started then."""
-    try:
-        with suppress(PermissionError):  # a process of another user
-            os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    now = _started(pid)
-    return now is None or started is None or now == started
 
 
 def _started(pid: int) -> str | None:

@@ -37,40 +37,26 @@ _OF_SEQUENCE = ("*.json", "*.pt", "examples/*.npz", "room/*.npz", PATTERN)
 
 
 class EvalFolder:
-    """An output folder of ``ufmstar eval``. Use :meth:`open`.
+    """An output folder of ``ufmstar eval``, which :meth:`open` makes; ``path`` is the folder."""
 
-    Attributes:
-        path: the folder.
-        about: eval.json.
-    """
-
-    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
-        self.path, self.about = path, about
+    def __init__(self, path: Path) -> None:
+        self.path = path
 
     @classmethod
     def open(cls, out: Path, about: Mapping[str, Any], *, resume: bool, overwrite: bool) -> EvalFolder:
         """Make the folder, or go on in it; see ``OutputFolder.open``. When going on, rows, sequences and networks of
         ``about`` (eval.json) are added to those of the earlier evaluation; suite, settings and the networks of the same
-        base must be the same. The cache of predictions is never removed.
-
-        Raises:
-            FolderError: the folder cannot be used as asked, or a process is at one of its sequences.
-            OSError: the folder cannot be made.
-        """
-        with OutputFolder.open(out, EVALUATION, about, resume=resume, overwrite=overwrite) as folder:
-            return cls(out, folder.manifest)
+        base must be the same. The cache of predictions is never removed. Raises FolderError also where a process is at
+        one of the sequences."""
+        with OutputFolder.open(out, EVALUATION, about, resume=resume, overwrite=overwrite):
+            return cls(out)
 
     def place(self, item: WorkItem) -> Path:
         """The folder of a sequence."""
         return self.path / "records" / item.folder
 
     def claim(self, item: WorkItem, launch: str) -> Claim | None:
-        """Claim a sequence; None while another process has it.
-
-        Args:
-            item: the sequence.
-            launch: the same for all processes that were started together.
-        """
+        """Claim a sequence; None while another process has it. ``launch`` as :func:`claim` takes it."""
         place = self.place(item)
         place.mkdir(parents=True, exist_ok=True)
         claimed = claim(place, launch)
@@ -134,6 +120,11 @@ class EvalFolder:
         except ValueError:
             return {"reason": f"{path} cannot be read", "rows": [], "launch": ""}
         return failure if isinstance(failure, dict) else None
+
+    def failures(self, items: Iterable[WorkItem]) -> dict[str, str]:
+        """Why a sequence is broken, by its label."""
+        stored = {item.label: self.failure(item) for item in items}
+        return {label: str(failure.get("reason")) for label, failure in stored.items() if failure is not None}
 
     def succeeded(self, item: WorkItem) -> None:
         """Forget an earlier failure."""

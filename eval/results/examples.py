@@ -34,28 +34,22 @@ _MAPS = ("depth", "variance", "aleatoric", "epistemic", "disagreement")
 
 
 class ExampleWriter(FrameSink):
-    """A sink that writes examples of a sequence.
+    """A sink that writes examples of a sequence, and UfM*'s mixtures after a quarter, half and all of the frames.
 
     Args:
         folder: of the sequence; "examples" and "room" are made within it.
         frames: how many, evenly spaced over the frames.
-        room: whether to leave UfM*'s mixtures as well, after a quarter, half and all of the frames.
-
-    Raises:
-        ValueError: a negative number of frames.
     """
 
-    def __init__(self, folder: Path, frames: int = 3, *, room: bool = True) -> None:
-        if frames < 0:
-            raise ValueError(f"frames must be at least 0, got {frames}")
-        self._folder, self._count, self._room = folder, frames, room
+    def __init__(self, folder: Path, frames: int = 3) -> None:
+        self._folder, self._count = folder, frames
         self._paths: dict[str, list[NDArray[np.float64]]] = {}
         self._last: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
     def begin(self, stream: FrameStream) -> None:
         total = len(stream.indices)
         self._frames = _moments([(n + 0.5) / self._count for n in range(self._count)], total)
-        self._rooms = _moments(ROOM_SHARES if self._room else (), total)
+        self._rooms = _moments(ROOM_SHARES, total)
         self._gaussians = {row.key: row.estimator for row in stream.rows if isinstance(row.estimator, Gaussians)}
 
     def take(self, result: FrameResult) -> None:
@@ -63,7 +57,7 @@ class ExampleWriter(FrameSink):
         ``write_atomic``."""
         if not result.rows or result.frame is None:
             return
-        for key in self._gaussians if self._room else ():
+        for key in self._gaussians:
             if key in result.rows:
                 self._last[key] = result.name, result.rows[key].T_world_cam
             if key in self._last:
@@ -75,12 +69,10 @@ class ExampleWriter(FrameSink):
 
     def end(self) -> None:
         """After the last frame. Raises OSError, see ``write_atomic``."""
-        if self._room:
-            self._write_rooms()
+        self._write_rooms()
 
     def _write_frame(self, result: FrameResult, frame: Frame) -> None:
         folder = self._folder / "examples"
-        folder.mkdir(parents=True, exist_ok=True)
         scenes = {key: _scene(frame, row) for key, row in result.rows.items()}
         first = next(iter(scenes.values()))
         _write(folder / f"{frame.name}.npz", {**first, "index": np.array(frame.index)})
@@ -92,11 +84,9 @@ class ExampleWriter(FrameSink):
             _write(folder / f"{frame.name}@{key}.npz", arrays if alike else {**arrays, **scene})
 
     def _write_rooms(self) -> None:
-        folder = self._folder / "room"
-        folder.mkdir(parents=True, exist_ok=True)
         for key, (name, T_world_cam) in self._last.items():
             arrays = {**_room(self._gaussians[key]), "T_world_cam": T_world_cam, "path": np.array(self._paths[key])}
-            _write(folder / f"{key}_{name}.npz", arrays)
+            _write(self._folder / "room" / f"{key}_{name}.npz", arrays)
 
 
 def _moments(shares: Iterable[float], total: int) -> list[int]:
@@ -141,4 +131,5 @@ def _seen(image: NDArray[np.uint8], K_image: NDArray, K: NDArray, size: Size) ->
 
 
 def _write(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, lambda file: np.savez(file, allow_pickle=False, **arrays))

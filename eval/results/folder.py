@@ -58,11 +58,6 @@ class FolderKind:
     # of (the manifest in the folder, the new one): what the folder contains from then on.
     merge: Callable[[Manifest, Manifest], Manifest] = lambda then, _: then
 
-    @property
-    def indefinite(self) -> str:
-        """The noun with its article."""
-        return f"{'an' if self.noun[0] in 'aeiou' else 'a'} {self.noun}"
-
     def new_manifest(self, content: Manifest) -> dict[str, Any]:
         """The manifest of new work, as plain values; ``content`` is what the kind keeps beside program and format."""
         own = {"state": _UNFINISHED} if self.format is None else {"format": self.format}
@@ -78,38 +73,35 @@ class FolderKind:
                 raise ValueError(f"made by {manifest['program']}, format {manifest['format']}")
             return dict(manifest)
         except (ValueError, KeyError, TypeError) as error:
-            raise FolderError(f"--resume: {path} is not {self.indefinite}'s that can be continued ({error})") from error
+            article = "an" if self.noun[0] in "aeiou" else "a"
+            text = f"--resume: {path} is not {article} {self.noun}'s that can be continued ({error})"
+            raise FolderError(text) from error
 
-    def occupied(self, out: Path) -> bool:
-        """Whether the folder contains earlier work of the program. Raises FolderError: it is a file, or contains files
-        that are not the program's."""
+    def earlier(self, out: Path, *, resume: bool, overwrite: bool) -> bool:
+        """Whether the folder contains earlier work of the program.
+
+        Raises:
+            FolderError: it is a file, contains files that are not the program's, or earlier work and the options do not
+                say what to do with it. Of work that cannot be continued, what was interrupted is of no use to anybody.
+        """
         if out.exists() and not out.is_dir():
             raise FolderError(f"--out {out} is a file, expected a folder")
-        if (out / self.manifest).is_file() and (self.format is not None or self._read_plain(out) is not None):
-            return True
-        if out.is_dir() and any(self._foreign(out)):
-            raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
-        return False
-
-    def require_choice(self, out: Path, *, resume: bool, overwrite: bool) -> None:
-        """Raise FolderError unless the options say what to do with earlier work in the folder; see ``occupied``."""
-        if not self.occupied(out) or resume or overwrite:
-            return
-        if self.format is not None:
-            choices = "--resume goes on with it, --overwrite replaces it"
-        elif (self._read_plain(out) or {}).get("state") == _UNFINISHED:
-            return  # interrupted, and of no use to anybody
-        else:
-            choices = "--overwrite replaces it"
-        raise FolderError(f"--out {out} holds an earlier {self.noun}: {choices}")
-
-    def _read_plain(self, out: Path) -> dict[str, Any] | None:
-        """The manifest, None where the file is another program's."""
-        try:
-            manifest = json.loads((out / self.manifest).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return None
-        return manifest if isinstance(manifest, dict) and manifest.get("program") == self.program else None
+        known, state = (out / self.manifest).is_file(), ""
+        if known and self.format is None:
+            try:
+                content = json.loads((out / self.manifest).read_text(encoding="utf-8"))
+            except (OSError, ValueError):
+                content = None
+            known = isinstance(content, dict) and content.get("program") == self.program
+            state = content.get("state", "") if known else ""
+        if not known:
+            if out.is_dir() and any(self._foreign(out)):
+                raise FolderError(f"--out {out} holds files of someone else: choose an empty or a new folder")
+            return False
+        if not (resume or overwrite or state == _UNFINISHED):
+            choices = "" if self.format is None else "--resume goes on with it, "
+            raise FolderError(f"--out {out} holds an earlier {self.noun}: {choices}--overwrite replaces it")
+        return True
 
     def _foreign(self, out: Path) -> list[Path]:
         """Entries beside those that a process leaves which was killed before it wrote the manifest."""
@@ -125,12 +117,11 @@ class OutputFolder:
 
     Attributes:
         path: the folder.
-        manifest: its content.
         resumed: whether it contained earlier work that goes on.
     """
 
-    def __init__(self, path: Path, manifest: Manifest, *, resumed: bool, held: ExitStack) -> None:
-        self.path, self.manifest, self.resumed, self._held = path, manifest, resumed, held
+    def __init__(self, path: Path, *, resumed: bool, held: ExitStack) -> None:
+        self.path, self.resumed, self._held = path, resumed, held
 
     @classmethod
     def open(
@@ -150,7 +141,7 @@ class OutputFolder:
                 started with other values (the message names them); or another process holds it.
             OSError: the folder cannot be made or locked.
         """
-        kind.require_choice(out, resume=resume, overwrite=overwrite)
+        kind.earlier(out, resume=resume, overwrite=overwrite)
         out.mkdir(parents=True, exist_ok=True)
         (out / kind.manifest).parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as held:
@@ -162,10 +153,9 @@ class OutputFolder:
                     raise FolderError(f"--out {out}: {busy}")
                 held.callback(lock.release)
             # Checked again: another process may have made the folder while this one waited.
-            kind.require_choice(out, resume=resume, overwrite=overwrite)
+            resumed = kind.earlier(out, resume=resume, overwrite=overwrite) and resume
             for pattern in kind.temporary:
                 remove_temporaries(out.glob(pattern))
-            resumed = resume and kind.occupied(out)
             manifest = kind.new_manifest(content)
             if resumed:
                 earlier = kind.read_manifest(out)
@@ -177,7 +167,7 @@ class OutputFolder:
                 kind.clear(out)
             if not resumed or manifest != earlier:
                 write_json_atomic(out / kind.manifest, manifest)
-            return cls(out, manifest, resumed=resumed, held=held.pop_all() if kind.held == "life" else ExitStack())
+            return cls(out, resumed=resumed, held=held.pop_all() if kind.held == "life" else ExitStack())
 
     def close(self) -> None:
         """Release the lock."""
@@ -212,19 +202,13 @@ def hold(path: Path, *, wait: float = 0.0) -> BaseFileLock | None:
         lock.acquire(timeout=wait, poll_interval=_POLL_SECONDS)
     except Timeout:
         return None
-    except NotImplementedError as error:  # filelock's form of ENOSYS
-        raise _no_locks(path, errno.ENOSYS) from error
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
+    except (NotImplementedError, OSError) as error:
+        code = error.errno if isinstance(error, OSError) else errno.ENOSYS  # filelock's form of it
+        if code not in _NO_LOCKS:
             raise
-        raise _no_locks(path, error.errno) from error
+        text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
+        raise OSError(code, text, str(path)) from error
     return lock
-
-
-def _no_locks(path: Path, code: int) -> OSError:
-    """The error of a file system that does not support locks."""
-    text = f"the file system does not support locks ({os.strerror(code)}), choose a folder on another one"
-    return OSError(code, text, str(path))
 
 
 def differences(then: Manifest, now: Manifest) -> str:

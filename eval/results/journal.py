@@ -3,57 +3,55 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from time import perf_counter
 from typing import Any
 
 from torch import Tensor
 
-from ufmstar_torch.eval.engine.anchors import FrameAnchors
 from ufmstar_torch.eval.engine.estimators import Estimate
+from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.rows import RowFrame
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 from ufmstar_torch.eval.results.run_folder import Checkpoint, RunFolder
-from ufmstar_torch.eval.results.summary import NEAR_ZERO
+from ufmstar_torch.eval.results.run_job import RunJob, saved_state
+from ufmstar_torch.eval.results.summary import GOING_ON, NEAR_ZERO, write_summary
 
 _MAPS = ("depth", "variance", "disagreement", "anchored", "bias", "posterior_depth", "posterior_variance")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")
-# A run on maps saves UfM*'s tensors under their own names, and no turn: its files have done so since the first version.
-_TURN, _UFM = "image_index", "ufm."
+_SUMMARY_EVERY = 30.0  # [s] between two updates of the summary of a run that is going on
 
 
 class Journal(FrameSink):
     """Writes every frame's maps to the run's folder, and commits it with the metrics' sums and the state that the next
-    one depends on (``FrameResult.state``). ``bare``: the row's depth comes from maps."""
+    one depends on (``FrameResult.state``); now and then the summary."""
 
-    def __init__(
-        self, key: str, folder: RunFolder, sums: Callable[[], dict[str, dict[str, Tensor]]], *, bare: bool
-    ) -> None:
-        self._key, self._folder, self._sums, self._bare = key, folder, sums, bare
+    def __init__(self, job: RunJob, folder: RunFolder, metrics: RunMetrics) -> None:
+        self._job, self._folder, self._metrics = job, folder, metrics
         self._earlier = list(folder.checkpoint.sessions)
         self._saving = 0.0
 
     def begin(self, stream: FrameStream) -> None:
         """The clock of this session starts."""
         self._first, self._started = stream.position, perf_counter()
+        self._summarised = self._started
 
     def take(self, result: FrameResult) -> None:
         """Write and commit a frame; raises OSError as ``FrameWriter.write`` and ``RunFolder.commit``."""
-        record = self._written(result)
-        session = {
-            "first": self._first,
-            "frames": result.number + 1 - self._first,
-            "seconds": perf_counter() - self._started,
-        }
+        record, frames = self._written(result), result.number + 1 - self._first
+        session = {"first": self._first, "frames": frames, "seconds": perf_counter() - self._started}
         checkpoint = Checkpoint(
             position=result.number + 1,
-            module=saved_state(row_part(result.state, self._key), bare=self._bare),
-            metrics=self._sums(),
+            module=saved_state(result.state[UFM], bare=not self._job.source.needs_image),
+            metrics=self._metrics.sums(),
             sessions=[*self._earlier, session],
         )
         before = perf_counter()
         self._folder.commit(record, checkpoint)
-        self._saving = 1000 * (perf_counter() - before)
+        after = perf_counter()
+        self._saving = 1000 * (after - before)
+        if after - self._summarised > _SUMMARY_EVERY:
+            write_summary(self._job, self._folder, *GOING_ON)
+            self._summarised = perf_counter()
 
     def end(self) -> None:
         """Store the last state, before pictures are drawn."""
@@ -62,31 +60,13 @@ class Journal(FrameSink):
     def _written(self, result: FrameResult) -> dict[str, Any]:
         """The frame's line of frames.jsonl, once its maps are written."""
         about = {"index": result.index, "name": result.name}
-        if self._key not in result.rows:
-            return {**about, "state": "skipped", "reason": result.skipped[self._key]}
-        row, before = result.rows[self._key], perf_counter()
+        if UFM not in result.rows:
+            return {**about, "state": "skipped", "reason": result.skipped[UFM]}
+        row, before = result.rows[UFM], perf_counter()
         maps = {name: getattr(row.estimate, name) for name in _MAPS}
-        lost = self._folder.writer.write(result.name, valid=row.estimate.valid, **maps)
-        saturated = {"saturated": {"depth": lost.depth_saturated, "sigma": lost.sigma_saturated}}
+        saturated = {"saturated": self._folder.writer.write(result.name, valid=row.estimate.valid, **maps)}
         times = {"ms": _times(result, row, 1000 * (perf_counter() - before), self._saving)}
         return {**about, "state": "done", **_figures(row), **saturated, **times, **_anchor_figures(row)}
-
-
-def row_part(state: Mapping[str, Tensor], key: str) -> dict[str, Tensor]:
-    """A row's part of a stream's state (``FrameStream.state``)."""
-    return {name.removeprefix(f"{key}/"): value for name, value in state.items() if name.startswith(f"{key}/")}
-
-
-def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
-    """A row's state as state.pt holds it; ``bare``: of a run on maps."""
-    return {k.removeprefix(_UFM): v for k, v in state.items() if k != _TURN} if bare else dict(state)
-
-
-def row_state(saved: Mapping[str, Tensor], *, bare: bool, images: Tensor) -> dict[str, Tensor]:
-    """The row's state from what :func:`saved_state` returned; ``images`` that a run on maps has seen."""
-    if not bare:
-        return dict(saved)
-    return {_TURN: images, **{k if k.startswith("tracker.") else _UFM + k: v for k, v in saved.items()}}
 
 
 def _figures(row: RowFrame) -> dict[str, Any]:
@@ -115,7 +95,7 @@ def _times(result: FrameResult, row: RowFrame, writing: float, saving: float) ->
     """By stage [ms]. "prepare" is what a prediction takes beside the network; "save" is that of the frame before, since
     this frame's is not known yet. "cycle" is the time since the frame before: stages overlap."""
     ms = result.ms
-    optional = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
+    optional: dict[str, float] = {stage: row.ms[stage] for stage in ("network", "anchors") if stage in row.ms}
     return {
         "read": ms["read"],
         **optional,
@@ -135,11 +115,13 @@ def _anchor_figures(row: RowFrame) -> dict[str, Any]:
     with a depth, and ``used`` agree with others. Without any used, ``without`` is the reason. Of a map of landmarks,
     ``tracked`` counts all, and ``found`` those in view.
     """
-    anchors, estimate = row.anchors, row.estimate
-    if anchors is None or estimate.anchored is None or estimate.bias is None:
+    anchors, estimate, statistics = row.anchors, row.estimate, row.estimate.statistics
+    if anchors is None or statistics is None or estimate.anchored is None or estimate.bias is None:
         return {}
+    used, usable = int(statistics.anchors_used[0]), int(statistics.anchors[0])
+    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
     return {
-        "anchors": _corners(anchors, estimate),
+        "anchors": {**counts, "without": None if used else why_none(anchors.triangulated, usable, anchors.none)},
         "mean_anchored": _mean(estimate.anchored, estimate.valid),
         "mean_bias": _mean(estimate.bias, estimate.valid),
         **_posterior_figures(estimate),
@@ -158,14 +140,6 @@ def _posterior_figures(estimate: Estimate) -> dict[str, Any]:
         "unseen": float(statistics.unseen[0]),
     }
     return {"posterior": figures}
-
-
-def _corners(anchors: FrameAnchors, estimate: Estimate) -> dict[str, Any]:
-    assert estimate.statistics is not None
-    used, usable = int(estimate.statistics.anchors_used[0]), int(estimate.statistics.anchors[0])
-    counts = {"tracked": anchors.tracked, "found": anchors.triangulated, "usable": usable, "used": used}
-    why = None if used else why_none(anchors.triangulated, usable, anchors.none)
-    return {**counts, "without": why}
 
 
 def why_none(triangulated: int, usable: int, none: str) -> str:

@@ -18,21 +18,22 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any
 
 import torch
 
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.machine import available_cores
-from ufmstar_torch.eval.results.work import EvalJob, Evaluate, WorkerContext, failures, run_job
-from ufmstar_torch.eval.results.worker import DONE, STOPPED, WorkerTask, device_of, work
+from ufmstar_torch.eval.results.machine import available_cores, device_of
+from ufmstar_torch.eval.results.work import EvalJob, Evaluate, Worker, WorkerTask
 from ufmstar_torch.eval.results.worklist import Shard
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.05
 _PATIENCE_SECONDS = 10.0  # for a process that was killed
-_WORKER = (sys.executable, "-P", "-m", "ufmstar_torch.eval.results.worker")
+WORKER = (sys.executable, "-P", "-c", f"from {__name__} import main; raise SystemExit(main())")
+DONE, FAILED, STOPPED = 0, 1, 130  # exit codes of a process
 # submitit's own names of parameters; others are SLURM's, as partition, account, constraint.
 _SUBMITIT = ("name", "timeout_min", "mem_gb", "nodes", "cpus_per_task", "gpus_per_node", "tasks_per_node")
 
@@ -58,11 +59,9 @@ class LaunchOptions:
 class EvalOutcome:
     """How an evaluation ended."""
 
-    job: EvalJob  # what was evaluated
     finished: bool  # False: it was stopped, or a process ended early
     stopped: bool  # by the caller
     failed: Mapping[str, str]  # why a sequence is broken, by its label
-    left: int  # number of sequences without all of their rows, broken ones left out
     reports: bool = True  # whether this process reports the results; further ones of torchrun are silent
 
 
@@ -126,8 +125,7 @@ def evaluate_suite(
     progress: Callable[[str, int, int], None],
     evaluate: Evaluate = evaluate_sequences,
 ) -> EvalOutcome:
-    """Evaluate a job; ``progress`` (see ``WorkerContext``) and ``evaluate`` (see ``evaluate_sequences``) are of this
-    process's own work.
+    """Evaluate a job; ``progress`` and ``evaluate`` (see ``Worker``) are of this process's own work.
 
     Raises:
         FolderError, FileNotFoundError, ValueError, ImportError: the work cannot be begun.
@@ -137,9 +135,10 @@ def evaluate_suite(
     if rank is not None:
         _require_plain(options, rank)
         # No common launch: torchrun starts all processes again when one was killed, and the sequence is tried again.
-        task = WorkerTask(job, rank.rank + 1, rank.world, rank.local, "", options.threads)
-        finished = work(task, stop=stop, report=report, waits=rank.rank == 0, evaluate=evaluate)
-        return _outcome(job, finished, stop(), reports=rank.rank == 0)
+        shard, first = Shard(rank.rank + 1, rank.world), rank.rank == 0
+        task = WorkerTask(job, shard, rank.local, helps=True, waits=first, threads=options.threads)
+        finished = work(task, stop=stop, report=report, evaluate=evaluate)
+        return _outcome(job, finished, stop(), reports=first)
     if options.slurm or options.processes > 1:
         slurm = Slurm.parse(options.slurm) if options.slurm else None
         # Opened once before any process starts, which reports mistakes once.
@@ -150,51 +149,51 @@ def evaluate_suite(
         else:
             finished = run_slurm(slurm, tasks_of(job, options, slurm.jobs), stop=stop, report=report)
         return _outcome(job, finished, stop())
-    job = replace(job, device=device_of(job.device, 0))
     shard = Shard.parse(options.shard or "1/1")
-    networks = job.load(torch.device(job.device))
     # The parts of a divided evaluation begin in any order: whichever is first makes the folder.
-    resume = options.resume or shard.count > 1
-    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=options.overwrite)
-    context = WorkerContext(shard, stop=stop, report=report, progress=progress, evaluate=evaluate)
-    return _outcome(job, run_job(job, folder, networks, context), stop())
+    how = {"resume": options.resume or shard.count > 1, "overwrite": options.overwrite}
+    own: dict[str, Any] = {"stop": stop, "report": report, "progress": progress, "evaluate": evaluate}
+    return _outcome(job, work(WorkerTask(job, shard), **how, **own), stop())
 
 
 def tasks_of(job: EvalJob, options: LaunchOptions, jobs: int | None = None) -> list[WorkerTask]:
     """The tasks of processes that share a job: ``options.processes`` on this computer, or ``jobs`` on a cluster."""
     launch, count = secrets.token_hex(8), jobs or options.processes
     threads = options.threads if jobs else options.threads or max(1, available_cores() // count)
-    return [WorkerTask(job, n + 1, count, 0 if jobs else n, launch, threads, options.debug) for n in range(count)]
+    how: dict[str, Any] = {"helps": True, "launch": launch, "threads": threads, "debug": options.debug}
+    return [WorkerTask(job, Shard(n + 1, count), 0 if jobs else n, **how) for n in range(count)]
 
 
-def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = _WORKER) -> bool:
-    """Start a process for every task by ``command``, which runs ``worker.main``, and wait for all; whether every one
-    came to its end. One that ends early loses only the sequence in hand: the others do the rest."""
-    running: list[_Process] = []
+def run_processes(tasks: Sequence[WorkerTask], *, stop: Stop, report: Report, command: Sequence[str] = WORKER) -> bool:
+    """Start a process for every task by ``command``, which runs :func:`main`, and wait for all; whether every one came
+    to its end. One that ends early loses only the sequence in hand: the others do the rest."""
+    children: list[subprocess.Popen[bytes]] = []
+
+    def terminate() -> None:
+        for child in children:
+            child.terminate()
+
     try:
         for task in tasks:
             # In a session of its own, so that Ctrl-C reaches this process alone, which passes it on.
             child = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
-            running.append(_Process(task.label, child))
+            children.append(child)
             assert child.stdin is not None
             pickle.dump(task, child.stdin)
             child.stdin.close()
-        return _wait(running, stop, report)
+        outcomes = [partial(_of_process, *pair) for pair in zip(tasks, children, strict=True)]
+        return _wait(outcomes, stop, report, terminate)
     finally:
-        for process in running:
-            process.child.kill()
-        for process in running:
-            process.child.wait(_PATIENCE_SECONDS)
+        for child in children:
+            child.kill()
+        for child in children:
+            child.wait(_PATIENCE_SECONDS)
 
 
 def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: Report) -> bool:
     """Submit a job for every task, and wait for all of them; whether every one came to its end. OUT/slurm has their
-    output; stopping cancels them.
-
-    Raises:
-        ImportError: submitit is missing.
-        ValueError: a parameter that submitit does not take, or no SLURM here.
-    """
+    output; stopping cancels them. Raises ImportError: submitit is missing; ValueError: a parameter that submitit does
+    not take, or no SLURM here."""
     try:
         import submitit
     except ImportError as error:
@@ -208,12 +207,12 @@ def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: 
     with executor.batch():
         jobs = [executor.submit(ClusterTask(task)) for task in tasks]
     report(f"jobs {', '.join(job.job_id for job in jobs)}; their output is in {folder}")
-    running = [_ClusterJob(job) for job in jobs]
     try:
-        return _wait(running, stop, report)
+        return _wait([partial(_of_job, job) for job in jobs], stop, report, None)
     finally:
-        for job in running:
-            job.stop()
+        for job in jobs:
+            if not job.done():
+                job.cancel()
 
 
 @dataclass(frozen=True)
@@ -232,67 +231,82 @@ class ClusterTask:
         return DelayedSubmission(self)
 
 
-@dataclass
-class _Process:
-    """A process on this computer."""
-
-    label: str
-    child: subprocess.Popen[bytes]
-
-    def outcome(self) -> tuple[bool, str] | None:
-        """Whether it came to its end, and a line about what went wrong, or ""; None while it runs."""
-        code = self.child.poll()
-        if code is None:
-            return None
-        how = f"signal {-code}" if code < 0 else f"code {code}"
-        return code == DONE, "" if code in (DONE, STOPPED) else f"process {self.label} ended early ({how})"
-
-    def stop(self) -> None:
-        """Ask it to end after the frame in hand."""
-        self.child.send_signal(signal.SIGTERM)
+def work(task: WorkerTask, *, resume: bool = True, overwrite: bool = False, **context: Any) -> bool:
+    """Take part; True when nothing is left to do. ``resume`` and ``overwrite`` are as ``EvalFolder.open`` takes them,
+    ``context`` as ``Worker`` does. Raises FolderError, OSError, ValueError, ImportError: the work cannot be begun, or
+    nothing can be written."""
+    if task.threads is not None:
+        torch.set_num_threads(task.threads)
+    job = replace(task.job, device=device_of(task.job.device, task.local))
+    networks = job.load(torch.device(job.device))
+    folder = EvalFolder.open(job.out, job.about(networks), resume=resume, overwrite=overwrite)
+    return Worker(replace(task, job=job), folder, networks, **context).run()
 
 
-@dataclass
-class _ClusterJob:
-    """A job of submitit; once it is cancelled, its end is not awaited."""
+def main() -> int:
+    """Do the task that standard input contains as a pickle; 0 done, 1 failed, 130 stopped."""
+    task: WorkerTask = pickle.load(sys.stdin.buffer)
+    parent, received = os.getppid(), list[int]()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda n, _: received.append(n))
 
-    job: Any
-    cancelled: bool = False
+    def stop() -> bool:
+        # An orphan ends too: its starter was killed and can no longer stop it.
+        return bool(received) or os.getppid() != parent
 
-    def outcome(self) -> tuple[bool, str] | None:
-        """As ``_Process.outcome``."""
-        if self.cancelled or not self.job.done():
-            return (False, "") if self.cancelled else None
-        error = self.job.exception()
-        if error is not None:
-            return False, f"job {self.job.job_id} failed: {' '.join(str(error).split())[-300:]}"
-        return bool(self.job.result()), ""
+    def report(line: str) -> None:
+        print(f"[{task.shard}] {line}", file=sys.stderr, flush=True)
 
-    def stop(self) -> None:
-        """Cancel it."""
-        self.cancelled = True
-        self.job.cancel()
-
-
-_Started = TypeVar("_Started", _Process, _ClusterJob)
+    try:
+        return DONE if work(task, stop=stop, report=report) else STOPPED
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        if task.debug:
+            raise
+        report(f"failed: {' '.join(str(error).split()) or type(error).__name__}")
+        return FAILED
 
 
-def _wait(running: list[_Started], stop: Stop, report: Report) -> bool:
-    """Wait until the list is empty, from which those that have ended are removed; whether all came to their end."""
-    finished, stopping = True, False
-    while running:
+# Whether a process or job came to its end, and a line about what went wrong, or ""; None while it runs.
+_Outcome = tuple[bool, str] | None
+
+
+def _of_process(task: WorkerTask, child: subprocess.Popen[bytes]) -> _Outcome:
+    code = child.poll()
+    if code is None:
+        return None
+    how = f"signal {-code}" if code < 0 else f"code {code}"
+    return code == DONE, "" if code in (DONE, STOPPED) else f"process {task.shard} ended early ({how})"
+
+
+def _of_job(job: Any) -> _Outcome:
+    if not job.done():
+        return None
+    error = job.exception()
+    if error is not None:
+        return False, f"job {job.job_id} failed: {' '.join(str(error).split())[-300:]}"
+    return bool(job.result()), ""
+
+
+def _wait(
+    running: Iterable[Callable[[], _Outcome]], stop: Stop, report: Report, end: Callable[[], None] | None
+) -> bool:
+    """Wait for all outcomes; whether all came to their end. At a stop, ``end`` asks all to end after the frame in hand;
+    with None they are not awaited."""
+    left, finished, stopping = list(running), True, False
+    while left:
         if not stopping and stop():
+            if end is None:
+                return False
             stopping = True
-            for one in running:
-                one.stop()
-        for one in list(running):
-            outcome = one.outcome()
+            end()
+        for one in list(left):
+            outcome = one()
             if outcome is not None:
-                running.remove(one)
+                left.remove(one)
                 finished = finished and outcome[0]
                 if outcome[1]:
                     report(outcome[1])
-        if running:
+        if left:
             time.sleep(_POLL_SECONDS)
     return finished
 
@@ -306,7 +320,4 @@ def _require_plain(options: LaunchOptions, rank: Rank) -> None:
 
 
 def _outcome(job: EvalJob, finished: bool, stopped: bool, *, reports: bool = True) -> EvalOutcome:
-    folder = EvalFolder(job.out, {})
-    failed = failures(folder, job.items)
-    open_items = [item for item in job.items if item.label not in failed and folder.missing(item, job.suite.rows)]
-    return EvalOutcome(job, finished, stopped, failed, len(open_items), reports)
+    return EvalOutcome(finished, stopped, EvalFolder(job.out).failures(job.items), reports)

@@ -79,3 +79,13 @@ def require_device(name: str) -> str:
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"--device {name} is not available: {str(error).splitlines()[0]}") from error
     return name
+
+
+def device_of(name: str, local: int) -> str:
+    """The device of the process with that number on its computer: "cuda" is the GPU in turn, else as it stands. Raises
+    ValueError: the device does not exist."""
+    import torch
+
+    if name == "cuda" and torch.cuda.is_available():
+        name = f"cuda:{local % torch.cuda.device_count()}"
+    return require_device(name)

@@ -22,13 +22,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
 from time import monotonic
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.results.files import to_json, write_atomic
+from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
 from ufmstar_torch.eval.results.folder import FolderError, FolderKind, OutputFolder, remover
 from ufmstar_torch.eval.results.writers import FrameWriter
 from ufmstar_torch.eval.sequences.own_output import read_journal
@@ -63,7 +63,7 @@ class Checkpoint:
 
 
 class RunFolder:
-    """The output folder of a new or continued run. Use :meth:`open`.
+    """The output folder of a new or continued run. Use ``with RunFolder.open(...)``.
 
     Attributes:
         path: the folder.
@@ -72,53 +72,41 @@ class RunFolder:
         records: the lines of frames.jsonl up to there.
     """
 
-    def __init__(self, folder: OutputFolder, checkpoint: Checkpoint, records: list[dict[str, Any]]) -> None:
-        self.path = folder.path
-        self._folder = folder
+    def __init__(self, folder: OutputFolder) -> None:
+        self.path, self._folder = folder.path, folder
         self.writer = FrameWriter(folder.path)
-        self.checkpoint = checkpoint
-        self.records = records
-        self._journal: BinaryIO | None = None
-        self._stored, self._stored_at = checkpoint, -math.inf
+        self.checkpoint, self.records = _load(self.writer) if folder.resumed else (Checkpoint(), [])
+        self._stored, self._stored_at = self.checkpoint, -math.inf
+        # The journal ends at the last finished frame; space is set aside for the summary.
+        self._journal = (self.path / "frames.jsonl").open("ab")
+        self._journal.truncate(self.checkpoint.journal_bytes)
+        write_atomic(self.path / "resume" / "reserve", lambda file: file.write(bytes(_RESERVE_BYTES)))
 
     @classmethod
     def open(cls, path: str | Path, identity: Mapping[str, Any], *, resume: bool, overwrite: bool) -> RunFolder:
         """Prepare the folder; see ``OutputFolder.open``. ``identity`` holds plain values that must be those of the run
-        that is to be continued.
-
-        Raises:
-            FolderError: the folder cannot be used as asked, or the state in it cannot be read.
-            OSError: the folder cannot be made.
-        """
+        that is to be continued. Raises FolderError also where the state in the folder cannot be read."""
         folder = OutputFolder.open(Path(path), RUN, {"identity": identity}, resume=resume, overwrite=overwrite)
         with ExitStack() as held:
             held.enter_context(folder)
-            run = cls(folder, *(_load(folder.path) if folder.resumed else (Checkpoint(), [])))
+            run = cls(folder)
             held.pop_all()
         return run
 
     def __enter__(self) -> RunFolder:
-        """Make the journal end at the last finished frame, and set space aside for the summary."""
-        self._journal = (self.path / "frames.jsonl").open("ab")
-        self._journal.truncate(self.checkpoint.journal_bytes)
-        reserve = bytes(_RESERVE_BYTES)
-        write_atomic(self.path / "resume" / "reserve", lambda file: file.write(reserve))
         return self
 
     def __exit__(self, *_: object) -> None:
         self.release_reserve()
         with suppress(OSError):  # no space even so: the run goes on from the state that is there
             self.store()
-        if self._journal is not None:
-            self._journal.truncate(self._stored.journal_bytes)
-            self._journal.close()
+        self._journal.truncate(self._stored.journal_bytes)
+        self._journal.close()
         self._folder.close()
 
     def commit(self, record: Mapping[str, Any], checkpoint: Checkpoint) -> None:
         """Record a frame as handled, once its files are written; now and then, :meth:`store`. Raises OSError: a full
         disk, say; the folder stays at the frame before."""
-        if self._journal is None:
-            raise ValueError("commit needs an open folder: use `with folder:`")
         line = json.dumps(to_json(record), allow_nan=False).encode() + b"\n"
         self._journal.truncate(self.checkpoint.journal_bytes)
         self._journal.write(line)
@@ -150,14 +138,15 @@ class RunFolder:
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Replace summary.json, on a full disk from the space set aside."""
         try:
-            self.writer.write_summary(summary)
+            write_json_atomic(self.path / "summary.json", summary)
         except OSError:
             self.release_reserve()
-            self.writer.write_summary(summary)
+            write_json_atomic(self.path / "summary.json", summary)
 
 
-def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
+def _load(writer: FrameWriter) -> tuple[Checkpoint, list[dict[str, Any]]]:
     """The state after the last finished frame, and the records up to there."""
+    out = writer.out_dir
     file, journal = out / "resume" / "state.pt", out / "frames.jsonl"
     if not file.is_file():
         return Checkpoint(), []
@@ -168,7 +157,6 @@ def _load(out: Path) -> tuple[Checkpoint, list[dict[str, Any]]]:
         records = read_journal(text, journal)
     except (OSError, EOFError, RuntimeError, KeyError, UnpicklingError, zipfile.BadZipFile, ValueError) as error:
         raise FolderError(f"--resume: the state in {out} cannot be read ({error}); --overwrite starts again") from error
-    writer = FrameWriter(out)
     lost = [r["name"] for r in records if r["state"] == "done" and not writer.finished(r["name"])]
     if stored_format != FORMAT or len(records) != stored["position"]:
         raise FolderError(f"--resume: the state in {out} is incomplete; --overwrite starts again")

@@ -6,10 +6,13 @@ import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from statistics import mean, median
-from typing import Any, NamedTuple
+from typing import Any
 
-from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM
+from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
 from ufmstar_torch.eval.results import machine
+from ufmstar_torch.eval.results.files import to_json
+from ufmstar_torch.eval.results.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.results.run_job import RunJob
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 
@@ -20,38 +23,27 @@ STAGES = ("read", "prepare", "network", "anchors", "ufm", "metrics", "write", "s
 _PACKAGES = ("ufmstar-torch", "torch", "numpy", "numba", "onnxruntime")
 
 
-class Ending(NamedTuple):
-    """How a run ended: "finished", "interrupted" or "failed", and why."""
-
-    state: str
-    reason: str
+# How a run ended, or not: the state, and why.
+GOING_ON = INTERRUPTED, "no orderly end: the program was killed, or is still running"
 
 
-def summarise(
-    *,
-    ending: Ending,
-    settings: Mapping[str, Any],
-    sequence: FrameSequence,
-    selected: int,
-    source: Mapping[str, Any],
-    runtime: Mapping[str, Any] | None,
-    records: Sequence[Mapping[str, Any]],
-    sessions: Sequence[Mapping[str, float]],
-    mixture: GaussianMixture,
-    figures: Mapping[str, Mapping[str, float]],
-    outputs: Mapping[str, str | None],
+def write_summary(
+    job: RunJob, folder: RunFolder, state: str, reason: str, outputs: Mapping[str, str | None] | None = None
 ) -> dict[str, Any]:
-    """The content of summary.json, from what the run has stored: ``records`` are the lines of frames.jsonl, ``mixture``
-    that at the end; ``outputs`` holds for each file None if it exists, or why it does not."""
+    """Write summary.json from what is on disk, so that a continued run has the same, and return its content as plain
+    values. ``state`` and ``reason``: how the run ended; ``outputs`` holds for each file None if it exists, or why it
+    does not."""
+    checkpoint, records = folder.checkpoint, folder.records
     done = [record for record in records if record["state"] == "done"]
-    return {
-        "program": "ufmstar run",
-        "state": ending.state,
-        "reason": ending.reason,
-        "sequence": _sequence(sequence),
-        "frames": _frames(records, selected),
-        "source": source,
-        "runtime": runtime,
+    figures = RunMetrics(UFM, checkpoint.metrics).figures()
+    summary = {
+        "program": RUN.program,
+        "state": state,
+        "reason": reason,
+        "sequence": _sequence(job.sequence),
+        "frames": _frames(records, len(job.indices)),
+        "source": job.source_identity,
+        "runtime": job.source.runtime,
         "prediction": {key: done[-1][key] for key in ("size", "intrinsics")} if done else None,
         "metrics": figures.get(UFM),
         "metrics_reason": None if UFM in figures else "no ground truth",
@@ -60,13 +52,16 @@ def summarise(
         **_posterior(done, figures.get(POSTERIOR)),
         "uncertainty": _uncertainty(done),
         "anchors": _anchors(done),
-        "mixture": _mixture(done, mixture),
+        "mixture": _mixture(done, job.ufm(checkpoint).mixture),
         "rotation_deviation_max": max((record["rotation_deviation"] for record in done), default=None),
-        "time": _time(done, sessions),
-        "outputs": outputs,
-        "settings": settings,
+        "time": _time(done, checkpoint.sessions),
+        "outputs": outputs or {},
+        "settings": job.settings,
         "versions": versions(),
     }
+    plain: dict[str, Any] = to_json(summary)
+    folder.write_summary(plain)
+    return plain
 
 
 def _posterior(done: Sequence[Mapping[str, Any]], figures: Mapping[str, float] | None) -> dict[str, Any]:
@@ -115,14 +110,16 @@ def _why_not_alone(done: Sequence[Mapping[str, Any]], judged: bool) -> str:
 
 def _uncertainty(done: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Means over all valid pixels of all frames. With perfect depth, they are the method's floor."""
+    pixels = sum(record["valid_pixels"] for record in done)
     saturated = {kind: sum(record["saturated"][kind] for record in done) for kind in ("depth", "sigma")}
     return {
         "mean_disagreement": _pixel_mean(done, "mean_disagreement"),
         "mean_sigma": _pixel_mean(done, "mean_sigma"),
         "mean_network_sigma": _pixel_mean(done, "mean_network_sigma"),
         "units": "disagreement m^2, sigma m",
-        "near_zero_share": _near_zero_share(done),
-        "valid_pixels": sum(record["valid_pixels"] for record in done),
+        # Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0.
+        "near_zero_share": sum(record["near_zero"] for record in done) / pixels if pixels else None,
+        "valid_pixels": pixels,
         "saturated_png_pixels": saturated,
     }
 
@@ -142,12 +139,6 @@ def _anchors(done: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
         "mean_bias": _pixel_mean(done, "mean_bias"),
         "units": "mean_anchored m^2 (B), mean_bias 1 (r: true depth over predicted, less 1)",
     }
-
-
-def _near_zero_share(done: Sequence[Mapping[str, Any]]) -> float | None:
-    """Of the valid pixels those with 0 < sigma < ``NEAR_ZERO``, near no component, where the prior is 0."""
-    pixels = sum(record["valid_pixels"] for record in done)
-    return sum(record["near_zero"] for record in done) / pixels if pixels else None
 
 
 def _pixel_mean(done: Sequence[Mapping[str, Any]], key: str) -> float | None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -99,52 +98,21 @@ class EvalJob:
 
 
 @dataclass(frozen=True)
-class WorkerContext:
-    """How one process takes part in an evaluation."""
+class WorkerTask:
+    """What one process does of an evaluation; pickled for another process."""
 
+    job: EvalJob  # what is evaluated
     shard: Shard = field(default_factory=Shard)  # the part of the sequences that it begins with
+    local: int = 0  # number of the process on its computer, which decides its GPU
     helps: bool = False  # take sequences of other parts afterwards; for processes that were started together
     waits: bool = False  # stay until the sequences that other processes work on are finished
     launch: str = ""  # the same for all processes that were started together; "" = one of its own
-    stop: Callable[[], bool] = lambda: False  # asked before every frame
-    report: Callable[[str], None] = lambda line: None  # receives a line when a sequence is finished
-    # called with a sequence's label, its number of finished frames, and the number of all of them.
-    progress: Callable[[str, int, int], None] = lambda label, done, total: None
-    evaluate: Evaluate = evaluate_sequences  # computes rows on sequences; see ``evaluate_sequences``
+    threads: int | None = None  # of the CPU; None = torch's own choice
+    debug: bool = False  # show tracebacks
 
 
-def run_job(job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext) -> bool:
-    """Evaluate the sequences one after another, with the folder opened and the networks loaded for the job; whether it
-    came to the end (False: ``context.stop`` ended it). ``folder.failure`` reports broken sequences.
-
-    Raises:
-        FolderError: earlier results were computed from another sequence of that name.
-        CacheError, OSError: nothing can be written.
-    """
-    context = replace(context, launch=context.launch or f"{os.getpid()} {time.time_ns()}")
-    worker = _Worker(job, folder, networks, context)
-    cache = PredictionCache(job.cache or job.out / CACHE)
-    judge = Judge(networks, torch.device(job.device), cache, job.frames, job.confident, job.bins, job.streams)
-    own = context.shard.of(job.items)
-    queue = [*own, *(item for item in job.items if context.helps and item not in own)]
-    try:
-        while queue:
-            taken: list[WorkItem] = []
-            context.evaluate(worker.tasks(queue, taken), judge, worker.finish, stop=context.stop)
-            queue = taken if context.waits else []
-            if queue:
-                time.sleep(_POLL_SECONDS)
-            elif taken and not context.helps:
-                context.report(f"left to another process that is at it: {', '.join(item.label for item in taken)}")
-    except Stopped:
-        return False
-    finally:
-        worker.release()
-    return True
-
-
-@dataclass(frozen=True, eq=False)
-class _InHand:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _InHand(SequenceTask):
     """A sequence that is evaluated."""
 
     # item, claim: which, and the claim to it.
@@ -154,114 +122,161 @@ class _InHand:
     digest: str
     landmarks: Mapping[str, str]
     missing: Sequence[Row]  # rows to store
-    left_out: Sequence[Row]  # those of them that cannot be had of this sequence, and why
-    why: str
+    left_out: Sequence[Row]  # those of them that cannot be had of this sequence
     started: float  # [s] ``time.monotonic``
 
 
-class _Worker:
-    """One process at its work; see ``run_job``."""
+class Worker:
+    """A process that takes part in an evaluation.
+
+    Args:
+        task: its part.
+        folder: opened for the job.
+        networks: of the job, loaded.
+        stop: asked before every frame; True ends the work.
+        report: receives a line when a sequence is finished.
+        progress: called with a sequence's label, its number of finished frames, and the number of all of them.
+        evaluate: computes rows on sequences; see ``evaluate_sequences``.
+    """
 
     def __init__(
-        self, job: EvalJob, folder: EvalFolder, networks: Mapping[str, DepthSource], context: WorkerContext
+        self,
+        task: WorkerTask,
+        folder: EvalFolder,
+        networks: Mapping[str, DepthSource],
+        *,
+        stop: Callable[[], bool] = lambda: False,
+        report: Callable[[str], None] = lambda line: None,
+        progress: Callable[[str, int, int], None] = lambda label, done, total: None,
+        evaluate: Evaluate = evaluate_sequences,
     ) -> None:
-        self.job, self.folder, self.networks, self.context = job, folder, networks, context
-        self._in_hand: dict[SequenceTask, _InHand] = {}
+        self.task, self.job, self.folder, self.networks = task, task.job, folder, networks
+        self.stop, self.report, self.progress, self.evaluate = stop, report, progress, evaluate
+        self._launch = task.launch or f"{os.getpid()} {time.time_ns()}"
+        self._in_hand: list[_InHand] = []
 
-    def tasks(self, queue: Iterable[WorkItem], taken: list[WorkItem]) -> Iterator[SequenceTask]:
-        """Claim one sequence of the queue after another; those with rows to compute are opened. ``taken`` gets the
-        sequences that another process has.
+    def run(self) -> bool:
+        """Evaluate the sequences one after another; whether it came to the end (False: ``stop`` ended it).
+        ``EvalFolder.failure`` reports broken sequences.
 
         Raises:
-            Stopped: the caller asked to stop.
-            FolderError: as :func:`run_job`.
+            FolderError: earlier results were computed from another sequence of that name.
+            CacheError, OSError: nothing can be written.
         """
+        job, task = self.job, self.task
+        cache = PredictionCache(job.cache or job.out / CACHE)
+        device = torch.device(job.device)
+        judge = Judge(self.networks, device, cache, job.frames, job.confident, job.bins, job.streams)
+        own = task.shard.of(job.items)
+        queue = [*own, *(item for item in job.items if task.helps and item not in own)]
+        try:
+            while queue:
+                taken: list[WorkItem] = []
+                self.evaluate(self._tasks(queue, taken), judge, self._finish, stop=self.stop)
+                queue = taken if task.waits else []
+                if queue:
+                    time.sleep(_POLL_SECONDS)
+                elif taken and not task.helps:
+                    self.report(f"left to another process that is at it: {', '.join(item.label for item in taken)}")
+        except Stopped:
+            return False
+        finally:
+            for one in self._in_hand:
+                one.claim.release()
+        return True
+
+    def _tasks(self, queue: Iterable[WorkItem], taken: list[WorkItem]) -> Iterator[SequenceTask]:
+        """Claim one sequence of the queue after another; those with rows to compute are opened. ``taken`` gets the
+        sequences that another process has. Raises Stopped, FolderError, as :meth:`run`."""
         for item in queue:
-            if self.context.stop():
+            if self.stop():
                 raise Stopped
-            claim = self.folder.claim(item, self.context.launch)
+            claim = self.folder.claim(item, self._launch)
             if claim is None:
                 taken.append(item)
                 continue
-            task = None
+            one = None
             try:
-                task = self._begin(item, claim)
+                one = self._begin(item, claim)
             finally:
-                if task is None:
+                if one is None:
                     claim.release()
-            if task is not None:
-                yield task
+            if one is not None:
+                self._in_hand.append(one)
+                yield one
 
-    def release(self) -> None:
-        """Give up the sequences in hand."""
-        for one in self._in_hand.values():
-            one.claim.release()
-
-    def _begin(self, item: WorkItem, claim: Claim) -> SequenceTask | None:
+    def _begin(self, item: WorkItem, claim: Claim) -> _InHand | None:
         """Open a sequence; None: nothing is to be computed of it."""
-        failure = self.folder.failure(item)
-        if failure is not None and failure.get("launch") == self.context.launch:
+        failure, rows = self.folder.failure(item), self.job.suite.rows
+        if failure is not None and failure.get("launch") == self._launch:
             return None  # of another process of this launch
-        missing = self.folder.missing(item, self.job.suite.rows)
+        missing = self.folder.missing(item, rows)
         if claim.died and missing:
             self._fail(item, DIED, missing)
             return None
         try:
             sequence = item.open()
             digest = content_digest(sequence)
-            landmarks = landmark_digests(self.job.suite.rows, sequence.folder)
+            landmarks = landmark_digests(rows, sequence.folder)
         except (*BROKEN, OSError) as error:
             self._fail(item, error, missing)
             return None
         self.folder.require_same_sequence(item, digest, landmarks)
-        posed = [row for row in self.job.suite.rows if sequence.posed or row.method.fusion == ALONE]
+        posed = [row for row in rows if sequence.posed or row.method.fusion == ALONE]
         possible = [row for row in posed if not _fitted_to(row, digest)]
-        left_out = [row for row in missing if row not in possible]
-        why = (_FITTED if sequence.posed else _NO_POSES).format(len(left_out))
-        one = _InHand(item, claim, digest, landmarks, missing, left_out, why, time.monotonic())
-        if not missing:
-            self._settle(one)
-            return None
         todo = [row for row in missing if row in possible]
-        rows = with_references(todo, possible) if todo else missing
-        sinks = [ExampleWriter(self.folder.place(item))] if self.job.keeps_examples(item) else []
-        task = SequenceTask(sequence, rows, sinks, partial(self.context.progress, item.label))
-        self._in_hand[task] = one
-        return task
+        one = _InHand(
+            sequence=sequence,
+            rows=with_references(todo, possible) if todo else missing,
+            sinks=[ExampleWriter(self.folder.place(item))] if self.job.keeps_examples(item) else [],
+            progress=lambda now: self.progress(item.label, now.done, now.total),
+            item=item,
+            claim=claim,
+            digest=digest,
+            landmarks=landmarks,
+            missing=missing,
+            left_out=[row for row in missing if row not in possible],
+            started=time.monotonic(),
+        )
+        if missing:
+            return one
+        self._settle(one)
+        return None
 
-    def finish(self, task: SequenceTask, outcome: list[RowResult] | Exception) -> None:
+    def _finish(self, one: _InHand, outcome: list[RowResult] | Exception) -> None:
         """Store the missing rows of a sequence, or the reason why they cannot be had."""
-        one = self._in_hand[task]
         if isinstance(outcome, Exception):
             self._fail(one.item, outcome, one.missing)
         else:
             self._store(one, [result for result in outcome if result.row in one.missing])
             frames = outcome[0].frames.get("done", 0) if outcome else 0
             rows, seconds = len(one.missing) - len(one.left_out), time.monotonic() - one.started
-            self.context.report(f"{one.item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
+            self.report(f"{one.item.label}: {rows} rows, {frames} frames, {seconds:.1f} s")
             self._settle(one)
-        del self._in_hand[task]
+        self._in_hand.remove(one)
         one.claim.release()
 
     def _settle(self, one: _InHand) -> None:
         """All possible rows are stored."""
         if one.left_out:
-            self._fail(one.item, one.why, one.left_out)
+            why = _FITTED if one.sequence.posed else _NO_POSES
+            self._fail(one.item, why.format(len(one.left_out)), one.left_out)
         else:
             self.folder.succeeded(one.item)
 
     def _fail(self, item: WorkItem, error: Exception | str, rows: Sequence[Row]) -> None:
         reason = " ".join(str(error).split()) or type(error).__name__
-        self.folder.fail(item, reason, rows, self.context.launch)
-        self.context.report(f"{item.label}: failed: {reason}")
+        self.folder.fail(item, reason, rows, self._launch)
+        self.report(f"{item.label}: failed: {reason}")
 
     def _store(self, one: _InHand, results: Iterable[RowResult]) -> None:
         """Store rows with what they were computed from."""
         item, landmarks = one.item, one.landmarks
-        common = {"versions": versions(), "machine": hardware(), "device": self.job.device, "sequence": one.digest}
-        many: dict[str, Any] = {"streams": self.job.streams} if self.job.streams > 1 else {}
+        common: dict[str, Any] = {"versions": versions(), "machine": hardware(), "device": self.job.device}
+        common |= {"sequence": one.digest, **({"streams": self.job.streams} if self.job.streams > 1 else {})}
         for result in results:
             row, network = result.row, self.networks[result.row.method.base]
+            made_of = {"network": network.digest, "runtime": network.runtime, "threads": torch.get_num_threads()}
             own = {"landmarks": landmarks[row.slug]} if row.slug in landmarks else {}
             record = Record(
                 suite=self.job.suite.name,
@@ -275,14 +290,7 @@ class _Worker:
                 curves=result.curves,
                 state=result.state,
                 ms=result.ms,
-                provenance={
-                    **common,
-                    **many,
-                    "network": network.digest,
-                    "runtime": network.runtime,
-                    "threads": torch.get_num_threads(),
-                    **own,
-                },
+                provenance={**common, **made_of, **own},
             )
             self.folder.keep(item, record, result)
 
@@ -297,9 +305,3 @@ def with_references(missing: Sequence[Row], rows: Sequence[Row]) -> list[Row]:
     """The missing rows and those whose confidence they are judged by, in the order of ``rows``."""
     needed = {*missing, *(reference for row in missing for reference in references(row, rows))}
     return [row for row in rows if row in needed]
-
-
-def failures(folder: EvalFolder, items: Iterable[WorkItem]) -> dict[str, str]:
-    """Why a sequence is broken, by its label."""
-    stored = {item.label: folder.failure(item) for item in items}
-    return {label: str(failure.get("reason")) for label, failure in stored.items() if failure is not None}

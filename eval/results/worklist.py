@@ -61,7 +61,7 @@ class Shard:
 
     def __post_init__(self) -> None:
         if not 1 <= self.index <= self.count:
-            raise ValueError(f"--shard must be 1/n to n/n, got {self.index}/{self.count}")
+            raise ValueError(f"--shard must be 1/n to n/n, got {self}")
 
     @classmethod
     def parse(cls, text: str) -> Shard:
@@ -70,6 +70,9 @@ class Shard:
         if match is None:
             raise ValueError(f"--shard must be i/n, 1/4 to 4/4 for four parts, got {text!r}")
         return cls(int(match[1]), int(match[2]))
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
 
     def of(self, items: Sequence[WorkItem]) -> list[WorkItem]:
         """Its items: every n-th, so that all parts get neighbours of each."""

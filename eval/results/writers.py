@@ -1,4 +1,4 @@
-"""What ``ufmstar run`` leaves on disk: per frame an npz and two 16-bit PNGs, and summary.json.
+"""What ``ufmstar run`` leaves of every frame: an npz and two 16-bit PNGs.
 
 ```
 OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and valid bool, each [H, W]; with
@@ -6,7 +6,6 @@ OUT/frames/NAME.npz   depth [m], variance [m^2], disagreement [m^2] float32 and 
                       posterior also posterior_depth [m] and posterior_variance [m^2]
 OUT/depth/NAME.png    depth, 16 bit, 0 = invalid; metres per count in the PNG's text
 OUT/sigma/NAME.png    standard deviation, likewise
-OUT/summary.json
 ```
 Every file is complete or absent. Nothing here keeps more than one frame in memory.
 """
@@ -14,15 +13,14 @@ Every file is complete or absent. Nothing here keeps more than one frame in memo
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.results.files import write_json_atomic, write_together
+from ufmstar_torch.eval.results.files import write_together
 from ufmstar_torch.eval.sequences.images import read_map
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.
@@ -32,13 +30,6 @@ FULL = 65535
 # the row above, takes six tenths of the time of a choice for every row, and the files are as large.
 PNG_LEVEL = 1
 _AFTER_HEADER = 33  # bytes: signature and IHDR
-
-
-class WrittenFrame(NamedTuple):
-    """Valid pixels of a frame that lie beyond the PNGs' range and are stored as its largest value."""
-
-    depth_saturated: int
-    sigma_saturated: int
 
 
 class FrameWriter:
@@ -72,9 +63,10 @@ class FrameWriter:
         names = sorted(path.stem for path in (self.out_dir / "frames").glob("[!.]*.npz"))
         return [name for name in names if self.finished(name)]
 
-    def write(self, name: str, *, valid: Tensor, **given: Tensor | None) -> WrittenFrame:
+    def write(self, name: str, *, valid: Tensor, **given: Tensor | None) -> dict[str, int]:
         """Write one frame; none of its files appears before all are written. The maps are [H, W]; those that are None
-        are left out, and ``valid`` is True where the pixel was used.
+        are left out, and ``valid`` is True where the pixel was used. Returns how many valid pixels of "depth" and
+        "sigma" lie beyond the PNGs' range and are stored as its largest value.
 
         Raises:
             ValueError: shapes or types disagree.
@@ -101,11 +93,7 @@ class FrameWriter:
                 paths["frames"]: lambda file: np.savez(file, allow_pickle=False, **maps),
             }
         )
-        return WrittenFrame(lost_d, lost_s)
-
-    def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Replace summary.json; the one before stays if that fails. See ``write_json_atomic``."""
-        write_json_atomic(self.out_dir / "summary.json", summary)
+        return {"depth": lost_d, "sigma": lost_s}
 
     def _depth_unit(self, depth: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
         """Metres per count of the depth PNGs, settled by the first frame of the run."""

@@ -1,0 +1,37 @@
+"""How far a command is, for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a command is."""
+
+    stage: str  # "kernels" (compiled on a machine's first run), "rooms", "frames" or "pictures"
+    done: int  # of this stage, skipped frames included
+    total: int  # of this stage
+    components: int | None = None  # of the first UfM* after this frame; None: it was skipped, or nothing is done yet
+    skipped: int = 0  # frames so far
+
+
+class ProgressSink(FrameSink):
+    """Calls ``progress`` at the start and after every frame; ``skipped`` frames came before."""
+
+    def __init__(self, progress: Callable[[Progress], object], skipped: int = 0) -> None:
+        self._progress, self._skipped = progress, skipped
+
+    def begin(self, stream: FrameStream) -> None:
+        self._total = len(stream.indices)
+        self._progress(Progress("frames", stream.position, self._total, None, self._skipped))
+
+    def take(self, result: FrameResult) -> None:
+        self._skipped += bool(result.skipped)
+        known = (row.estimate.statistics for row in result.rows.values())
+        statistics = next((one for one in known if one is not None), None)
+        components = None if statistics is None else int(statistics.components[0])
+        self._progress(Progress("frames", result.number + 1, self._total, components, self._skipped))
