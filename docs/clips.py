@@ -15,6 +15,7 @@ from torch import nn
 
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.sequences import FrameError
+from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour.open import open_sequence
@@ -73,8 +74,7 @@ def clips(arguments: argparse.Namespace) -> Iterator[Clip]:
         for name, path in SHARED.items():
             yield predict(name, str(arguments.root / "data" / path), [network], aleatoric=False)
         return
-    with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
-        members = [member.eval() for member in load_trained([weights])]
+    members = demo_networks()
     first, last = (int(word) for word in arguments.tours.split(":"))
     for seed in range(first, last):
         fov = "" if arguments.fov is None else f"&fov={arguments.fov[(seed - first) % len(arguments.fov)]:g}"
@@ -83,15 +83,25 @@ def clips(arguments: argparse.Namespace) -> Iterator[Clip]:
         yield predict(f"tour {seed}, ensemble", tour, members, aleatoric=True)
 
 
+def demo_networks() -> list[DepthNetwork]:
+    """The networks that come with the package, trained on small rooms."""
+    with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
+        return [member.eval() for member in load_trained([weights])]
+
+
+def readable(sequence: FrameSequence) -> Iterator[Frame]:
+    """The frames of a sequence but those whose files are broken."""
+    for index in range(len(sequence)):
+        try:
+            yield sequence[index]
+        except FrameError:
+            continue
+
+
 def predict(name: str, source: str, members: list[DepthNetwork], *, aleatoric: bool) -> Clip:
     """The members in turn on every frame that can be read; their own variance only if asked for."""
     rows = []
-    sequence = open_sequence(source)
-    for index in range(len(sequence)):
-        try:
-            frame = sequence[index]
-        except FrameError:
-            continue
+    for frame in readable(open_sequence(source)):
         member = members[len(rows) % len(members)]
         image, intrinsics = image_tensor(frame), torch.from_numpy(frame.intrinsics)
         with torch.no_grad():

@@ -7,9 +7,7 @@ python docs/draw_anchors.py --root ../shared --clip fr1/xyz --out fr1_xyz.jpg
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from clips import SHARED, Map
+from clips import SHARED, Map, demo_networks, readable
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -29,14 +27,12 @@ from scipy.stats import spearmanr
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import LandmarkTracker
 from ufmstar_torch.eval.report.outputs import field_of_view
-from ufmstar_torch.eval.sequences import FrameError
-from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
+from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.eval.tour.open import open_sequence
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.trained import load_trained
 
 UNKNOWN = "0.8"  # grey of pixels without ground truth
 DEPTH, ERROR, RATIO = "viridis", "magma", "RdBu"
@@ -100,15 +96,6 @@ def last_shot(sequence: FrameSequence, network: DepthNetwork) -> Shot:
     )
 
 
-def readable(sequence: FrameSequence) -> Iterator[Frame]:
-    """Its frames but those whose files are broken."""
-    for index in range(len(sequence)):
-        try:
-            yield sequence[index]
-        except FrameError:
-            continue
-
-
 def draw(shot: Shot) -> Figure:
     """Above, the relative error: measured at anchors, expected from them, true. Below, sigma beside the true error."""
     height = 2 * 2.3 * shot.image.shape[0] / shot.image.shape[1] + 0.9  # [inches]
@@ -167,12 +154,6 @@ def rms(values: Map, known: NDArray[np.bool_]) -> str:
     return f"RMS {np.sqrt(np.mean(np.square(values[known]))):.2f} m"
 
 
-def demo_network() -> DepthNetwork:
-    """The first of the networks that come with the package, trained on small rooms."""
-    with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
-        return load_trained([weights])[0].eval()
-
-
 def main() -> None:
     """See the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -183,7 +164,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="picture")
     options = parser.parse_args()
     if options.root is None:
-        network, sequence = demo_network(), open_sequence(options.tour)
+        network, sequence = demo_networks()[0], open_sequence(options.tour)
     else:
         network = load_network("fastdepth", options.root / "weights" / "fastdepth_nyu.onnx").eval()
         sequence = open_sequence(str(options.root / "data" / SHARED[options.clip]))

@@ -25,7 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ufmstar_torch.eval.report.style import Style, finish, new_figure, save_figure
+from ufmstar_torch.eval.report.style import Look, finish, new_figure, save_figure
 from ufmstar_torch.gaussian import floor_covariance, pointwise_disagreement, wasserstein_variance
 
 WRONG = 0.6  # [m] of a view's estimate
@@ -45,7 +45,7 @@ WORDS = {
     "D": "C left, B right",
     "E": "A left, B right",
 }
-POINTWISE, GAUSSIAN = Style("#E69F00", "s"), Style("#0072B2", "o")
+LOOKS = {"pointwise": Look("pointwise, √m_p", "#E69F00", "s"), "gaussian": Look("Gaussian, √m_g", "#0072B2", "o")}
 VIEWS = ("#D55E00", "#0072B2")
 
 
@@ -107,17 +107,16 @@ def draw(cases: Mapping[str, Case]) -> Any:
         axes.set(ylim=(DEPTH - 1.6 * WRONG, DEPTH + 1.6 * WRONG))
         finish(axes, title=f"{name}: {WORDS[name]}", x="x [m]", y="z [m]" if column == 0 else "")
     below = figure.add_subplot(grid[1, :])
-    for kind, style in (("pointwise", POINTWISE), ("gaussian", GAUSSIAN)):
+    for kind, look in LOOKS.items():
         points = {name: (case.error, getattr(case, kind) ** 0.5) for name, case in cases.items()}
-        label = "pointwise, √m_p" if kind == "pointwise" else "Gaussian, √m_g"
-        below.plot(*zip(*points.values(), strict=True), **style.line | {"linestyle": ""}, label=label)
+        below.plot(*zip(*points.values(), strict=True), **look.line | {"linestyle": ""})
         named: dict[tuple[float, float], list[str]] = {}
         for name, (x, y) in points.items():
             named.setdefault((round(x, 6), round(y, 6)), []).append(name)
         for place, names in named.items():
             shift = (8, 6) if kind == "gaussian" else (-26, -3)
             words = ", ".join(names)
-            below.annotate(words, place, xytext=shift, textcoords="offset points", color=style.colour)
+            below.annotate(words, place, xytext=shift, textcoords="offset points", color=look.colour)
     below.set_ylim(bottom=-0.08)
     below.plot([0, 1.1 * WRONG], [0, 1.1 * WRONG], linestyle="--", color="0.6", label="as large as the error")
     below.legend(frameon=False, fontsize=8)

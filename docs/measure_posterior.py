@@ -14,14 +14,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import torch
-from clips import line, shown
+from clips import demo_networks, line, shown
 from torch import Tensor
 
 from ufmstar_torch import UfMStar
@@ -37,7 +36,6 @@ from ufmstar_torch.frame import FrameInput, check_frame
 from ufmstar_torch.kernels import posterior_cpu
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.models.trained import load_trained
 from ufmstar_torch.posterior.running import SIZE
 
 SHOWN = ("delta1", "rmse", "ece_delta", "ece_q", "nll", "spearman")
@@ -150,8 +148,7 @@ def scaled(taken: list[Taken], kind: str) -> dict[str, float]:
 
 def recordings(arguments: argparse.Namespace) -> Iterator[tuple[str, list[Taken]]]:
     """Every tour with every network, with its name."""
-    with as_file(files("ufmstar_torch.models") / "weights" / "demo.safetensors") as weights:
-        networks: dict[str, DepthNetwork | None] = {"demo": load_trained([weights])[0].eval(), "made": None}
+    networks: dict[str, DepthNetwork | None] = {"demo": demo_networks()[0], "made": None}
     if arguments.weights is not None:
         networks["FastDepth"] = load_network("fastdepth", arguments.weights).eval()
     for source in arguments.tours:

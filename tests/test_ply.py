@@ -14,7 +14,6 @@ from ufmstar_torch.eval.report.gaussians import (
     OPACITY,
     SIGMA_FLOOR,
     icosphere,
-    read_mixture_npz,
     write_ellipsoids_ply,
     write_mixture_npz,
     write_mixture_ply,
@@ -209,6 +208,14 @@ class TestEllipsoids:
         splats, mesh = parse(tmp_path / "m.ply")[0]["vertex"], parse(tmp_path / "e.ply")[0]["vertex"]
         rgb = 255 * (0.5 + 0.28209479177387814 * stack(splats, "f_dc_0", "f_dc_1", "f_dc_2"))
         np.testing.assert_allclose(stack(mesh, "red", "green", "blue")[::162], rgb, atol=1e-3)
+
+
+def read_mixture_npz(path: Path) -> tuple[GaussianMixture, torch.Tensor | None]:
+    """As a user's program reads it: the fields of a mixture, and the pose."""
+    with np.load(path, allow_pickle=False) as stored:
+        fields = {name: torch.from_numpy(stored[name]) for name in stored.files}
+    T_world_first = fields.pop("T_world_first", None)
+    return GaussianMixture(**fields), T_world_first
 
 
 class TestNpz:

@@ -33,12 +33,12 @@ from ufmstar_torch.eval.report.figures_sweep import Point, draw_changes, draw_sw
 from ufmstar_torch.eval.report.means import difference, mean_of
 from ufmstar_torch.eval.report.names import NLL
 from ufmstar_torch.eval.report.style import (
+    Look,
     label_ends,
+    look_of,
     new_figure,
     save_figure,
-    short_name,
     spread_apart,
-    style_of,
 )
 from ufmstar_torch.eval.report.write import write_report
 
@@ -80,12 +80,12 @@ class TestCalibration:
         assert list(delta) == list(quantile) == ["alone", "UfM-100K", "UfM*"]
         for row in (ALONE, UFM, UFM_STAR):
             curves = results.merged["rooms", row].curves
-            np.testing.assert_array_equal(quantile[short_name(row.method)].get_ydata(), curves["ece_q_observed"])
+            np.testing.assert_array_equal(quantile[look_of(row.method).name].get_ydata(), curves["ece_q_observed"])
             pixels = np.array(curves["ece_delta_pixels"])
             kept = pixels > 0.001 * pixels.sum()
-            line = delta[short_name(row.method)]
+            line = delta[look_of(row.method).name]
             np.testing.assert_array_equal(line.get_ydata(), np.array(curves["ece_delta_accuracy"], float)[kept])
-            assert line.get_color() == style_of(row.method).colour
+            assert line.get_color() == look_of(row.method).colour
         assert list(drawn(shown[1])) == ["UfM*"]  # a network of depth alone has no variance of its own
         assert set(words(shown[0])) == {"alone", "UfM-100K", "UfM*", "exactly right"}
 
@@ -124,7 +124,7 @@ class TestError:
         ]
         for axes, reference in zip(shown, ("Ensemble", "UfM-Ensemble-100K"), strict=True):
             for row in (ALONE, UFM, UFM_STAR):
-                line = drawn(axes)[row.method.name]
+                line = drawn(axes)[look_of(row.method).name]
                 expected = results.merged["rooms", row].curves[f"nll_by_error:{reference}"]
                 np.testing.assert_array_equal(line.get_ydata(), expected)
                 np.testing.assert_array_equal(line.get_xdata(), np.arange(5, 100, 10))
@@ -201,14 +201,14 @@ class TestSweeps:
     def test_lines_bands_and_the_base_alone(self, swept):
         figure = draw_sweep(swept, "ensemble", "rotation_noise")
         above, below = figure.axes[0], figure.axes[3]
-        line, dashed = drawn(above)["UfM*-Ensemble"], drawn(above)["alone"]
+        line, dashed = drawn(above)["UfM*"], drawn(above)["alone"]
         np.testing.assert_allclose(line.get_xdata(), [0, 2, 5])
         np.testing.assert_allclose(line.get_ydata(), [5.0, 5.2, 5.5])
         assert (dashed.get_linestyle(), set(dashed.get_ydata())) == ("--", {7.0})
         half = mean_of(points_of(swept)[0].records, NLL).half
         band = above.collections[0].get_paths()[0].vertices
         assert band[:, 1].min() == pytest.approx(5.0 - half)
-        np.testing.assert_allclose(drawn(below)["UfM*-Ensemble"].get_ydata(), [0, 0.2, 0.5], atol=1e-12)
+        np.testing.assert_allclose(drawn(below)["UfM*"].get_ydata(), [0, 0.2, 0.5], atol=1e-12)
         assert figure.axes[-1].get_xlabel() == "rotation noise [°]"
 
     def test_left_out_images_are_paired_with_the_base_on_the_same(self):
@@ -219,7 +219,7 @@ class TestSweeps:
             figures[Row(ALONE.method, Setting(skip=skip)), ("d", "s")] = {"nll": alone}
         figure = draw_sweep(in_memory(figures), "ensemble", "skip")
         assert list(drawn(figure.axes[0])["alone"].get_ydata()) == [3.0, 3.5, 2.6]
-        np.testing.assert_allclose(drawn(figure.axes[3])["UfM*-Ensemble"].get_ydata(), [-2.0, -1.5, -0.1])
+        np.testing.assert_allclose(drawn(figure.axes[3])["UfM*"].get_ydata(), [-2.0, -1.5, -0.1])
 
     def test_changes_of_every_setting(self):
         either = Row(UFM_STAR.method, Setting({"segment.prune": "either"}))
@@ -230,7 +230,7 @@ class TestSweeps:
         axes = figure.axes[0]
         point = axes.lines[1]  # after the line at 0
         assert point.get_xdata()[0] == pytest.approx(0.105)
-        assert point.get_markerfacecolor() == style_of(either.method).colour  # beyond its interval: filled
+        assert point.get_markerfacecolor() == look_of(either.method).colour  # beyond its interval: filled
         assert [label.get_text() for label in axes.get_yticklabels()] == ["pruning rule either"]
         assert draw_changes(in_memory({(UFM_STAR, ("d", "a")): {"nll": 1.0}}), "ensemble") is None
 
@@ -283,9 +283,9 @@ class TestStyle:
     def test_every_kind_of_method_has_a_look_of_its_own(self):
         kinds = ["Ensemble", "UfM-Ensemble", "UfM-Ensemble-100K", "UfM-FullEnsemble", "UfM*-Ensemble"]
         kinds += ["UfM*-FullEnsemble", "UfM*-Ensemble-fixed-param"]
-        styles = [style_of(Method.parse(name)) for name in kinds]
+        styles = [look_of(Method.parse(name)) for name in kinds]
         assert len({s.colour for s in styles}) == len({s.marker for s in styles}) == len(kinds)
-        assert {style_of(Method(base)) for base in BASES} == {styles[0]}  # the same whatever the network
+        assert {look_of(Method(base)) for base in BASES} == {styles[0]}  # the same whatever the network
 
     def test_the_same_figure_gives_the_same_file_and_no_global_state(self, tmp_path):
         import matplotlib
@@ -295,7 +295,7 @@ class TestStyle:
             figure = new_figure(3, 2, "title")
             axes = figure.subplots()
             axes.plot([0, 1], [0, 1])
-            label_ends(axes, [(1.0, "line", "red")])
+            label_ends(axes, [(1.0, Look("line", "red"))])
             save_figure(figure, tmp_path / name)
         assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
         assert dict(matplotlib.rcParams) == before

@@ -16,7 +16,6 @@ from evaluations import HOSTILE, KITCHEN, LATER, TITLE, in_memory, rows_of, writ
 
 from ufmstar_torch import cli
 from ufmstar_torch.eval.metrics import mean_and_ci
-from ufmstar_torch.eval.report import write as write_module
 from ufmstar_torch.eval.report.data import Failed, Results
 from ufmstar_torch.eval.report.findings import best_rows, caveats, compare, comparisons, headlines
 from ufmstar_torch.eval.report.page import command, write_page
@@ -284,7 +283,7 @@ class TestPage:
         def broken(*_: object) -> None:
             raise ValueError("no <b>such</b> glyph")
 
-        monkeypatch.setattr(write_module, "draw_entropy", broken)
+        monkeypatch.setattr("ufmstar_torch.eval.report.figures_curves.draw_entropy", broken)
         assert cli.main(["report", str(out)]) == 0
         assert "figure not drawn: entropy ensemble: no <b>such</b> glyph\n" in capsys.readouterr().out
         page = Page((out / "report.html").read_text(encoding="utf-8"))

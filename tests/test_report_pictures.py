@@ -47,10 +47,8 @@ from ufmstar_torch.eval.report.rooms import (
     SIGMAS,
     Projection,
     Snapshot,
-    below_ceiling,
     choose_times,
     draw_room,
-    far_to_near,
     find_rooms,
     project,
     views_of,
@@ -279,17 +277,30 @@ def snapshot(frame: str, mean: list[list[float]], m: list[float], sigma: float =
 
 
 class TestRooms:
-    def test_the_nearest_is_painted_last(self) -> None:
-        view = Projection(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), "")  # seen from -y
-        painted = far_to_near(view, snapshot("f", [[1, -2, 0], [2, 5, 0], [3, 0, 0]], [0, 0, 0]))
-        assert painted.mean[:, 0].tolist() == [2, 3, 1]
+    def pixels(self, path: Path, snapshots: list[Snapshot], *roots: float) -> int:
+        """Pixels of the view from above where Gaussians of these sqrt(m) [m] lie on each other, the last one on top."""
+        scale = draw_room(path, snapshots, "room")
+        colour = np.full(3, 255.0)
+        for root in roots:
+            colour = 0.85 * scale.rgb(np.array(root)).astype(float) + 0.15 * colour
+        with Image.open(path) as picture:
+            drawn = np.asarray(picture.convert("RGB")).astype(int)
+        above = drawn[70 : len(drawn) // 2, :, :]  # below the title
+        return int((np.abs(above - colour).max(-1) <= 2).sum())
 
-    def test_the_ceiling_is_taken_off(self) -> None:
-        up = np.array([0.0, 0.0, 1.0])
-        one = snapshot("f", [[0, 0, 0.2], [0, 0, 1.0]], [1.0, 2.0])
-        higher = replace(one, path=np.array([[0, 0, 0.9]]))
-        assert below_ceiling(one, up, [one]).disagreement.tolist() == [1.0]
-        assert below_ceiling(one, up, [one, higher]).disagreement.tolist() == [1.0, 2.0]
+    def test_the_nearest_is_painted_last(self, tmp_path: Path) -> None:
+        near, far = ([0.0, 0.0, 2.0], 4.0), ([0.0, 2.0, 2.0], 0.25)  # seen from -y
+        for one, other in ((near, far), (far, near)):
+            room = [snapshot("f", [one[0], other[0]], [one[1], other[1]])]
+            assert self.pixels(tmp_path / "r.png", room, 0.5, 2.0) > 300
+            assert self.pixels(tmp_path / "r.png", room, 2.0, 0.5) == 0
+
+    def test_the_ceiling_is_taken_off(self, tmp_path: Path) -> None:
+        one = snapshot("f", [[0, 0.2, 2], [2, -1.0, 2]], [0.25, 4.0])  # up is -y
+        higher = replace(one, path=np.array([[0, -0.9, 0]]))
+        assert self.pixels(tmp_path / "r.png", [one], 0.5) > 300
+        assert self.pixels(tmp_path / "r.png", [one], 2.0) == 0
+        assert self.pixels(tmp_path / "r.png", [higher], 2.0) > 300
 
     def test_same_scale_at_all_times_and_colours_of_root_m(self, tmp_path: Path) -> None:
         times = [snapshot("0", [[0, 0, 2]], [0.25]), snapshot("1", [[0, 0, 2], [2, 0, 2]], [0.25, 4.0])]

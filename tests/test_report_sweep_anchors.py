@@ -119,14 +119,14 @@ def test_pose_noise_has_lines_of_both_and_their_difference_at_the_same_value(res
     assert titles[5] == "difference to UfM* in ECE_δ, in pairs"
     above, below = drawn(figure.axes[1]), drawn(figure.axes[5])
     values = ROTATION_DRIFTS
-    plain, anchored = above["UfM*-DepthOnly"], above["UfM*-DepthOnly anchored"]
+    plain, anchored = above["UfM*"], above["anchored"]
     rows = [[row(rotation_drift=v, **more) for v in values] for more in ({}, {"anchors": "tracked"})]
     expected = [[np.mean([error(r, p) for p in SEQUENCES.values()]) for r in line] for line in rows]
     np.testing.assert_allclose(plain.get_xdata(), values)
     np.testing.assert_allclose([plain.get_ydata(), anchored.get_ydata()], expected)
     assert plain.get_color() != anchored.get_color()
-    assert set(below) == {"UfM*-DepthOnly anchored"}, "nothing is compared with itself"
-    np.testing.assert_allclose(below["UfM*-DepthOnly anchored"].get_ydata(), np.subtract(*expected[::-1]))
+    assert set(below) == {"anchored"}, "nothing is compared with itself"
+    np.testing.assert_allclose(below["anchored"].get_ydata(), np.subtract(*expected[::-1]))
     assert ends(figure.axes[1]) == {"UfM*", "anchored"}
     assert figure.axes[5].get_xlabel() == "rotation drift [°/√frame]"
 
@@ -146,14 +146,14 @@ def test_the_band_of_a_line_with_anchors_is_its_interval(results):
 def test_what_only_anchors_have_stands_beside_plain_ufm_star(results, name):
     figure = draw_sweep(results, "depth_only", name)
     above, below = drawn(figure.axes[1]), drawn(figure.axes[5])
-    level_line = above["UfM*-DepthOnly"]
+    level_line = above["UfM*"]
     assert level_line.get_linestyle() == "--"
     np.testing.assert_allclose(level_line.get_ydata(), 0.5)
     assert "UfM*" in ends(figure.axes[1])
-    change = below["UfM*-DepthOnly anchored"].get_ydata()
+    change = below["anchored"].get_ydata()
     if name == "anchor_count":
         np.testing.assert_allclose(change, [0, -0.0125, -0.05, -0.25], atol=1e-12)
-        np.testing.assert_allclose(below["UfM*-DepthOnly truth anchors"].get_ydata()[[0, 3, 4]], [0, -0.375, -0.375])
+        np.testing.assert_allclose(below["truth anchors"].get_ydata()[[0, 3, 4]], [0, -0.375, -0.375])
     else:
         np.testing.assert_allclose(change, -0.25)
 
@@ -176,7 +176,7 @@ def test_seeds_of_a_noise_are_one_point():
     # Without plain UfM*, the difference is to the line's own default.
     below = draw_sweep(result, "depth_only", "rotation_drift").axes[4]
     assert below.get_title(loc="left") == "difference to the default in NLL, in pairs"
-    assert drawn(below)["UfM*-DepthOnly anchored"].get_ydata()[0] == 0
+    assert drawn(below)["anchored"].get_ydata()[0] == 0
 
 
 def test_words_and_switches_are_no_values():

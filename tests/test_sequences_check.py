@@ -13,6 +13,7 @@ from ufmstar_torch.eval.check.check import check_sequence
 from ufmstar_torch.eval.check.depth_image_fit import depth_edges, depth_image_fit
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.eval.sequences.ground_truth import register_depth
+from ufmstar_torch.eval.sequences.poses import CONVENTIONS
 
 SIZE = (120, 160)
 
@@ -47,7 +48,7 @@ def test_a_wrong_depth_scale_is_recognised(walk, factor):
 def test_both_at_once(walk):
     result = check_sequence(with_poses(open_sequence(walk, depth_scale=2e-3), np.linalg.inv))
     assert len(result.problems) == 2
-    assert "inverted" in result.reading
+    assert "inverted" in CONVENTIONS[result.poses].description
     assert result.scale == pytest.approx(0.5, rel=0.05)
     assert result.best_error < 0.01 < result.error
 
@@ -78,7 +79,7 @@ def test_every_generated_layout_is_consistent(tmp_path, writer):
     result = check_sequence(open_sequence(path))
     assert result.ok
     assert result.error < 0.02
-    assert "camera-to-world, x right" in result.reading
+    assert "camera-to-world, x right" in CONVENTIONS[result.poses].description
     if writer == "write_seven_scenes":
         own = check_sequence(open_sequence(path, register=False))
         assert own.ok

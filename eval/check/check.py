@@ -47,11 +47,6 @@ class SequenceCheck:
     undecided: tuple[str, ...]  # what this sequence leaves open
 
     @property
-    def reading(self) -> str:
-        """The reading of the poses in words."""
-        return CONVENTIONS[self.poses].description
-
-    @property
     def ok(self) -> bool:
         """Whether no problem was detected (something may still be undecided)."""
         return not self.problems
@@ -69,30 +64,17 @@ class _Pair:
 
 
 def check_sequence(sequence: FrameSequence, pairs: int = 8) -> SequenceCheck:
-    """Checks pose convention, depth scale and registration on evenly spaced pairs of frames.
+    """Check pose convention, depth scale and registration on evenly spaced pairs of frames.
 
-    Of a sequence without poses only the registration is checked; there are no pairs then, and ``error`` is NaN.
-
-    Args:
-        sequence: at least two frames with depth (or one, without poses).
-        pairs: how many pairs to compare, at least 1.
-
-    Raises:
-        ValueError: fewer than two frames with depth can be read; ``pairs`` is not positive.
+    Of a sequence without poses only the registration is checked; there are no pairs then, and ``error`` is NaN. Raises
+    ValueError: fewer than two frames with depth (one, without poses) can be read; ``pairs`` is not positive.
     """
     if pairs < 1:
         raise ValueError(f"pairs must be at least 1, got {pairs}")
-    unreadable: list[str] = []
-    if sequence.posed:
-        figures, problems, undecided = _geometry(sequence, pairs, unreadable)
-    else:
-        figures = (0, 0, float("nan"), OURS, 1.0, float("nan"))
-        problems, undecided = [], ["there are no poses: methods that compare views cannot be run"]
-    registration = _registration(sequence, unreadable)
-    if registration is not None:
-        wrong, open_ = _registration_verdict(registration)
-        problems, undecided = problems + wrong, undecided + open_
-    return SequenceCheck(*figures, registration, tuple(dict.fromkeys(unreadable)), tuple(problems), tuple(undecided))
+    check = _Check(sequence)
+    figures, registration = check.geometry(pairs), check.registration()
+    unreadable = tuple(dict.fromkeys(check.unreadable))
+    return SequenceCheck(*figures, registration, unreadable, tuple(check.problems), tuple(check.undecided))
 
 
 def warp_error(pair: _Pair, poses: str, scale: float) -> float:
@@ -118,44 +100,97 @@ def warp_error(pair: _Pair, poses: str, scale: float) -> float:
     return float(np.median(np.abs(np.log(z[inside][valid] / depth_there[valid]))))
 
 
-def _geometry(
-    sequence: FrameSequence, count: int, unreadable: list[str]
-) -> tuple[tuple[int, int, float, str, float, float], list[str], list[str]]:
-    """The first six fields of the outcome, problems and undecided questions of poses and depth scale."""
-    errors: dict[str, np.ndarray] = {}
-    pairs: list[_Pair] = []
-    gap = 0
-    for gap in (gap for gap in _GAPS if gap < len(sequence)):
-        first = np.unique(np.linspace(0, len(sequence) - 1 - gap, count).astype(int)).tolist()
-        read = [(_read(sequence, i, unreadable), _read(sequence, i + gap, unreadable)) for i in first]
-        pairs = [_pair(*a, *b) for a, b in read if a is not None and b is not None]
-        errors = {name: _errors(pairs, name, _SCALES) for name in CONVENTIONS} if pairs else {}
-        if any(np.isfinite(curve).any() for curve in errors.values()):
-            break
-    if not pairs:
-        raise ValueError(f"sequence {sequence.name!r} has no two readable frames with depth to compare")
-    poses = min(errors, key=lambda name: float(errors[name].min()))
-    around = _SCALES[int(np.argmin(errors[poses]))]
-    fine = around * 10.0 ** np.linspace(-0.125, 0.125, 21)
-    fine_errors = _errors(pairs, poses, fine)
-    scale, best = float(fine[int(np.argmin(fine_errors))]), float(fine_errors.min())
-    given = float(_errors(pairs, OURS, np.ones(1))[0])
-    if _as_good(given, best):
-        poses = OURS
-    if _as_good(float(_errors(pairs, poses, np.ones(1))[0]), best):
-        scale = 1.0
-    figures = (len(pairs), gap, given, poses, scale, best)
-    return figures, *_geometry_verdict(errors, given, best, poses, scale)
+class _Check:
+    """A check in progress: files that could not be decoded, problems and undecided questions so far."""
 
+    def __init__(self, sequence: FrameSequence) -> None:
+        self.sequence = sequence
+        self.unreadable: list[str] = []
+        self.problems: list[str] = []
+        self.undecided: list[str] = []
 
-def _read(sequence: FrameSequence, index: int, unreadable: list[str]) -> tuple[Frame, np.ndarray] | None:
-    """A frame and its depth, if it has any; one that cannot be decoded is noted."""
-    try:
-        frame = sequence[index]
-    except FrameError as error:
-        unreadable.append(str(error))
-        return None
-    return None if frame.depth is None or not (frame.depth > 0).any() else (frame, frame.depth)
+    def geometry(self, count: int) -> tuple[int, int, float, str, float, float]:
+        """Check poses and depth scale; the first six fields of the outcome."""
+        if not self.sequence.posed:
+            self.undecided.append("there are no poses: methods that compare views cannot be run")
+            return 0, 0, float("nan"), OURS, 1.0, float("nan")
+        errors: dict[str, np.ndarray] = {}
+        pairs: list[_Pair] = []
+        gap = 0
+        for gap in (gap for gap in _GAPS if gap < len(self.sequence)):
+            first = np.unique(np.linspace(0, len(self.sequence) - 1 - gap, count).astype(int)).tolist()
+            read = [(self._read(i), self._read(i + gap)) for i in first]
+            pairs = [_pair(*a, *b) for a, b in read if a is not None and b is not None]
+            errors = {name: _errors(pairs, name, _SCALES) for name in CONVENTIONS} if pairs else {}
+            if any(np.isfinite(curve).any() for curve in errors.values()):
+                break
+        if not pairs:
+            raise ValueError(f"sequence {self.sequence.name!r} has no two readable frames with depth to compare")
+        poses = min(errors, key=lambda name: float(errors[name].min()))
+        around = _SCALES[int(np.argmin(errors[poses]))]
+        fine = around * 10.0 ** np.linspace(-0.125, 0.125, 21)
+        fine_errors = _errors(pairs, poses, fine)
+        scale, best = float(fine[int(np.argmin(fine_errors))]), float(fine_errors.min())
+        given = float(_errors(pairs, OURS, np.ones(1))[0])
+        if _as_good(given, best):
+            poses = OURS
+        if _as_good(float(_errors(pairs, poses, np.ones(1))[0]), best):
+            scale = 1.0
+        self._judge_geometry(errors, given, best, poses, scale)
+        return len(pairs), gap, given, poses, scale, best
+
+    def registration(self) -> DepthImageFit | None:
+        """Check how depth lies on the image, where the depth maps claim to lie there."""
+        if self.sequence.depth_intrinsics is not None:
+            return None
+        indices = np.unique(np.linspace(0, len(self.sequence) - 1, _REGISTRATION_FRAMES).astype(int))
+        frames = [self._read(int(i)) for i in indices]
+        both = [(one[0].image, one[1]) for one in frames if one is not None and one[0].image is not None]
+        if not both:
+            return None
+        fit = depth_image_fit(both)
+        if fit.edges < _MIN_EDGES or fit.contrast < _MIN_CONTRAST:
+            self.undecided.append("too few edges, or too many, to tell whether depth is registered to the images")
+        elif fit.quality < _NOT_ALIGNED:
+            zoomed = f"zoomed by {fit.zoom:.2f} and shifted by ({fit.shift_x:.0f}, {fit.shift_y:.0f}) px"
+            self.problems.append(f"depth looks not registered to the images: {zoomed} its edges fit better")
+        elif fit.quality < _ALIGNED:
+            self.undecided.append("depth edges meet image edges too weakly to tell whether depth is registered")
+        return fit
+
+    def _read(self, index: int) -> tuple[Frame, np.ndarray] | None:
+        """A frame and its depth, if it has any; one that cannot be decoded is noted."""
+        try:
+            frame = self.sequence[index]
+        except FrameError as error:
+            self.unreadable.append(str(error))
+            return None
+        return None if frame.depth is None or not (frame.depth > 0).any() else (frame, frame.depth)
+
+    def _judge_geometry(
+        self, errors: dict[str, np.ndarray], given: float, best: float, poses: str, scale: float
+    ) -> None:
+        """Note problems and undecided questions of poses and depth scale."""
+        if not np.isfinite(best):
+            self.problems.append("no two frames overlap under any reading of the poses")
+            return
+        as_given = f"by {given:.1%} as given" if np.isfinite(given) else "as given frames do not overlap"
+        measured = f"warped depth is off by {best:.1%} then, {as_given}"
+        if best > _MAX_ERROR:
+            self.problems.append(f"depth and poses disagree under every reading tried ({measured})")
+            return
+        if poses != OURS:
+            self.problems.append(f"the poses look {CONVENTIONS[poses].description} ({measured})")
+        if not 1 / _SCALE_TOLERANCE < scale < _SCALE_TOLERANCE:
+            size = "small" if scale > 1 else "large"
+            self.problems.append(f"depth looks too {size}: times {scale:.3g} fits ({measured})")
+        alike = [name for name in errors if name != poses and _as_good(float(errors[name].min()), best)]
+        if alike:
+            others = ", or ".join(CONVENTIONS[name].description for name in alike)
+            self.undecided.append(f"the motion does not tell the poses from {others}")
+        fitting = _SCALES[[_as_good(float(error), best) for error in errors[poses]]]
+        if fitting.size and fitting.max() / fitting.min() > 4:
+            self.undecided.append("the motion is too small, beside the depth, to tell the depth's scale")
 
 
 def _pair(first: Frame, first_depth: np.ndarray, second: Frame, second_depth: np.ndarray) -> _Pair:
@@ -172,53 +207,5 @@ def _errors(pairs: list[_Pair], poses: str, scales: np.ndarray) -> np.ndarray:
     return np.median([[warp_error(pair, poses, scale) for scale in scales] for pair in pairs], axis=0)
 
 
-def _registration(sequence: FrameSequence, unreadable: list[str]) -> DepthImageFit | None:
-    """Fit of depth and image, where the depth maps claim to lie on the images."""
-    if sequence.depth_intrinsics is not None:
-        return None
-    indices = np.unique(np.linspace(0, len(sequence) - 1, _REGISTRATION_FRAMES).astype(int))
-    frames = [_read(sequence, int(i), unreadable) for i in indices]
-    both = [(one[0].image, one[1]) for one in frames if one is not None and one[0].image is not None]
-    return depth_image_fit(both) if both else None
-
-
 def _as_good(error: float, best: float) -> bool:
     return error <= max(_SAME_FACTOR * best, best + _SAME_ERROR)
-
-
-def _geometry_verdict(
-    errors: dict[str, np.ndarray], given: float, best: float, poses: str, scale: float
-) -> tuple[list[str], list[str]]:
-    """Problems and undecided questions of poses and depth scale."""
-    problems: list[str] = []
-    undecided: list[str] = []
-    if not np.isfinite(best):
-        return ["no two frames overlap under any reading of the poses"], undecided
-    as_given = f"by {given:.1%} as given" if np.isfinite(given) else "as given frames do not overlap"
-    measured = f"warped depth is off by {best:.1%} then, {as_given}"
-    if best > _MAX_ERROR:
-        return [f"depth and poses disagree under every reading tried ({measured})"], undecided
-    if poses != OURS:
-        problems.append(f"the poses look {CONVENTIONS[poses].description} ({measured})")
-    if not 1 / _SCALE_TOLERANCE < scale < _SCALE_TOLERANCE:
-        problems.append(f"depth looks too {'small' if scale > 1 else 'large'}: times {scale:.3g} fits ({measured})")
-    alike = [name for name in errors if name != poses and _as_good(float(errors[name].min()), best)]
-    others = [CONVENTIONS[name].description for name in alike]
-    if others:
-        undecided.append(f"the motion does not tell the poses from {', or '.join(others)}")
-    fitting = _SCALES[[_as_good(float(error), best) for error in errors[poses]]]
-    if fitting.size and fitting.max() / fitting.min() > 4:
-        undecided.append("the motion is too small, beside the depth, to tell the depth's scale")
-    return problems, undecided
-
-
-def _registration_verdict(registration: DepthImageFit) -> tuple[list[str], list[str]]:
-    """Problems and undecided questions of the fit of depth and image."""
-    if registration.edges < _MIN_EDGES or registration.contrast < _MIN_CONTRAST:
-        return [], ["too few edges, or too many, to tell whether depth is registered to the images"]
-    if registration.quality < _NOT_ALIGNED:
-        shift = f"({registration.shift_x:.0f}, {registration.shift_y:.0f}) px"
-        zoomed = f"zoomed by {registration.zoom:.2f} and shifted by {shift} its edges fit better"
-        return [f"depth looks not registered to the images: {zoomed}"], []
-    weak = "depth edges meet image edges too weakly to tell whether depth is registered"
-    return [], [weak] if registration.quality < _ALIGNED else []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -76,9 +76,7 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         sequence = open_sequence(path, **options)
     except (FrameError, FileNotFoundError, ImportError, ValueError) as error:
         return DataReport(name or Path(path).name, str(path), problems=(f"cannot be opened: {error}",))
-    depth_range, filled = _depth_statistics(sequence)
     positions = np.array([entry.T_world_cam[:3, 3] for entry in sequence.entries])
-    problems, remedies, undecided, checked = _verdict(sequence, path, pairs, options)
     return DataReport(
         name=name or sequence.name,
         path=str(path),
@@ -93,19 +91,13 @@ def check_data(path: str | Path, name: str | None = None, pairs: int = 8, **opti
         depth_size=sequence.depth_size,
         intrinsics=_pinhole(sequence.intrinsics),
         depth_intrinsics=None if sequence.depth_intrinsics is None else _pinhole(sequence.depth_intrinsics),
-        depth_range=depth_range,
-        filled=filled,
-        checked=checked,
-        problems=tuple(problems),
-        remedies=tuple(remedies),
-        undecided=tuple(undecided),
+        **_depth_statistics(sequence),
+        **_verdict(sequence, path, pairs, options),
     )
 
 
-def _verdict(
-    sequence: FrameSequence, path: str | Path, pairs: int, options: Mapping[str, Any]
-) -> tuple[list[str], list[str], list[str], dict[str, Any]]:
-    """Problems, remedies, what is undecided, and the check's figures."""
+def _verdict(sequence: FrameSequence, path: str | Path, pairs: int, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The last four fields of the report."""
     problems: list[str] = []
     remedies: list[str] = []
     if len(sequence) < _FEW * len(sequence.names_on_disk):
@@ -114,7 +106,8 @@ def _verdict(
     try:
         outcome = check_sequence(sequence, pairs)
     except ValueError as error:
-        return problems, remedies, [f"nothing was compared: {error}"], {}
+        undecided = (f"nothing was compared: {error}",)
+        return {"problems": tuple(problems), "remedies": tuple(remedies), "undecided": undecided}
     read, broken = _read_frames(sequence)
     if broken:
         problems.append(f"{len(broken)} of the {read} frames read cannot be decoded, first {broken[0]}")
@@ -122,8 +115,10 @@ def _verdict(
     problems += outcome.problems
     remedies += _remedies(outcome, sequence, path, options)
     figures = ("pairs", "gap", "error", "poses", "scale", "best_error", "registration")
-    measured = {name: value for name, value in asdict(outcome).items() if name in figures}
-    return problems, remedies, list(outcome.undecided), {**measured, "read": read, "unreadable": broken}
+    checked = {name: value for name, value in asdict(outcome).items() if name in figures}
+    checked |= {"read": read, "unreadable": broken}
+    words = {"problems": tuple(problems), "remedies": tuple(remedies), "undecided": outcome.undecided}
+    return {"checked": checked, **words}
 
 
 def _remedies(check: SequenceCheck, sequence: FrameSequence, path: str | Path, options: Mapping[str, Any]) -> list[str]:
@@ -195,8 +190,8 @@ def _read_frames(sequence: FrameSequence) -> tuple[int, list[str]]:
     return len(chosen), broken
 
 
-def _depth_statistics(sequence: FrameSequence) -> tuple[tuple[float, ...] | None, float]:
-    """Quantiles of depth [m] and the share of valid pixels, over evenly spaced frames."""
+def _depth_statistics(sequence: FrameSequence) -> dict[str, Any]:
+    """Quantiles of depth [m] and the share of valid pixels, over evenly spaced frames; {} without any."""
     with_depth = [entry for entry in sequence.entries if entry.load_depth is not None]
     values, pixels = [], 0
     for i in np.unique(np.linspace(0, len(with_depth) - 1, min(_SAMPLED, len(with_depth))).astype(int)):
@@ -210,9 +205,80 @@ def _depth_statistics(sequence: FrameSequence) -> tuple[tuple[float, ...] | None
             pixels += depth.size
     depths = np.concatenate(values) if values else np.zeros(0)
     if depths.size == 0:
-        return None, 0.0
-    return tuple(float(q) for q in np.quantile(depths, _QUANTILES)), depths.size / pixels
+        return {}
+    low_high = tuple(float(q) for q in np.quantile(depths, _QUANTILES))
+    return {"depth_range": low_high, "filled": depths.size / pixels}
 
 
 def _pinhole(K: np.ndarray) -> tuple[float, ...]:
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+
+
+# ---- in words: a page for one sequence, a line each for several ----
+
+
+def page(report: DataReport) -> str:
+    """Everything about one sequence, several lines."""
+    if not report.layout:
+        return "\n".join([f"{report.name}: {report.path}", *_problems(report), _end(report)])
+    lines = [
+        f"{report.name}: layout {report.layout}, {report.frames} of {report.on_disk} frames usable",
+        *(f"  skipped       {n} x {reason}" for reason, n in report.skipped.items()),
+        f"  images        {_size(report.image_size)}, {_camera(report.intrinsics)}",
+        f"  depth         {_depth(report)}",
+        f"  poses         {f'path of {report.walked:.1f} m' if report.posed else 'none: single images'}",
+    ]
+    if report.checked and report.posed:
+        pairs, gap, error = (report.checked[key] for key in ("pairs", "gap", "error"))
+        fit = f"off by {error:.1%}" if error < float("inf") else "does not overlap"
+        lines.append(f"  geometry      depth warped {_count(gap, 'frame')} on {fit} ({_count(pairs, 'pair')})")
+    lies = report.checked.get("registration")
+    if lies is not None:
+        lines.append(f"  registration  {lies['quality']:.2f} of 1: how well depth edges meet image edges as they are")
+    lines += [f"  undecided     {text}" for text in report.undecided]
+    return "\n".join([*lines, *_problems(report), _end(report)])
+
+
+def lines(reports: Sequence[DataReport]) -> str:
+    """Several sequences, a line each, and how many are fine."""
+    fine = sum(report.ok for report in reports)
+    return "\n".join([*map(_line, reports), f"{fine} of {len(reports)} sequences are fine"])
+
+
+def _line(report: DataReport) -> str:
+    if report.ok:
+        error = report.checked.get("error")
+        fit = f", depth fits to {error:.1%}" if error is not None and report.posed else ""
+        return f"fine     {report.name}: {report.layout}, {report.frames} of {report.on_disk} frames{fit}"
+    remedy = f" -> {'; '.join(report.remedies)}" if report.remedies else ""
+    return f"PROBLEM  {report.name}: {' '.join('; '.join(report.problems).split())}{remedy}"
+
+
+def _problems(report: DataReport) -> list[str]:
+    return [f"  PROBLEM       {text}" for text in report.problems] + [f"  remedy        {t}" for t in report.remedies]
+
+
+def _end(report: DataReport) -> str:
+    return "fine" if report.ok else _count(len(report.problems), "problem")
+
+
+def _size(size: tuple[int, int] | None) -> str:
+    return "of unknown size" if size is None else f"{size[1]}x{size[0]}"
+
+
+def _camera(values: tuple[float, ...]) -> str:
+    return "fx {:.1f} fy {:.1f} cx {:.1f} cy {:.1f} px".format(*values)
+
+
+def _depth(report: DataReport) -> str:
+    if report.depth_range is None:
+        return "none"
+    low, high = report.depth_range
+    maps = f"{_size(report.depth_size)}, {low:.2f} to {high:.2f} m, {report.filled:.0%} of the pixels"
+    camera = "" if report.depth_intrinsics is None else f", a camera of its own: {_camera(report.depth_intrinsics)}"
+    missing = f", {_count(report.without_depth, 'frame')} without" if report.without_depth else ""
+    return maps + camera + missing
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

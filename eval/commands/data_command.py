@@ -54,7 +54,7 @@ def read(words: Sequence[str]) -> CheckOptions:
 
 def main(options: CheckOptions) -> int:
     """Check, and print what was found; the exit code."""
-    from ufmstar_torch.eval.check.report import lines, page
+    from ufmstar_torch.eval.check.data_check import lines, page
 
     try:
         reports, several = _check(options)

@@ -46,13 +46,18 @@ def read(words: Sequence[str]) -> RecalibrateOptions:
 
 def main(options: RecalibrateOptions) -> int:
     """Fit, write the file, and print how well it fits sequences that it was not fitted to; the exit code."""
+    from ufmstar_torch.eval.methods.method import UFM_STAR
     from ufmstar_torch.eval.metrics.recalibration import fit
     from ufmstar_torch.eval.report.data import load_results
     from ufmstar_torch.eval.report.text import aligned
 
     try:
         results = load_results(options.out, with_sums=False)
-        row = _row(results, options.row)
+        rows = [row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration]
+        row = next((row for row in rows if row.label == options.row), None)
+        if row is None:
+            known = ", ".join(row.label for row in rows) or "(none: no row of UfM*)"
+            raise ValueError(f"--row must be one of {known}, got {options.row!r}")
         counts = _counts(results, row)
         fitted = fit(list(counts.values()), options.kind)
         _about(fitted, results, row).save(options.to)
@@ -63,16 +68,6 @@ def main(options: RecalibrateOptions) -> int:
         print("fitted to a single sequence, on which it is not judged: evaluate more of them")
     print(f"{options.to}: {len(fitted.variance)} knots, fitted to {len(counts)} sequences")
     return 0
-
-
-def _row(results: Results, name: str) -> Row:
-    """The row of this name. Raises ValueError: the evaluation has no such row, or a method other than UfM*."""
-    from ufmstar_torch.eval.methods.method import UFM_STAR
-
-    rows = {row.label: row for row in results.rows if row.method.fusion == UFM_STAR and not row.setting.recalibration}
-    if name not in rows:
-        raise ValueError(f"--row must be one of {', '.join(rows) or '(none: no row of UfM*)'}, got {name!r}")
-    return rows[name]
 
 
 def _counts(results: Results, row: Row) -> dict[str, Array]:

@@ -28,15 +28,6 @@ class PredictedMap(NamedTuple):
     variance: np.ndarray | None  # [H, W] float32 [m^2]
     intrinsics: np.ndarray  # [3, 3] float64 of the map [px]
 
-    def resized(self, size: Size | None) -> PredictedMap:
-        """At another size (h, w), by taking the nearest pixel."""
-        if size is None or size == self.depth.shape:
-            return self
-        height, width = self.depth.shape
-        K = resize_intrinsics(torch.from_numpy(self.intrinsics), (height, width), size).numpy()
-        variance = None if self.variance is None else resample_nearest(self.variance, self.intrinsics, K, size)
-        return PredictedMap(resample_nearest(self.depth, self.intrinsics, K, size), variance, K)
-
 
 class MapSource(DepthSource):
     """Depth maps that exist already, brought to ``size`` (h, w) unless it is None; the rest as ``DepthSource``."""
@@ -61,10 +52,16 @@ class MapSource(DepthSource):
         return self
 
     def one(self, frame: Frame, n: int) -> Prediction:
-        """The frame's map; no network runs. Raises FrameError: it has none, or it cannot be read."""
-        given = self._read(frame).resized(self._size)
-        variance = None if given.variance is None else torch.from_numpy(given.variance)
-        return Prediction(torch.from_numpy(given.depth), variance, None, torch.from_numpy(given.intrinsics).double())
+        """The frame's map, resized by taking the nearest pixel; no network runs. Raises FrameError: it has none, or it
+        cannot be read."""
+        depth, variance, K = self._read(frame)
+        if self._size is not None and self._size != depth.shape:
+            before, height, width = K, *depth.shape
+            K = resize_intrinsics(torch.from_numpy(K), (height, width), self._size).numpy()
+            depth = resample_nearest(depth, before, K, self._size)
+            variance = None if variance is None else resample_nearest(variance, before, K, self._size)
+        spread = None if variance is None else torch.from_numpy(variance)
+        return Prediction(torch.from_numpy(depth), spread, None, torch.from_numpy(K).double())
 
 
 def folder_source(

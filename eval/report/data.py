@@ -90,9 +90,10 @@ class Results:
         """Names, sorted."""
         return tuple(sorted({record.dataset for record in self.records}))
 
-    def of(self, row: Row, dataset: str | None = None) -> tuple[Record, ...]:
-        """The records of a row, of one data set or (None) of all, by data set and sequence."""
-        return self._by_row.get((row, dataset), ())
+    def of(self, row: Row, dataset: str | None = None, sequence: str | None = None) -> tuple[Record, ...]:
+        """The records of a row, of one data set or sequence or (None) of all, by data set and sequence."""
+        records = self._by_row.get((row, dataset), ())
+        return records if sequence is None else tuple(record for record in records if record.sequence == sequence)
 
     def default_rows(self, base: str | None = None) -> list[Row]:
         """Of each method of a base (None: of all) the first row that no ablation varies."""

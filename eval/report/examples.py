@@ -36,6 +36,11 @@ class RowMaps:
         with np.errstate(invalid="ignore"):
             return np.isfinite(self.depth) & (self.depth > 0) & np.isfinite(self.variance) & (self.variance >= 0)
 
+    @property
+    def known_depth(self) -> Map:
+        """[h, w] depth [m], NaN where invalid."""
+        return known_where(self.valid, self.depth)
+
     def root(self, part: Map) -> Map:
         """[h, w] square root of the variance or a part of it [m], NaN where invalid."""
         usable = self.valid & np.isfinite(part) & (part >= 0)
@@ -80,6 +85,11 @@ class Example:
         """Height by width of what the maps show: networks that take squares squeeze wide images."""
         height, width = self.truth.shape
         return float((height / self.K[1, 1]) / (width / self.K[0, 0]))
+
+    @property
+    def known_truth(self) -> Map:
+        """[h, w] ground truth [m], NaN where there is none."""
+        return known_where(self.truth > 0, self.truth)
 
     def error(self, row: str) -> Map:
         """[h, w] |depth - truth| [m], NaN where there is no truth or no prediction."""

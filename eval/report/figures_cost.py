@@ -4,27 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, mean_of
 from ufmstar_torch.eval.report.names import ECE_DELTA, NETWORK_MS, STATE, TOTAL_MS, UNCERTAINTY_MS
-from ufmstar_torch.eval.report.style import (
-    TICK,
-    Style,
-    finish,
-    label_ends,
-    new_figure,
-    short_name,
-    spread_apart,
-    stretch,
-    style_of,
-)
 
 NETWORK_COLOUR = "#bdbdbd"
 MOST_NAMES = 10  # more points have a legend instead
@@ -45,19 +36,19 @@ def draw_latency(results: Results) -> Any | None:
             timed.append((row, network, uncertainty))
     if not timed:
         return None
-    figure = new_figure(7.6, 1.2 + 0.27 * len(timed), "Time per frame")
+    figure = style.new_figure(7.6, 1.2 + 0.27 * len(timed), "Time per frame")
     axes = figure.subplots()
     longest = 0.0
     for y, (row, network, uncertainty) in enumerate(timed):
         n, u = (mean.value if mean.sequences else 0.0 for mean in (network, uncertainty))
         axes.barh(y, n, color=NETWORK_COLOUR, height=0.66)
-        axes.barh(y, u, left=n, color=style_of(row.method).colour, height=0.66)
+        axes.barh(y, u, left=n, color=style.look_of(row.method).colour, height=0.66)
         words = f"  {f'{n:.1f}' if network.sequences else 'network not timed'} + {u:.1f} ms"
-        axes.text(n + u, y, words, size=TICK, va="center", color=INK)
+        axes.text(n + u, y, words, size=style.TICK, va="center", color=INK)
         longest = max(longest, n + u)
     axes.set(xlim=(0, 1.3 * longest), ylim=(len(timed) - 0.4, -0.6))
     axes.set_yticks(range(len(timed)), [row.method.name for row, _, _ in timed])
-    finish(axes, x="network (grey) + uncertainty (coloured) [ms], mean over sequences of the median frame")
+    style.finish(axes, x="network (grey) + uncertainty (coloured) [ms], mean over sequences of the median frame")
     axes.grid(visible=False, axis="y")
     return figure
 
@@ -67,19 +58,19 @@ def draw_stages(results: Results) -> Any | None:
     staged = [row for row in (results.efficiency or {}).get("rows", ()) if row.get("stages")]
     if not staged:
         return None
-    figure = new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")
+    figure = style.new_figure(8.6, 1.5 + 0.5 * len(staged), "Where the time of UfM* goes")
     axes = figure.subplots()
     for y, row in enumerate(staged):
         times = {name: row["stages"]["stages"][name]["median_ms"] for name in STAGES if name in row["stages"]["stages"]}
         _draw_stages(axes, y, times)
     axes.set_yticks(range(len(staged)), [plain(f"{row['row']}\n{row['network']}") for row in staged])
-    finish(axes, x="share of the step [%], medians of its stages")
+    style.finish(axes, x="share of the step [%], medians of its stages")
     axes.grid(visible=False)
     axes.set(xlim=(0, 100), ylim=(len(staged) - 0.4, -0.6))
     from matplotlib.patches import Patch
 
     handles = [Patch(color=colour, label=name) for name, colour in STAGES.items()]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=TICK)
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=style.TICK)
     return figure
 
 
@@ -91,10 +82,10 @@ def _draw_stages(axes: Any, y: int, times: Mapping[str, float]) -> None:
         axes.barh(y, share, left=left, color=STAGES[name], height=0.62, edgecolor="white", linewidth=0.5)
         if share >= 6:
             letters = INK if name in ("regress", "average") else "white"  # dark on the light colours
-            words = {"size": TICK, "color": letters, "ha": "center", "va": "center"}
+            words = {"size": style.TICK, "color": letters, "ha": "center", "va": "center"}
             axes.text(left + share / 2, y, f"{share:.0f} %", **words)
         left += share
-    axes.text(101, y, f"{total:.1f} ms", size=TICK, color=INK, va="center")
+    axes.text(101, y, f"{total:.1f} ms", size=style.TICK, color=INK, va="center")
 
 
 def draw_tradeoff(results: Results) -> Any | None:
@@ -107,26 +98,26 @@ def draw_tradeoff(results: Results) -> Any | None:
     took = {row: x for row, x in took.items() if not math.isnan(x)}
     if not any(kept.values()):
         return None
-    figure = new_figure(11.0, 4.8, "Calibration against cost on all sequences")
+    figure = style.new_figure(11.0, 4.8, "Calibration against cost on all sequences")
     words = ("kept between frames [MB]", "time per frame [ms]")
     for axes, panel, word in zip(figure.subplots(1, 2, sharey=True), (kept, took), words, strict=True):
         for row, x in panel.items():
             mean = points[row]
             axes.errorbar(
-                x, mean.value, yerr=np.nan_to_num(mean.half), color=style_of(row.method).colour, markersize=6,
+                x, mean.value, yerr=np.nan_to_num(mean.half), color=style.look_of(row.method).colour, markersize=6,
                 marker=_BASE_MARKERS[row.method.base], linewidth=1, elinewidth=0.5, capsize=0,
             )  # fmt: skip
         # Methods alone keep nothing: there is room for 0 at the left.
-        stretch(axes, list(panel.values()), 8, linthresh=0.5, linscale=0.8)
+        style.stretch(axes, list(panel.values()), 8, linthresh=0.5, linscale=0.8)
         if axes.get_xscale() == "linear":
             axes.set_xlim(left=0)
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.set_ylim(bottom=0)
-        finish(axes, x=word, y="ECE_δ ↓ (bar: 95 % interval)")
+        style.finish(axes, x=word, y="ECE_δ ↓ (bar: 95 % interval)")
         if len(points) <= MOST_NAMES:
             _name_points(axes, [(x, points[row].value, row) for row, x in panel.items()])
     if len(points) > MOST_NAMES:
-        figure.legend(handles=_legend(list(points)), loc="outside right upper", frameon=False, fontsize=TICK)
+        figure.legend(handles=_legend(list(points)), loc="outside right upper", frameon=False, fontsize=style.TICK)
     return figure
 
 
@@ -134,12 +125,12 @@ def _legend(rows: Sequence[Row]) -> list[Any]:
     """Colours are methods, marks are networks."""
     from matplotlib.lines import Line2D
 
-    look: dict[str, Any] = {"linestyle": "", "markersize": 6}
-    methods = {short_name(row.method): style_of(row.method).colour for row in rows}
+    how: dict[str, Any] = {"linestyle": "", "markersize": 6}
+    looks = {look.name: look for look in (style.look_of(row.method) for row in rows)}.values()
     bases = dict.fromkeys(row.method.base for row in rows)
     return [
-        *(Line2D([], [], marker="o", color=colour, label=name, **look) for name, colour in methods.items()),
-        *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **look) for base in bases),
+        *(Line2D([], [], marker="o", color=look.colour, label=look.name, **how) for look in looks),
+        *(Line2D([], [], marker=_BASE_MARKERS[base], color=INK, label=BASES[base][1], **how) for base in bases),
     ]
 
 
@@ -147,12 +138,13 @@ def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:
     """Each point's name in a column right of the panel, apart from each other, with a thin line to its point."""
     height = axes.get_position().height * axes.figure.get_figheight()
     high = axes.get_ylim()[1]
-    places = spread_apart([y / high for _, y, _ in points], 1.2 * TICK / 72 / height, 0, 1)
+    places = style.spread_apart([y / high for _, y, _ in points], 1.2 * style.TICK / 72 / height, 0, 1)
     for (x, y, row), place in zip(points, places, strict=True):
-        name = f"{BASES[row.method.base][1]} {short_name(row.method)}"
+        look = style.look_of(row.method)
+        name = f"{BASES[row.method.base][1]} {look.name}"
         axes.annotate(
-            name, (x, y), (1.04, place), textcoords="axes fraction", size=TICK, va="center",
-            color=style_of(row.method).colour,
+            name, (x, y), (1.04, place), textcoords="axes fraction", size=style.TICK, va="center",
+            color=look.colour,
             arrowprops={"arrowstyle": "-", "color": FAINT, "linewidth": 0.4, "relpos": (0, 0.5), "shrinkB": 3},
         )  # fmt: skip
 
@@ -160,26 +152,26 @@ def _name_points(axes: Any, points: Sequence[tuple[float, float, Row]]) -> None:
 # ---- growth ----
 
 # Runs of one world differ in their limits of merging and of components in memory; without either comes first.
-_STYLES = (Style("#6b6b6b", "^"), Style("#0072B2", "o"), Style("#D55E00", "v"), Style("#009E73", "D"))
+_COLOURS = ("#6b6b6b", "#0072B2", "#D55E00", "#009E73")
 _PANELS = {"components": "components in memory", "step_median_ms": "time of a step [ms], median"}
 
 
 def draw_growth(runs: Sequence[Mapping[str, Any]]) -> Any:
     """Components, and the time of a step, over frames, of runs of ``measure_growth``; a row of panels each world."""
     worlds = list(dict.fromkeys(run["world"] for run in runs))
-    figure = new_figure(8.6, 3.4 * len(worlds), f"Growth: {', '.join(worlds)}; {runs[0]['frames']} frames")
+    figure = style.new_figure(8.6, 3.4 * len(worlds), f"Growth: {', '.join(worlds)}; {runs[0]['frames']} frames")
     for world, panels in zip(worlds, figure.subplots(len(worlds), 2, squeeze=False), strict=True):
         own = [run for run in runs if run["world"] == world]
         for panel, (key, words) in zip(panels, _PANELS.items(), strict=True):
             ends = []
-            for index, run in enumerate(own):
-                style = _STYLES[index % len(_STYLES)]
+            for run, colour in zip(own, cycle(_COLOURS), strict=False):
                 values = [row[key] for row in run["rows"]]
-                panel.plot([row["frames"][1] for row in run["rows"]], values, color=style.colour, linewidth=1.6)
+                panel.plot([row["frames"][1] for row in run["rows"]], values, color=colour, linewidth=1.6)
                 merge = f"merge {run['merge']:g}" if run["merge"] else ""
                 most = f"at most {run['max_components']}" if run["max_components"] else ""
-                ends.append((values[-1], ", ".join(filter(None, (merge, most))) or "off", style.colour))
+                look = style.Look(", ".join(filter(None, (merge, most))) or "off", colour)
+                ends.append((values[-1], look))
             panel.set_ylim(bottom=0)
-            finish(panel, x=f"frames, {world}", y=words)
-            label_ends(panel, ends)
+            style.finish(panel, x=f"frames, {world}", y=words)
+            style.label_ends(panel, ends)
     return figure

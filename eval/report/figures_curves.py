@@ -13,26 +13,18 @@ from numpy.typing import NDArray
 from ufmstar_torch.eval.engine.judge import BY_ERROR
 from ufmstar_torch.eval.methods.method import ALONE, BASES, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.report import style
 from ufmstar_torch.eval.report.colours import FAINT, INK
 from ufmstar_torch.eval.report.data import Merged, Results
 from ufmstar_torch.eval.report.means import value_of
 from ufmstar_torch.eval.report.names import count
-from ufmstar_torch.eval.report.style import (
-    LABEL,
-    TICK,
-    Style,
-    finish,
-    hidden_panels,
-    label_ends,
-    new_figure,
-    save_figure,
-    short_name,
-    style_of,
-)
+from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.results.record import Record
 
 Curves = Mapping[str, Sequence[float]]
 PER_LINE, MOST_SEQUENCES = 3, 12
+# Words at the axes of the two diagrams of calibration.
+DELTA, QUANTILE = ("predicted share within 25 %", "true share"), ("predicted quantile", "share of truth below")
 # The looks of methods that are known by name alone, as the demo's.
 _BY_ORDER = (("#6b6b6b", "^"), ("#E69F00", "s"), ("#0072B2", "o"), ("#009E73", "D"), ("#CC79A7", "v"), ("#D55E00", "P"))
 
@@ -55,7 +47,7 @@ def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any 
     """Both curves of single sequences, from the one on which UfM* is best to that on which it is worst."""
     panels = []
     for name in chosen_sequences(results, dataset, base):
-        of = {row: [r for r in results.of(row, dataset) if r.sequence == name] for row in results.default_rows(base)}
+        of = {row: results.of(row, dataset, name) for row in results.default_rows(base)}
         shown = {row: records[0] for row, records in of.items() if records and _has_curves(records[0].curves)}
         titles = (f"{name}\n{_errors(shown, 'ece_delta', 'δ')}", _errors(shown, "ece_q", "q"))
         panels.append((titles, {row: record.curves for row, record in shown.items()}))
@@ -65,9 +57,8 @@ def draw_sequence_calibration(results: Results, dataset: str, base: str) -> Any 
     figure = _draw_columns(title, panels, 4, (0.4, 2.45, 0.7, 4.9), ends=False)
     from matplotlib.lines import Line2D
 
-    rows = {short_name(row.method): row for row in results.default_rows(base)}
-    judged = {name: row for name, row in rows.items() if any(_has_curves(r.curves) for r in results.of(row))}
-    handles = [Line2D([], [], label=name, **style_of(row.method).line) for name, row in judged.items()]
+    judged = [row for row in results.default_rows(base) if any(_has_curves(r.curves) for r in results.of(row))]
+    handles = [Line2D([], [], **style.look_of(row.method).line) for row in judged]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8)
     return figure
 
@@ -103,57 +94,42 @@ def _draw_columns(
     """
     columns = min(len(panels), most)
     lines = -(-len(panels) // columns)
-    figure = new_figure(size[0] + size[1] * columns, size[2] + size[3] * lines, title)
-    axes = hidden_panels(figure, 2 * lines, columns)
+    figure = style.new_figure(size[0] + size[1] * columns, size[2] + size[3] * lines, title)
+    axes = style.hidden_panels(figure, 2 * lines, columns)
     for number, (titles, curves) in enumerate(panels):
         line, column = divmod(number, columns)
         ordered = sorted(curves.items(), key=lambda item: (item[0].method.fusion == UFM_STAR, item[0].method.full))
-        drawn = {short_name(row.method): (style_of(row.method), values) for row, values in ordered}
+        drawn = {style.look_of(row.method): values for row, values in ordered}
         named = ends or column == 0
-        draw_delta(axes[2 * line, column], drawn, titles[0], "true share" if named else "", ends)
-        draw_quantiles(axes[2 * line + 1, column], drawn, titles[1], "share of truth below" if named else "", ends)
+        for below, (words, own) in enumerate(zip((DELTA, QUANTILE), titles, strict=True)):
+            _draw_shares(axes[2 * line + below, column], words, drawn, own, named, ends)
     return figure
 
 
-def draw_delta(
-    axes: Any, lines: Mapping[str, tuple[Style, Curves]], title: str, y: str = "true share", ends: bool = False
-) -> None:
-    """Confidence that the depth is within 25 %, and how often it is; bins with hardly a pixel are left out."""
-    shown = {}
-    for name, (style, values) in lines.items():
-        confidence, accuracy, pixels = (
-            np.array(values[f"ece_delta_{what}"], float) for what in ("confidence", "accuracy", "pixels")
-        )
-        kept = pixels > 0.001 * pixels.sum()
-        shown[name] = (style, confidence[kept], accuracy[kept])
-    _draw_shares(axes, shown, title, ("predicted share within 25 %", y), ends)
-
-
-def draw_quantiles(
-    axes: Any,
-    lines: Mapping[str, tuple[Style, Curves]],
-    title: str,
-    y: str = "share of truth below",
-    ends: bool = False,
-) -> None:
-    """Predicted quantiles of the depth, and the share of the truth below them."""
-    shown = {n: (s, np.array(v["ece_q_levels"]), np.array(v["ece_q_observed"])) for n, (s, v) in lines.items()}
-    _draw_shares(axes, shown, title, ("predicted quantile", y), ends)
-
-
 def _draw_shares(
-    axes: Any, lines: Mapping[str, tuple[Style, Any, Any]], title: str, words: tuple[str, str], ends: bool
+    axes: Any, words: tuple[str, str], lines: Mapping[Look, Curves], title: str, named: bool, ends: bool
 ) -> None:
-    """Lines in the unit square with its diagonal."""
+    """Confidence that the depth is within 25 %, and how often it is (``DELTA``), or predicted quantiles and the share
+    of the truth below them (``QUANTILE``), in the unit square with its diagonal."""
     axes.set_visible(True)
     axes.plot([0, 1], [0, 1], linestyle="--", linewidth=1.0, color=FAINT)
-    for name, (style, x, y) in lines.items():
-        axes.plot(x, y, label=name, clip_on=False, **style.line)
+    last = []
+    for look, values in lines.items():
+        x, y = _confidence(values) if words is DELTA else (values["ece_q_levels"], values["ece_q_observed"])
+        axes.plot(x, y, clip_on=False, **look.line)
+        last += [(float(y[-1]), look)] if len(y) else []
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 0.5, 1], yticks=[0, 0.5, 1])
-    finish(axes, title=title, x=words[0], y=words[1])
+    style.finish(axes, title=title, x=words[0], y=words[1] if named else "")
     if ends:
-        last = [(y[-1], name, style.colour) for name, (style, _, y) in lines.items() if len(y)]
-        label_ends(axes, [*last, (1.0, "exactly right", FAINT)])
+        style.label_ends(axes, [*last, (1.0, Look("exactly right", FAINT))])
+
+
+def _confidence(values: Curves) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Confidence and accuracy of the bins that have more than hardly a pixel."""
+    named = ("ece_delta_confidence", "ece_delta_accuracy", "ece_delta_pixels")
+    confidence, accuracy, pixels = (np.array(values[name], float) for name in named)
+    kept = pixels > 0.001 * pixels.sum()
+    return confidence[kept], accuracy[kept]
 
 
 def _has_curves(curves: Mapping[str, Any]) -> bool:
@@ -176,21 +152,21 @@ def write_curves(path: Path, curves: Mapping[str, Curves], *, title: str = "") -
     have a look of their own."""
     if not 1 <= len(curves) <= len(_BY_ORDER):
         raise ValueError(f"curves must hold 1 to {len(_BY_ORDER)} methods, got {len(curves)}")
-    figure = new_figure(12.6, 4.6, title)
+    figure = style.new_figure(12.6, 4.6, title)
     delta, quantiles, sparse = figure.subplots(1, 3)
-    lines = {name: (Style(*look), curves[name]) for name, look in zip(curves, _BY_ORDER, strict=False)}
-    draw_delta(delta, lines, "δ calibration")
-    draw_quantiles(quantiles, lines, "quantile calibration")
-    for style, values in lines.values():
+    lines = {Look(name, *look): curves[name] for name, look in zip(curves, _BY_ORDER, strict=False)}
+    _draw_shares(delta, DELTA, lines, "δ calibration", named=True, ends=False)
+    _draw_shares(quantiles, QUANTILE, lines, "quantile calibration", named=True, ends=False)
+    for look, values in lines.items():
         x = np.arange(len(values["sparsification_rmse"])) / len(values["sparsification_rmse"])
-        sparse.plot(x, values["sparsification_rmse"], markevery=10, **style.line)
-        sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=style.colour)
+        sparse.plot(x, values["sparsification_rmse"], markevery=10, **look.line)
+        sparse.plot(x, values["sparsification_oracle_rmse"], linewidth=1.0, linestyle=":", color=look.colour)
     sparse.set_xlim(0, 1)
     sparse.set_ylim(bottom=0)
     words = ("sparsification (dotted: best possible)", "share of pixels left out, largest σ first", "RMSE [m]")
-    finish(sparse, title=words[0], x=words[1], y=words[2])
+    style.finish(sparse, title=words[0], x=words[1], y=words[2])
     figure.legend(*delta.get_legend_handles_labels(), loc="outside lower center", ncols=len(curves) + 1, frameon=False)
-    save_figure(figure, path)
+    style.save_figure(figure, path)
 
 
 # ---- NLL by size of the error ----
@@ -207,20 +183,23 @@ def draw_error(results: Results, dataset: str) -> Any | None:
     if not panels:
         return None
     columns = max(map(len, panels.values()))
-    figure = new_figure(0.6 + 4.3 * columns, 0.5 + 3.1 * len(panels), f"NLL by size of the error on {dataset}")
-    for line, (base, by_reference) in zip(hidden_panels(figure, len(panels), columns), panels.items(), strict=True):
+    figure = style.new_figure(0.6 + 4.3 * columns, 0.5 + 3.1 * len(panels), f"NLL by size of the error on {dataset}")
+    for line, (base, by_reference) in zip(
+        style.hidden_panels(figure, len(panels), columns), panels.items(), strict=True
+    ):
         for axes, (reference, curves) in zip(line, by_reference.items(), strict=False):
             axes.set_visible(True)
             for row, values in sorted(curves.items(), key=lambda item: item[0].method.fusion == UFM_STAR):
                 x = (np.arange(len(values)) + 0.5) * 100 / len(values)
-                axes.plot(x, np.array(values, float), label=row.method.name, **style_of(row.method).line)
+                axes.plot(x, np.array(values, float), **style.look_of(row.method).line)
             axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100])
             method = Method.parse(reference)
-            title = f"{BASES[base][0]}: where {'it' if method.fusion == ALONE else short_name(method)} is confident"
-            finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
+            judge = "it" if method.fusion == ALONE else style.look_of(method).name
+            title = f"{BASES[base][0]}: where {judge} is confident"
+            style.finish(axes, title=title, x="percentile of the row's error", y="mean NLL [nats]")
             # At the last group that had a pixel.
-            ends = {row: next(value for value in reversed(values) if value == value) for row, values in curves.items()}
-            label_ends(axes, [(y, short_name(row.method), style_of(row.method).colour) for row, y in ends.items()])
+            last = {row: next(y for y in reversed(values) if y == y) for row, values in curves.items()}
+            style.label_ends(axes, [(y, style.look_of(row.method)) for row, y in last.items()])
     return figure
 
 
@@ -249,14 +228,14 @@ def draw_entropy(results: Results, base: str) -> Any | None:
                 panels.setdefault(dataset, {})[row] = merged
     if not panels:
         return None
-    figure = new_figure(7.6, 1.0 + 2.1 * len(panels), f"Predictive entropy by data set, {BASES[base][0]}")
+    figure = style.new_figure(7.6, 1.0 + 2.1 * len(panels), f"Predictive entropy by data set, {BASES[base][0]}")
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
     low, high = entropy_range([merged for rows in panels.values() for merged in rows.values()])
     for panel, (dataset, rows) in zip(axes, panels.items(), strict=True):
         panel.set_xlim(low, high)
         _draw_histograms(panel, rows)
-        finish(panel, title=dataset, y="share of pixels per nat")
-    axes[-1].set_xlabel("entropy ½ ln(2πeV) [nats]", size=LABEL, color=INK)
+        style.finish(panel, title=dataset, y="share of pixels per nat")
+    axes[-1].set_xlabel("entropy ½ ln(2πeV) [nats]", size=style.LABEL, color=INK)
     _sigma_axis(axes[0], low, high)
     return figure
 
@@ -283,18 +262,20 @@ def density(merged: Merged) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _draw_histograms(axes: Any, rows: Mapping[Row, Merged]) -> None:
     """Histograms, and the mean of each as a dashed line with its name beside."""
     for number, (row, merged) in enumerate(rows.items()):
-        colour = style_of(row.method).colour
+        look = style.look_of(row.method)
         heights, edges = density(merged)
-        axes.stairs(heights, edges, color=colour, linewidth=1.5, label=short_name(row.method))
+        axes.stairs(heights, edges, color=look.colour, linewidth=1.5, label=look.name)
         if row.method.fusion == UFM_STAR and not row.method.full:
-            axes.stairs(heights, edges, color=colour, alpha=0.15, fill=True)
+            axes.stairs(heights, edges, color=look.colour, alpha=0.15, fill=True)
         mean, counts = merged.figures["entropy"], merged.curves["entropy_counts"]
-        axes.axvline(mean, color=colour, linestyle="--", linewidth=1.1)
+        axes.axvline(mean, color=look.colour, linestyle="--", linewidth=1.1)
         # Pixels below the histogram: V = 0 above all.
         below = counts[0] / sum(counts)
         remark = "" if below < 0.005 else f"\n({100 * below:.0f} % with hardly any V)"
-        words = f"{short_name(row.method)}: mean {mean:.2f}{remark}"
-        axes.text(1.02, 0.95 - 0.13 * number, words, color=colour, size=TICK, va="top", transform=axes.transAxes)
+        words = f"{look.name}: mean {mean:.2f}{remark}"
+        axes.text(
+            1.02, 0.95 - 0.13 * number, words, color=look.colour, size=style.TICK, va="top", transform=axes.transAxes
+        )
     axes.set_ylim(bottom=0)
 
 
@@ -306,5 +287,5 @@ def _sigma_axis(axes: Any, low: float, high: float) -> None:
     within = [sigma for sigma in finer if low <= math.log(sigma) + ONE_METRE <= high]
     shown = decades if len(decades) > 2 else within
     twin.set_xticks([math.log(sigma) for sigma in shown], [f"σ = {sigma:g} m" for sigma in shown])
-    twin.tick_params(labelsize=TICK - 1, color=FAINT, labelcolor=INK)
+    twin.tick_params(labelsize=style.TICK - 1, color=FAINT, labelcolor=INK)
     twin.spines["top"].set_visible(False)

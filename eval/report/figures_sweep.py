@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
+from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,32 +18,11 @@ from ufmstar_torch.eval.engine.anchors import TRUTH_COUNT
 from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
+from ufmstar_torch.eval.report import names, style
 from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
-from ufmstar_torch.eval.report.names import (
-    DIFFERENCES,
-    ECE_DELTA,
-    ECE_Q,
-    NLL,
-    SETTINGS,
-    SPEARMAN,
-    count,
-    setting_label,
-    setting_name,
-)
-from ufmstar_torch.eval.report.style import (
-    ALONE_STYLE,
-    LABEL,
-    TICK,
-    Style,
-    finish,
-    label_ends,
-    new_figure,
-    short_name,
-    stretch,
-    style_of,
-)
+from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.results.record import Record
 
 COUNT = "anchor_count"
@@ -75,7 +55,7 @@ class SweepLine:
         """What is fixed, for people: "", "anchored", "truth anchors, shrinkage κ 1 anchors"."""
         values = dict(self.rest)
         anchors = _ANCHORED.get(kind := values.pop("anchors", ""), kind)
-        return ", ".join(filter(None, (anchors, setting_label(values))))
+        return ", ".join(filter(None, (anchors, names.setting_label(values))))
 
     def at(self, value: float) -> Point | None:
         """The point of a value; of a line with one point, which does not depend on it, that one."""
@@ -145,13 +125,13 @@ def _changed(row: Row) -> list[str]:
 
 # ---- figures ----
 
-SHOWN = (NLL, ECE_DELTA, ECE_Q)
-# Lines of the same method by what is fixed; they differ from all of ``style_of``'s.
-_FIXED: dict[Rest, Style] = {
-    (("anchors", TRACKED),): Style("#882255", "d"),
-    (("anchors", TRUTH),): Style("#222222", "*"),
+SHOWN = (names.NLL, names.ECE_DELTA, names.ECE_Q)
+# Colours and marks of lines of the same method by what is fixed; they differ from all of ``look_of``'s.
+_FIXED: dict[Rest, tuple[str, str]] = {
+    (("anchors", TRACKED),): ("#882255", "d"),
+    (("anchors", TRUTH),): ("#222222", "*"),
 }
-_OTHERS = (Style("#117733", "h"), Style("#88CCEE", "p"), Style("#999933", "<"), Style("#AA4499", ">"))
+_OTHERS = (("#117733", "h"), ("#88CCEE", "p"), ("#999933", "<"), ("#AA4499", ">"))
 # Beyond this an axis of NLLs is logarithmic: pixels of nearly no variance take their mean to any height.
 _HIGH = 50.0
 
@@ -165,21 +145,21 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
     lines = [line for line in sweep_lines(results, base, name) if len(line.points) > 1 or not line.rest]
     alone = [line for line in lines if line.method == Method(base)][:1]
     drawn = [line for line in lines if line.method.fusion != ALONE]
-    others = cycle(_OTHERS)
-    styles = [_FIXED.get(line.rest) or next(others) if line.rest else style_of(line.method) for line in drawn]
-    looks = dict.fromkeys(alone, (ALONE_STYLE, True))
-    looks |= {line: (style, len(line.points) == 1) for line, style in zip(drawn, styles, strict=True)}
+    looks, others = {line: style.look_of(line.method) for line in [*alone, *drawn]}, cycle(_OTHERS)
+    for line in drawn:
+        if line.rest:
+            looks[line] = Look(line.words or looks[line].name, *(_FIXED.get(line.rest) or next(others)))
     to, below = _compared(drawn, alone[0] if alone else None, name)
-    shown = (*SHOWN, SPEARMAN) if any("anchors" in dict(line.rest) for line in drawn) else SHOWN
-    word, unit = SETTINGS.get(name, (setting_name(name), ""))
-    title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {count(len(results.sequences()), 'sequence')}"
-    figure = new_figure(4.0 * len(shown), 6.0 if below else 3.4, title)
+    shown = (*SHOWN, names.SPEARMAN) if any("anchors" in dict(line.rest) for line in drawn) else SHOWN
+    word, unit = names.SETTINGS.get(name, (names.setting_name(name), ""))
+    title = f"{word[:1].upper()}{word[1:]}: {BASES[base][0]}, {names.count(len(results.sequences()), 'sequence')}"
+    figure = style.new_figure(4.0 * len(shown), 6.0 if below else 3.4, title)
     axes = figure.subplots(1 + bool(below), len(shown), squeeze=False, sharex=True)
     for column, quantity in enumerate(shown):
         panel = axes[0][column]
         means = {line: {p.value: mean_of(p.records, quantity) for p in line.points} for line in looks}
         reached, ends = _draw(panel, means, looks)
-        finish(panel, title=f"{quantity.heading}, mean over sequences")
+        style.finish(panel, title=f"{quantity.heading}, mean over sequences")
         _scale(panel, [point.value for line in drawn if len(line.points) > 1 for point in line.points])
         _tame(panel, name, reached, ends)
         if below:
@@ -187,9 +167,9 @@ def draw_sweep(results: Results, base: str, name: str) -> Any:
             panel.axhline(0, color=FAINT, linewidth=0.8)
             means = {line: {a.value: difference(a.records, b.records, quantity) for a, b in ab} for line, ab in below}
             reached, ends = _draw(panel, means, looks)
-            finish(panel, title=f"difference to {to} in {quantity.name}, in pairs")
+            style.finish(panel, title=f"difference to {to} in {quantity.name}, in pairs")
             _tame(panel, name, reached, ends)
-        panel.set_xlabel(plain(f"{word} [{unit}]" if unit else word), size=LABEL, color=INK)
+        panel.set_xlabel(plain(f"{word} [{unit}]" if unit else word), size=style.LABEL, color=INK)
     return figure
 
 
@@ -205,7 +185,7 @@ def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) ->
     if alone is not None and len(alone.points) > 1:
         to, reference = "alone", lambda line, value: alone.at(value)
     elif fixed := [line for line in swept if line.rest and line.method in plain]:
-        methods, swept = {short_name(line.method) for line in fixed}, fixed
+        methods, swept = {style.look_of(line.method).name for line in fixed}, fixed
         words = methods.pop() if len(methods) == 1 else "the method as it is"
         to, reference = words, lambda line, value: plain[line.method].at(value)
     else:
@@ -215,10 +195,10 @@ def _compared(drawn: Sequence[SweepLine], alone: SweepLine | None, name: str) ->
 
 
 def _draw(
-    axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, tuple[Style, bool]]
-) -> tuple[list[float], list[tuple[float, str, str]]]:
-    """Means over the values of a setting with their bands, by line; dashed and level lines for reference, as ``looks``
-    has it. The values reached, and what stands at the ends."""
+    axes: Any, curves: Mapping[SweepLine, Mapping[float, Mean]], looks: Mapping[SweepLine, Look]
+) -> tuple[list[float], list[tuple[float, Look]]]:
+    """Means over the values of a setting with their bands, by line; dashed without a band for reference. The values
+    reached, and what stands at the ends."""
     reached: list[float] = []
     ends = []
     for line, means in curves.items():
@@ -226,22 +206,21 @@ def _draw(
         if not kept:
             continue
         x, y, half = np.array(kept).T
-        (style, dashed), short = looks[line], short_name(line.method)
-        label = short if style is ALONE_STYLE else " ".join(filter(None, (line.method.name, line.words)))
-        look: dict[str, Any] = {"color": style.colour, "linestyle": "--", "linewidth": 1.4, "label": label}
-        if not dashed:
-            axes.plot(x, y, label=label, **style.line)
-            axes.fill_between(x, y - half, y + half, color=style.colour, alpha=0.15, linewidth=0)
+        look = looks[line]
+        dashed: dict[str, Any] = {"color": look.colour, "linestyle": "--", "linewidth": 1.4, "label": look.name}
+        if line.method.fusion != ALONE and len(line.points) > 1:
+            axes.plot(x, y, **look.line)
+            axes.fill_between(x, y - half, y + half, color=look.colour, alpha=0.15, linewidth=0)
         elif len(means) == 1:
-            axes.axhline(y[0], **look)
+            axes.axhline(y[0], **dashed)
         else:
-            axes.plot(x, y, **look)
+            axes.plot(x, y, **dashed)
         reached += [value for value in y.tolist() if math.isfinite(value)]
-        ends.append((float(y[-1]), short if style is ALONE_STYLE else line.words or short, style.colour))
+        ends.append((float(y[-1]), look))
     return reached, ends
 
 
-def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[float, str, str]]) -> None:
+def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[float, Look]]) -> None:
     """Mark the default, and name the lines.
 
     Logarithmic beyond 1 where values are so high that the others would lie on one line, and cut to the values:
@@ -253,12 +232,12 @@ def _tame(axes: Any, name: str, reached: Sequence[float], ends: Sequence[tuple[f
     value = default_value(name)
     if not math.isnan(value):
         axes.axvline(value, color=FAINT, linewidth=0.8, linestyle=":", zorder=0)
-    label_ends(axes, ends)
+    style.label_ends(axes, ends)
 
 
 def _scale(axes: Any, values: Sequence[float]) -> None:
     """Logarithmic where values span a factor of 20 or more, with a tick for every value of a few."""
-    stretch(axes, values, 20, linthresh=1.0, linscale=0.5)
+    style.stretch(axes, values, 20, linthresh=1.0, linscale=0.5)
     ticks = sorted(set(values))
     if len(ticks) <= 9:
         axes.set_xticks(ticks, [f"{value:g}" for value in ticks])
@@ -270,26 +249,29 @@ def draw_changes(results: Results, base: str) -> Any | None:
     lines = list(_variants(results, base))
     if not lines:
         return None
-    shown = [q for q in DIFFERENCES if q.key != "ause_rmse"]
-    title = f"What each setting changes: {BASES[base][0]}, in pairs on {count(len(results.sequences()), 'sequence')}"
-    figure = new_figure(2.8 + 2.3 * len(shown), 1.3 + 0.24 * len(lines), title)
+    shown = [q for q in names.DIFFERENCES if q.key != "ause_rmse"]
+    title = (
+        f"What each setting changes: {BASES[base][0]}, in pairs on {names.count(len(results.sequences()), 'sequence')}"
+    )
+    figure = style.new_figure(2.8 + 2.3 * len(shown), 1.3 + 0.24 * len(lines), title)
     axes = figure.subplots(1, len(shown), squeeze=False, sharey=True)[0]
     for place, quantity in zip(axes, shown, strict=True):
         place.axvline(0, color=FAINT, linewidth=0.8)
         for y, (row, reference) in enumerate(lines):
             mean = difference(results.of(row), results.of(reference), quantity)
             if not math.isnan(mean.value):
-                style = style_of(row.method)
+                look = style.look_of(row.method)
                 place.errorbar(
-                    mean.value, y, xerr=np.nan_to_num(mean.half), color=style.colour, marker=style.marker,
-                    markersize=4.5, linewidth=1.4, markerfacecolor=style.colour if mean.beyond else "white", capsize=0,
+                    mean.value, y, xerr=np.nan_to_num(mean.half), color=look.colour, marker=look.marker,
+                    markersize=4.5, linewidth=1.4, markerfacecolor=look.colour if mean.beyond else "white", capsize=0,
                 )  # fmt: skip
-        finish(place, title=f"Δ {quantity.heading}", x="less the default")
+        style.finish(place, title=f"Δ {quantity.heading}", x="less the default")
     axes[0].set_ylim(len(lines) - 0.5, -0.5)
     one = len({row.method for row, _ in lines}) == 1  # the method is named where there are several
-    names = [("" if one else f"{short_name(r.method)}, ") + setting_label(r.setting.to_dict()) for r, _ in lines]
-    axes[0].set_yticks(range(len(lines)), map(plain, names), size=TICK)
-    figure.supxlabel("filled: the 95 % interval leaves out 0", size=TICK, color=FAINT, x=0.99, ha="right")
+    methods = ["" if one else f"{style.look_of(row.method).name}, " for row, _ in lines]
+    settings = [names.setting_label(row.setting.to_dict()) for row, _ in lines]
+    axes[0].set_yticks(range(len(lines)), map(plain, map(add, methods, settings)), size=style.TICK)
+    figure.supxlabel("filled: the 95 % interval leaves out 0", size=style.TICK, color=FAINT, x=0.99, ha="right")
     return figure
 
 

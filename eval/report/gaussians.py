@@ -100,14 +100,6 @@ def write_mixture_npz(path: str | Path, mixture: GaussianMixture, *, T_world_fir
     write_atomic(Path(path), lambda file: np.savez(file, allow_pickle=False, **fields))
 
 
-def read_mixture_npz(path: str | Path) -> tuple[GaussianMixture, Tensor | None]:
-    """The mixture of ``write_mixture_npz`` on the CPU, and ``T_world_first`` in float64 or None."""
-    with np.load(path, allow_pickle=False) as stored:
-        fields = {name: torch.from_numpy(stored[name]) for name in stored.files}
-    T_world_first = fields.pop("T_world_first", None)
-    return GaussianMixture(**fields), T_world_first
-
-
 def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Unit vectors [10 4^s + 2, 3] and outward triangles [20 4^s, 3] of a divided icosahedron.
 

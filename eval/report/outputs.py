@@ -174,11 +174,7 @@ def absolute_error(depth: NDArray[Any], truth: NDArray[Any]) -> NDArray[np.float
 
 
 def write_pictures(
-    out: Path,
-    panels: Sequence[FramePanel],
-    metrics: Mapping[str, SequenceMetrics],
-    ufm_star: UfMStar,
-    title: str,
+    out: Path, panels: Sequence[FramePanel], metrics: Mapping[str, SequenceMetrics], ufm_star: UfMStar, title: str
 ) -> dict[str, str | None]:
     """Write all of :data:`DEMO_FILES` into an existing folder: the sheet of the panels, the curves of the metrics by
     name, and the mixture. By file: None if it was written, else why not (an optional package is missing).

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -18,7 +19,7 @@ from ufmstar_torch.eval.report.efficiency import efficiency_tables
 from ufmstar_torch.eval.report.findings import PairedComparison, best_rows, caveats, comparisons, headlines, join
 from ufmstar_torch.eval.report.means import MIN_SEQUENCES, value_of
 from ufmstar_torch.eval.report.names import DIFFERENCES, count, row_label
-from ufmstar_torch.eval.report.pictures import BREAKDOWN, COMPARE, ROOM, STRIP, Picture
+from ufmstar_torch.eval.report.pictures import Picture
 from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.report.tables import overview, sequence_tables
 from ufmstar_torch.eval.results.files import write_atomic
@@ -31,37 +32,6 @@ MOST_BYTES = 7_000_000
 QUALITY = 84
 # Further sequences are only in the tables' folder.
 MOST_SEQUENCES = 24
-# By kind of picture, or first word of a figure's file name: the part's title, and how to read it.
-_PARTS = {
-    "calibration": (
-        "Calibration curves",
-        "On the dashed diagonal a method is exactly right; below it the δ curve is overconfident, above it too modest.",
-    ),
-    "error": (
-        "NLL by size of the error",
-        "Over the pixels of which the named method is confident, from a row's smallest errors to its largest. Low at "
-        "the right: large errors are noticed. High at the left: good predictions are distrusted.",
-    ),
-    "entropy": (
-        "Entropy by data set",
-        "How uncertain each method is, whether or not it should be: for data on which no calibration can be had.",
-    ),
-    "sweep": (
-        "Sweeps and ablations",
-        "Figures over the values of a setting, and below them differences at the same value, in pairs; bars and bands "
-        "are 95 % intervals.",
-    ),
-    "tradeoff": ("Calibration against cost", ""),
-    "latency": ("Where the time goes", ""),
-    "other": ("Further diagrams", ""),
-    STRIP: (
-        "Pictures: each method on a frame",
-        "Chosen before anything was computed: frames spread over the first sequences, not the ones that look best.",
-    ),
-    BREAKDOWN: ("Pictures: what the variance is made of", ""),
-    COMPARE: ("Pictures: UfM* against UfM", ""),
-    ROOM: ("Rooms as Gaussians", ""),
-}
 
 
 def write_page(
@@ -85,9 +55,7 @@ def write_page(
     more = len(sequences) - MOST_SEQUENCES
     words = f"The other {more} sequences are in the folder's tables." if more > 0 else ""
     overviews = [
-        _part(
-            title, [table for over, table in tables.items() if over is None], [t for over, t in tables.items() if over]
-        )
+        _part(title, [t for over, t in tables.items() if not over], [t for over, t in tables.items() if over])
         for title, tables in overview(results).items()
         if tables
     ]
@@ -191,15 +159,16 @@ def _pictures(
 ) -> tuple[list[Part], list[str]]:
     """Diagrams by kind, those of single sequences folded and last, then pictures by kind, as long as they fit into
     ``room`` bytes; and the names of those that do not."""
+    parts = tomllib.loads((TEMPLATES / "pictures.toml").read_text(encoding="utf-8"))
     todo: list[tuple[str, Path, dict[str, str]]] = []
     for path in figures:
         kind, *words = path.stem.replace("_", "-").split("-")
-        alt = f"{_PARTS.get(kind, _PARTS['other'])[0]}: {' '.join([kind, *words])}"
+        alt = f"{parts.get(kind, parts['other'])['title']}: {' '.join([kind, *words])}"
         folded = " ".join(words) if words[:1] == ["sequences"] else ""
         todo.append((kind, path, {"alt": alt, "title": "", "caption": "", "folded": folded}))
     todo.sort(key=lambda entry: bool(entry[2]["folded"]))
     todo += [(picture.kind, folder / picture.file, {**asdict(picture), "folded": ""}) for picture in pictures]
-    by_kind: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _PARTS}
+    by_kind: dict[str, list[dict[str, Any]]] = {kind: [] for kind in parts}
     left_out = []
     for kind, path, named in todo:
         uri, width, height = _embedded(path)
@@ -208,12 +177,8 @@ def _pictures(
         else:
             room -= len(uri)
             by_kind.get(kind, by_kind["other"]).append({**named, "uri": uri, "width": width, "height": height})
-    parts = [
-        {"kind": "pictures", "title": _PARTS[kind][0], "words": _PARTS[kind][1], "pictures": shown}
-        for kind, shown in by_kind.items()
-        if shown
-    ]
-    return parts, left_out
+    shown = {kind: of_kind for kind, of_kind in by_kind.items() if of_kind}
+    return [{"kind": "pictures", **parts[kind], "pictures": of_kind} for kind, of_kind in shown.items()], left_out
 
 
 def _embedded(path: Path) -> tuple[str, int, int]:

@@ -11,18 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import (
-    DEPTH_MAP,
-    ERROR_MAP,
-    FAINT,
-    INK,
-    INVALID_GREY,
-    ColourScale,
-    plain,
-    require_matplotlib,
-    robust_range,
-    save_png,
-)
+from ufmstar_torch.eval.report import colours
+from ufmstar_torch.eval.report.colours import FAINT, INK, ColourScale
 
 # (left, top, width, height) in pixels of the map.
 Box = tuple[int, int, int, int]
@@ -104,15 +94,15 @@ def draw_grid(
         draw_bar(axes_at(figure, left, bottom, bar.span * step - _GAP - 0.24, _BAR), bar)
     from matplotlib.patches import Rectangle
 
-    grey = (INVALID_GREY / 255,) * 3
+    grey = (colours.INVALID_GREY / 255,) * 3
     figure.add_artist(Rectangle((_MARGIN, bottom), 0.12, _BAR, color=grey, transform=figure.dpi_scale_trans))
     say(figure, _MARGIN + 0.18, bottom + _BAR / 2, "no value, no truth", size=7.5, color=FAINT, va="center")
-    save_png(figure, path)
+    colours.save_png(figure, path)
 
 
 def new_sheet(width: float, height: float, title: str) -> Any:
     """An empty figure with a title [in]."""
-    require_matplotlib()
+    colours.require_matplotlib()
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=110, facecolor="white")
@@ -122,7 +112,7 @@ def new_sheet(width: float, height: float, title: str) -> Any:
 
 def say(figure: Any, x: float, y: float, words: str, **how: Any) -> None:
     """Words at a place of a sheet [in]."""
-    figure.text(x, y, plain(words), transform=figure.dpi_scale_trans, **how)
+    figure.text(x, y, colours.plain(words), transform=figure.dpi_scale_trans, **how)
 
 
 def axes_at(figure: Any, left: float, bottom: float, width: float, height: float) -> Any:
@@ -145,7 +135,7 @@ def break_name(name: str, letters: int) -> str:
 def _draw_panel(axes: Any, panel: Panel) -> None:
     axes.set_axis_off()
     if panel.caption:
-        axes.set_title(plain(panel.caption), size=8, color=INK, pad=2.5)
+        axes.set_title(colours.plain(panel.caption), size=8, color=INK, pad=2.5)
     if panel.rgb is None:
         axes.text(0.5, 0.5, panel.absent, color=FAINT, size=8, ha="center", va="center", transform=axes.transAxes)
         return
@@ -253,10 +243,10 @@ def fit_scales(panels: Sequence[FramePanel]) -> PanelScales:
     That one ends at the larger of their 99th percentiles, so that a sigma as large as the error has its colour.
     """
     of = {name: [panel.maps[name] for panel in panels if name in panel.maps] for name in MAPS}
-    depth = robust_range([*of["depth"], *of["posterior"]], from_zero=False)
+    depth = colours.robust_range([*of["depth"], *of["posterior"]], from_zero=False)
     lengths = (of[name] for name in ("sigma", "error", "posterior_sigma", "posterior_error") if of[name])
-    high = max(robust_range(maps, from_zero=True)[1] for maps in lengths)
-    return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(0.0, high, ERROR_MAP))
+    high = max(colours.robust_range(maps, from_zero=True)[1] for maps in lengths)
+    return PanelScales(ColourScale(*depth, colours.DEPTH_MAP), ColourScale(0.0, high, colours.ERROR_MAP))
 
 
 def contact_sheet(
@@ -271,7 +261,7 @@ def contact_sheet(
     """
     if not panels:
         raise ValueError("panels must hold at least one frame")
-    require_matplotlib()
+    colours.require_matplotlib()
     columns = map_columns(panels) if columns is None else columns
     absent = ["no ground truth" if column.field == "error" else "none" for column in columns]
     rows = []

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
-from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, known_where, robust_range
+from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.examples import Example, Map, RowMaps, find_examples
+from ufmstar_torch.eval.report.examples import Example, find_examples
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.report.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
@@ -163,7 +163,7 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
 
 def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
     """Scales over the truth and these rows of a frame: depth between percentiles 1 and 99, lengths from 0 to 99."""
-    depths = [known_truth(example), *(known_depth(example.rows[row]) for row in rows)]
+    depths = [example.known_truth, *(example.rows[row].known_depth for row in rows)]
     lengths = [value for row in rows for value in (example.error(row), example.rows[row].sigma)]
     depth, length = robust_range(depths, from_zero=False), robust_range(lengths, from_zero=True)
     return PanelScales(ColourScale(*depth, DEPTH_MAP), ColourScale(*length, ERROR_MAP))
@@ -172,11 +172,11 @@ def fit_strip_scales(example: Example, rows: Sequence[str]) -> PanelScales:
 def draw_strip(folder: Path, example: Example, rows: Sequence[str], base: str) -> Picture:
     """Image and truth, then depth, error, standard deviation and NLL of each row of a base, on common scales."""
     scales = fit_strip_scales(example, rows)
-    truth = Panel(scales.depth.rgb(known_truth(example)), "ground truth")
+    truth = Panel(scales.depth.rgb(example.known_truth), "ground truth")
     head = GridRow(example.sequence, [f"frame {example.frame}"], [Panel(example.image, "image"), truth])
     body = []
     for row in rows:
-        depth = Panel(scales.depth.rgb(known_depth(example.rows[row])))
+        depth = Panel(scales.depth.rgb(example.rows[row].known_depth))
         body.append(GridRow(example.label(row), figures_of(example, row), [depth, *_judged(example, row, scales)]))
     body[0] = body[0].captioned(("predicted depth", "|error|", "σ = √V", "NLL"))
     bars = [
@@ -275,16 +275,6 @@ def _scaled(box: Box, shape: tuple[int, ...], picture: tuple[int, ...]) -> Box:
     y, x = picture[0] / shape[0], picture[1] / shape[1]
     left, top, width, height = box
     return round(left * x), round(top * y), max(1, round(width * x)), max(1, round(height * y))
-
-
-def known_truth(example: Example) -> Map:
-    """[h, w] ground truth [m], NaN where there is none."""
-    return known_where(example.truth > 0, example.truth)
-
-
-def known_depth(maps: RowMaps) -> Map:
-    """[h, w] predicted depth [m], NaN where invalid."""
-    return known_where(maps.valid, maps.depth)
 
 
 def _judged(example: Example, row: str, scales: PanelScales) -> tuple[Panel, Panel, Panel]:

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.report.panels import Bar, axes_at, draw_bar, new_sheet, 
 Array = NDArray[np.float64]
 # A patch that is evenly covered from -a to a has sigma = a / sqrt(3): so drawn, an ellipse is as large as its patch.
 SIGMAS = float(np.sqrt(3.0))
-# A ceiling hides the room from above; the highest camera is held well below it [m].
+# A ceiling hides the room from above: what lies so far above the highest camera is left out [m].
 HEADROOM = 0.3
 MOST_TIMES = 4
 ELEVATION = 35.0  # degrees
@@ -80,7 +80,9 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
         raise ValueError("snapshots must hold at least one Gaussian")
     scale = ColourScale(*robust_range([snapshot.root for snapshot in snapshots], from_zero=True), ERROR_MAP)
     views = views_of(np.stack([snapshot.T_world_cam for snapshot in snapshots]))
-    shown = [below_ceiling(snapshot, views[0].towards, snapshots) for snapshot in snapshots]
+    up = views[0].towards
+    ceiling = max(float((snapshot.path @ up).max()) for snapshot in snapshots) + HEADROOM
+    shown = [snapshot.take(snapshot.mean @ up <= ceiling) for snapshot in snapshots]
     limits = [_limits(view, shown) for view in views]
     tall = [_CELL * (high[1] - low[1]) / (high[0] - low[0]) for low, high in limits]
     width, bottom = _LEFT + len(snapshots) * _CELL + 0.1, _BOTTOM + sum(tall)
@@ -104,17 +106,6 @@ def draw_room(path: Path, snapshots: Sequence[Snapshot], title: str) -> ColourSc
     return scale
 
 
-def below_ceiling(snapshot: Snapshot, up: Array, all_times: Sequence[Snapshot]) -> Snapshot:
-    """The snapshot without the Gaussians that lie above every camera by more than ``HEADROOM``."""
-    highest = max(float((other.path @ up).max()) for other in all_times)
-    return snapshot.take(snapshot.mean @ up <= highest + HEADROOM)
-
-
-def far_to_near(view: Projection, snapshot: Snapshot) -> Snapshot:
-    """The Gaussians in the order in which they are painted, the farthest from the viewer first."""
-    return snapshot.take(np.argsort(snapshot.mean @ view.towards, kind="stable"))
-
-
 def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourScale) -> None:
     from matplotlib.collections import EllipseCollection
 
@@ -123,7 +114,7 @@ def _draw_view(axes: Any, view: Projection, snapshot: Snapshot, scale: ColourSca
     axes.set_yticks([])
     for side in axes.spines.values():
         side.set_color("#d9d9d9")
-    painted = far_to_near(view, snapshot)
+    painted = snapshot.take(np.argsort(snapshot.mean @ view.towards, kind="stable"))  # from far to near
     semi_axes, angle = project(view, painted.covariance)
     colours = scale.rgb(painted.root) / 255
     wide, narrow = 2 * semi_axes.T

@@ -17,41 +17,33 @@ TITLE, LABEL, TICK = 11, 9, 8  # sizes of letters [pt]
 DPI = 130
 
 
-class Style(NamedTuple):
-    """A line's colour (Okabe and Ito's, which the colour-blind tell apart) and mark (for print in grey)."""
+class Look(NamedTuple):
+    """A line's name, colour (Okabe and Ito's, which the colour-blind tell apart) and mark (for print in grey)."""
 
+    name: str
     colour: str
-    marker: str
+    marker: str = ""
 
     @property
     def line(self) -> dict[str, Any]:
         """For ``Axes.plot``."""
-        return {"color": self.colour, "marker": self.marker, "linewidth": 1.6, "markersize": 4.5}
+        return {
+            "label": self.name, "color": self.colour, "marker": self.marker, "linewidth": 1.6, "markersize": 4.5,
+        }  # fmt: skip
 
 
-ALONE_STYLE = Style("#6b6b6b", "^")
-
-
-def style_of(method: Method) -> Style:
-    """The same in every figure, whatever the network."""
+def look_of(method: Method) -> Look:
+    """The same in every figure, whatever the network: "alone", "UfM-100K", "UfM*", "UfM*-Full"."""
     if method.fusion == ALONE:
-        return ALONE_STYLE
+        return Look("alone", "#6b6b6b", "^")
+    full = "-Full" if method.full else ""
     if method.fusion == UFM:
-        if method.full:
-            return Style("#F0E442", "X")
-        return Style("#E69F00", "s") if method.max_points is None else Style("#D55E00", "v")
-    if method.full:
-        return Style("#009E73", "D")
-    return Style("#CC79A7", "P") if method.fixed_param else Style("#0072B2", "o")
-
-
-def short_name(method: Method) -> str:
-    """A method's name where its network stands elsewhere: "alone", "UfM-100K", "UfM*", "UfM*-Full"."""
-    if method.fusion == ALONE:
-        return "alone"
-    cap = "" if method.max_points is None else f"-{method.max_points // 1000}K"
-    name = "UfM" if method.fusion == UFM else "UfM*"
-    return f"{name}{'-Full' if method.full else ''}{cap}{' fixed-param' if method.fixed_param else ''}"
+        cap = "" if method.max_points is None else f"-{method.max_points // 1000}K"
+        colour = ("#F0E442", "X") if full else ("#D55E00", "v") if cap else ("#E69F00", "s")
+        return Look(f"UfM{full}{cap}", *colour)
+    fixed = " fixed-param" if method.fixed_param else ""
+    colour = ("#009E73", "D") if full else ("#CC79A7", "P") if fixed else ("#0072B2", "o")
+    return Look(f"UfM*{full}{fixed}", *colour)
 
 
 def new_figure(width: float, height: float, title: str) -> Any:
@@ -106,15 +98,16 @@ def spread_apart(places: Sequence[float], gap: float, low: float, high: float) -
     return [float(place) for place in spread]
 
 
-def label_ends(axes: Any, ends: Sequence[tuple[float, str, str]]) -> None:
-    """Names right of a panel, level with where their lines end, and apart from each other, for final limits of y; an
-    end is (y of the line's end, name, colour)."""
+def label_ends(axes: Any, ends: Sequence[tuple[float, Look]]) -> None:
+    """Names right of a panel, level with the y where their lines end, and apart from each other, for final limits of
+    y."""
     transform = axes.transData + axes.transAxes.inverted()
     x = axes.get_xlim()[1]
-    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _, _ in ends]
+    wanted = [min(max(float(transform.transform((x, y))[1]), 0.0), 1.0) for y, _ in ends]
     height = axes.get_position().height * axes.figure.get_figheight()
-    for place, (_, name, colour) in zip(spread_apart(wanted, 1.25 * TICK / 72 / height, 0, 1), ends, strict=True):
-        axes.text(1.02, place, plain(name), transform=axes.transAxes, color=colour, size=TICK, va="center", ha="left")
+    for place, (_, look) in zip(spread_apart(wanted, 1.25 * TICK / 72 / height, 0, 1), ends, strict=True):
+        where = {"transform": axes.transAxes, "va": "center", "ha": "left"}
+        axes.text(1.02, place, plain(look.name), color=look.colour, size=TICK, **where)
 
 
 def stretch(axes: Any, values: Sequence[float], factor: float, **about_zero: float) -> None:

@@ -107,10 +107,12 @@ def significant(value: float) -> int:
     return max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
 
 
-def mark_best(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
+def mark_best(cells: Sequence[Cell], quantity: Quantity | None) -> list[Cell]:
     """Bold where a cell prints the best value of its block; none where all print the same, or there is one alone."""
+    if quantity is None or quantity.better is None:
+        return list(cells)
     printed = [float(cell.value) for cell in cells if cell.value]
-    if quantity.better is None or len(set(printed)) < 2:
+    if len(set(printed)) < 2:
         return list(cells)
     best = min(printed) if quantity.better == LOWER else max(printed)
     return [replace(cell, bold=bool(cell.value) and float(cell.value) == best) for cell in cells]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -44,13 +44,11 @@ def sequence_tables(results: Results, dataset: str) -> list[Table]:
     """The paper's columns for each sequence of a data set: no intervals, since it is one."""
     tables = []
     for name, sequence in results.sequences(dataset):
-        of = {row: [r for r in results.of(row, name) if r.sequence == sequence] for row in results.rows}
-        records = {row: listed for row, listed in of.items() if listed}
+        records = {row: listed for row in results.rows if (listed := results.of(row, name, sequence))}
         counts = (value_of(listed[0], "frames.done") for listed in records.values())
         frames = max((int(count) for count in counts if count == count), default=0)
-        lines = _lines({row: _cells(listed, MAIN) for row, listed in records.items()}, MAIN)
         title = f"{name}, {sequence}" + (f": {frames} frames" if frames else "")
-        tables.append(Table(f"{name}-{sequence}", title, METHOD, _columns(MAIN, ""), lines))
+        tables.append(_table(f"{name}-{sequence}", title, records, _figures(records, MAIN, "")))
     return tables
 
 
@@ -87,80 +85,91 @@ def _difference_cell(mean: Mean, quantity: Quantity) -> Cell:
     return cell if verdict is not False else replace(cell, remark="worse")
 
 
+class _Figures(NamedTuple):
+    """A column: its heading, its cells by row, and the figure by which the best of a block is marked."""
+
+    head: Column
+    cells: Mapping[Row, Cell]
+    quantity: Quantity | None = None
+
+
 def _means(
     results: Results, dataset: str | None, quantities: Sequence[Quantity], name: str, quoted: PaperTable | None = None
 ) -> Table:
     """A table of means over the sequences of one data set, or of all; the paper's columns last."""
     records = {row: listed for row in results.rows if (listed := results.of(row, dataset))}
     alike = len({frozenset((r.dataset, r.sequence) for r in listed) for listed in records.values()}) == 1
-    cells = {row: _cells(listed, quantities) for row, listed in records.items()}
-    costs = {row: _costs(results.efficiency, row, listed) for row, listed in records.items()} if name == "main" else {}
-    if any(cell.value for pair in costs.values() for cell in pair):
-        quantities = (*quantities, ENERGY, MEMORY)
-        cells = {row: [*listed, *costs[row]] for row, listed in cells.items()}
     group = "Ours" if quoted else ""
-    columns = _columns(quantities, group)
+    columns = _figures(records, quantities, group)
     notes = [_network_note(results), _prepared_note(records), _interval_note(records), _nll_note(records, quantities)]
-    if ENERGY in quantities:
+    costs = _costs(results.efficiency, records, group) if name == "main" and results.efficiency else []
+    if any(cell.value for column in costs for cell in column.cells.values()):
+        columns += costs
         notes.append(_cost_note(results.efficiency or {}))
     if not alike:
-        columns = [Column(group, "sequences", "Sequences"), *columns]
-        cells = {row: [Cell(str(len(records[row]))), *listed] for row, listed in cells.items()}
+        counts = {row: Cell(str(len(listed))) for row, listed in records.items()}
+        unmarked = (column._replace(quantity=None) for column in columns)
+        columns = [_Figures(Column(group, "sequences", "Sequences"), counts), *unmarked]
         notes.append("The rows are means over different sequences, so none is marked as the best.")
-    lines = _lines(cells, quantities if alike else ())
     if quoted:
-        theirs = [_PAPER_COLUMNS[key] for key in quoted.columns]
-        columns += [Column("Paper", f"paper: {q.with_unit(q.name)}", q.with_unit(q.latex)) for q in theirs]
-        labels = row_labels(cells)
-        rows = {labels[row]: quoted.rows.get(row.method.name, {}) for row in plain_rows(cells)}
-        lines = [
-            line._replace(cells=(*line.cells, *(rows.get(line.label, {}).get(c, Cell()) for c in quoted.columns)))
-            for line in lines
-        ]
+        columns += _quoted(quoted, records)
         notes.append(
             f"The paper's own figures are of {quoted.network} on {quoted.measured_on}; compare the differences between "
             "rows, not the rows with each other."
         )
-    return Table(
-        name, f"{results.title}, {_where(results, dataset)}", METHOD, columns, lines, tuple(filter(None, notes))
-    )
+    title = f"{results.title}, {_where(results, dataset)}"
+    return _table(name, title, records, columns, tuple(filter(None, notes)))
 
 
-def _cells(records: Sequence[Record], quantities: Sequence[Quantity]) -> list[Cell]:
-    return [Cell.of(mean_of(records, q), q.decimals) for q in quantities]
+def _figures(records: Mapping[Row, Sequence[Record]], quantities: Sequence[Quantity], group: str) -> list[_Figures]:
+    means = [(q, {row: mean_of(listed, q) for row, listed in records.items()}) for q in quantities]
+    return [_column(quantity, group, of_rows) for quantity, of_rows in means]
 
 
-def _costs(efficiency: Mapping[str, Any] | None, row: Row, records: Sequence[Record]) -> tuple[Cell, Cell]:
-    """Energy and memory of a row's uncertainty: energy over the sequences that were measured, memory over all of them;
-    dashes where nothing was measured."""
-    line = next((line for line in (efficiency or {}).get("rows", ()) if line["row"] == row.label), None)
-    if efficiency is None or line is None:
-        return Cell(), Cell()
-    where = {(record.dataset, record.sequence) for record in records}
-    measured = (one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in where)
-    spent = mean_over(v for one in measured if (v := one["energy_mj"].get(row.label)) is not None)
-    network = line["memory"].get("network_uncertainty_bytes")
-    kept = [] if network is None else [1e-6 * (network + (r.state.get("bytes_mean") or 0.0)) for r in records]
-    return Cell.of(spent, ENERGY.decimals), Cell.of(mean_over(kept), MEMORY.decimals)
+def _column(quantity: Quantity, group: str, means: Mapping[Row, Mean]) -> _Figures:
+    cells = {row: Cell.of(mean, quantity.decimals) for row, mean in means.items()}
+    return _Figures(Column(group, quantity.heading, quantity.latex_heading), cells, quantity)
 
 
-def _columns(quantities: Sequence[Quantity], group: str) -> list[Column]:
-    return [Column(group, q.heading, q.latex_heading) for q in quantities]
+def _costs(efficiency: Mapping[str, Any], records: Mapping[Row, Sequence[Record]], group: str) -> list[_Figures]:
+    """Energy and memory of the rows' uncertainty: energy over the sequences that were measured, memory over all of
+    them; dashes where nothing was measured."""
+    measured_rows = {line["row"]: line for line in efficiency.get("rows", ())}
+    spent, kept = {}, {}
+    for row, listed in records.items():
+        if row.label in measured_rows:
+            where = {(record.dataset, record.sequence) for record in listed}
+            measured = (one for one in efficiency.get("sequences", ()) if (one["dataset"], one["sequence"]) in where)
+            spent[row] = mean_over(v for one in measured if (v := one["energy_mj"].get(row.label)) is not None)
+            network = measured_rows[row.label]["memory"].get("network_uncertainty_bytes")
+            sizes = () if network is None else (network + (r.state.get("bytes_mean") or 0.0) for r in listed)
+            kept[row] = mean_over(1e-6 * size for size in sizes)
+    return [_column(ENERGY, group, spent), _column(MEMORY, group, kept)]
 
 
-def _lines(cells: Mapping[Row, Sequence[Cell]], quantities: Sequence[Quantity]) -> list[Line]:
+def _quoted(quoted: PaperTable, rows: Iterable[Row]) -> list[_Figures]:
+    """The paper's columns, for rows of its own settings."""
+    theirs = {row: quoted.rows.get(row.method.name, {}) for row in plain_rows(rows)}
+    columns = []
+    for key in quoted.columns:
+        q = _PAPER_COLUMNS[key]
+        head = Column("Paper", f"paper: {q.with_unit(q.name)}", q.with_unit(q.latex))
+        columns.append(_Figures(head, {row: cells[key] for row, cells in theirs.items() if key in cells}))
+    return columns
+
+
+def _table(name: str, title: str, rows: Iterable[Row], columns: Sequence[_Figures], notes: Sequence[str] = ()) -> Table:
     """Rows by base, the best of each in bold; one block where every base has a single row, as in table 4."""
-    bases = [row.method.base for row in cells]
+    labels = row_labels(rows)
+    bases = [row.method.base for row in labels]
     together = len(set(bases)) == len(bases)
-    lines, labels = [], row_labels(cells)
-    for block, (_, group) in enumerate(groupby(cells, key=lambda row: None if together else row.method.base)):
-        rows = list(group)
-        columns: list[Sequence[Cell]] = list(zip(*(cells[row] for row in rows), strict=True))
-        if quantities:
-            columns = [mark_best(column, q) for column, q in zip(columns, quantities, strict=True)]
-        for row, of_row in zip(rows, zip(*columns, strict=True), strict=True):
-            lines.append(Line(block, labels[row], row.method.fusion == UFM_STAR, of_row))
-    return lines
+    lines = []
+    for block, (_, group) in enumerate(groupby(labels, key=lambda row: None if together else row.method.base)):
+        of_block = list(group)
+        marked = [mark_best([c.cells.get(row, Cell()) for row in of_block], c.quantity) for c in columns]
+        for row, cells in zip(of_block, zip(*marked, strict=True), strict=True):
+            lines.append(Line(block, labels[row], row.method.fusion == UFM_STAR, cells))
+    return Table(name, title, METHOD, [column.head for column in columns], lines, notes)
 
 
 def _where(results: Results, dataset: str | None) -> str:

@@ -16,27 +16,14 @@ from ufmstar_torch.eval.report.tables import NLL_OF_FEW, main_table
 from ufmstar_torch.eval.report.write import Report
 from ufmstar_torch.eval.results.summary import NEAR_ZERO
 
-_DEMO_COLUMNS = {
-    "delta1": "delta1",
-    "nll": "NLL",
-    "ece_delta": "ECE_delta",
-    "ece_q": "ECE_q",
-    "ause_rmse": "AUSE [m]",
-}
+_CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}
+_DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}
+_RUN_COLUMNS = {"delta1": "delta1", "abs_rel": "AbsRel", "rmse": "RMSE [m]", **_CALIBRATION, "spearman": "Spearman"}
 # What the counts of a frame's anchors mean, by their source: how many have a depth there, and of how many.
 _FOUND = {
     "tracked": ("triangulated", "tracked"),
     "landmarks": ("in view", "in the map"),
     "dense": ("with a depth", "searched or seen again"),
-}
-_RUN_COLUMNS = {
-    "delta1": "delta1",
-    "abs_rel": "AbsRel",
-    "rmse": "RMSE [m]",
-    "nll": "NLL",
-    "ece_delta": "ECE_delta",
-    "ece_q": "ECE_q",
-    "spearman": "Spearman",
 }
 
 

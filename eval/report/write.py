@@ -9,15 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ufmstar_torch.eval.report import figures_cost, figures_curves, figures_sweep
 from ufmstar_torch.eval.report.data import Results, load_results
-from ufmstar_torch.eval.report.figures_cost import draw_latency, draw_stages, draw_tradeoff
-from ufmstar_torch.eval.report.figures_curves import (
-    draw_calibration,
-    draw_entropy,
-    draw_error,
-    draw_sequence_calibration,
-)
-from ufmstar_torch.eval.report.figures_sweep import draw_changes, draw_sweep, sweeps
 from ufmstar_torch.eval.report.page import write_page
 from ufmstar_torch.eval.report.pictures import Picture, pictures_of
 from ufmstar_torch.eval.report.style import save_figure
@@ -64,20 +57,20 @@ def write_report(out: Path, *, figures: bool = True, pictures: str = "svg") -> R
 def figures_of(results: Results) -> Iterator[tuple[str, Callable[[], Any]]]:
     """Name (its first word is the kind) and function of every figure; None where there is nothing to draw."""
     for dataset in results.datasets:
-        yield f"calibration {dataset}", partial(draw_calibration, results, dataset)
+        yield f"calibration {dataset}", partial(figures_curves.draw_calibration, results, dataset)
         for base in results.bases:
             name = f"calibration sequences {dataset} {base}"
-            yield name, partial(draw_sequence_calibration, results, dataset, base)
-        yield f"error {dataset}", partial(draw_error, results, dataset)
+            yield name, partial(figures_curves.draw_sequence_calibration, results, dataset, base)
+        yield f"error {dataset}", partial(figures_curves.draw_error, results, dataset)
     for base in results.bases:
-        yield f"entropy {base}", partial(draw_entropy, results, base)
-    for base, name in sweeps(results):
-        yield f"sweep {base} {name}", partial(draw_sweep, results, base, name)
+        yield f"entropy {base}", partial(figures_curves.draw_entropy, results, base)
+    for base, name in figures_sweep.sweeps(results):
+        yield f"sweep {base} {name}", partial(figures_sweep.draw_sweep, results, base, name)
     for base in results.bases:
-        yield f"sweep changes {base}", partial(draw_changes, results, base)
-    yield "latency", partial(draw_latency, results)
-    yield "latency stages", partial(draw_stages, results)
-    yield "tradeoff", partial(draw_tradeoff, results)
+        yield f"sweep changes {base}", partial(figures_sweep.draw_changes, results, base)
+    yield "latency", partial(figures_cost.draw_latency, results)
+    yield "latency stages", partial(figures_cost.draw_stages, results)
+    yield "tradeoff", partial(figures_cost.draw_tradeoff, results)
 
 
 def _draw(results: Results, kind: str, undrawn: dict[str, str]) -> list[Path]:

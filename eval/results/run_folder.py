@@ -113,18 +113,17 @@ class RunFolder:
         self._journal.flush()
         checkpoint.journal_bytes = self.checkpoint.journal_bytes + len(line)
         if monotonic() - self._stored_at >= STATE_EVERY:
-            self._store(checkpoint)
+            self.store(checkpoint)
         # Through JSON, so that this run and one that is continued compute with the same numbers.
         self.records.append(json.loads(line))
         self.checkpoint = checkpoint
 
-    def store(self) -> None:
-        """Keep the state after the last finished frame on disk, for a run that goes on from it. Raises OSError: a full
-        disk, say; the state before stays."""
-        if self._stored is not self.checkpoint:
-            self._store(self.checkpoint)
-
-    def _store(self, checkpoint: Checkpoint) -> None:
+    def store(self, checkpoint: Checkpoint | None = None) -> None:
+        """Keep a state on disk, for a run that goes on from it: None = that after the last finished frame. Raises
+        OSError: a full disk, say; the state before stays."""
+        checkpoint = checkpoint or self.checkpoint
+        if self._stored is checkpoint:
+            return
         # Plain values and tensors, large ones by their non-zero entries.
         sums = {name: {key: pack(value) for key, value in own.items()} for name, own in checkpoint.metrics.items()}
         content = {**checkpoint.__dict__, "format": FORMAT, "metrics": sums}
