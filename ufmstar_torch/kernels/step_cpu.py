@@ -91,7 +91,8 @@ def step(
         joined = _join(state, frame, segments, cameras[0], pairs, config)
     stage("fuse")
 
-    learnt, views = None, None
+    learnt: Learnt | None = None
+    views: list[View] | None = None
     if config.anchored:
         learnt, views = _learn(state, joined, frame, anchors, config)
     stage("append")
