@@ -18,6 +18,8 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.optional import optional
+
 # Where training programs put the weights inside a checkpoint, and what wrappers put before every key.
 _CONTAINERS = ("state_dict", "model_state_dict", "model")
 _PREFIXES = ("module.", "_orig_mod.", "state_dict.", "model.", "network.")
@@ -97,7 +99,7 @@ def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[st
     not installed."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"no file of weights {path}")
-    safetensors = _safetensors()
+    safetensors = _safetensors("safetensors")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             keys = [] if prefix is None else [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118
@@ -141,7 +143,7 @@ def _write(file: Any, path: Path, state: dict[str, Tensor], metadata: str) -> No
     if path.suffix == ".safetensors":
         # Tensors that share memory are not allowed there; a copy each costs little.
         separate = {key: value.clone() for key, value in state.items()}
-        file.write(_safetensors().torch.save(separate, metadata={"metadata": metadata}))
+        file.write(_safetensors("safetensors.torch").save(separate, metadata={"metadata": metadata}))
     elif path.suffix in _TORCH_SUFFIXES:
         torch.save({"state_dict": state, "metadata": json.loads(metadata)}, file)
     else:
@@ -207,11 +209,5 @@ def some(keys: list[Any]) -> str:
     return ", ".join(str(key) for key in keys[:_SHOWN]) + more
 
 
-def _safetensors() -> Any:
-    """The package, imported when first needed."""
-    try:
-        import safetensors.torch
-    except ModuleNotFoundError as error:
-        message = "a .safetensors file needs the package safetensors: pip install safetensors"
-        raise ModuleNotFoundError(message) from error
-    return safetensors
+def _safetensors(module: str) -> Any:
+    return optional(module, "a .safetensors file needs the package safetensors", "safetensors")

@@ -22,6 +22,7 @@ from ufmstar_torch.models.checkpoints import channels_of, fill, load_state_dict_
 from ufmstar_torch.models.dropout import DecoderDropout
 from ufmstar_torch.models.network import Backbone, fits, require_image
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.optional import optional
 
 MULTIPLE = 32  # [px] five halvings
 SMALLEST = 64  # [px] borders cannot be reflected in a map of a single pixel
@@ -244,9 +245,5 @@ def _convolution(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 def _torchvision_models() -> Any:
-    """torchvision, imported when first needed: it takes seconds."""
-    try:
-        import torchvision.models
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("a ResNet encoder needs torchvision: pip install torchvision") from error
-    return torchvision.models
+    """torchvision's, imported when first needed: it takes seconds."""
+    return optional("torchvision.models", "a ResNet encoder needs torchvision", "torchvision")

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from ufmstar_torch.checked import choice
 from ufmstar_torch.models.network import DepthNetwork, require_image
 from ufmstar_torch.models.outputs import ProgramSpec
 from ufmstar_torch.models.preprocess import Preprocess
+from ufmstar_torch.optional import optional
 from ufmstar_torch.prediction import DepthPrediction
 
 if TYPE_CHECKING:
@@ -247,15 +247,9 @@ def providers_for(device: torch.device) -> tuple[str, ...]:
     return (gpu, cpu) if device.type == "cuda" and gpu in here else (cpu,)
 
 
-def _onnxruntime() -> ModuleType:
-    try:
-        import onnxruntime
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "running an ONNX network needs the package onnxruntime: pip install 'ufmstar-torch[models]'"
-        ) from error
-    module: ModuleType = onnxruntime
-    return module
+def _onnxruntime() -> Any:
+    need = "running an ONNX network needs the package onnxruntime"
+    return optional("onnxruntime", need, "'ufmstar-torch[models]'")
 
 
 def _fixed(node: NodeArg) -> list[int | None]:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from ufmstar_torch.optional import optional
+
 if TYPE_CHECKING:
     from onnx import ModelProto
 
@@ -44,17 +46,13 @@ class ConvWeights:
 def load_onnx_graph(path: str | Path) -> ModelProto:
     """The parsed file. Raises ModuleNotFoundError: ``onnx`` is not installed (extra ``models``); FileNotFoundError:
     there is no such file; ValueError: the file is not ONNX, or cut off."""
-    try:
-        import onnx
-        from google.protobuf.message import DecodeError
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "reading weights from an ONNX file needs the package onnx: pip install 'ufmstar-torch[models]'"
-        ) from error
+    onnx = optional("onnx", "reading weights from an ONNX file needs the package onnx", "'ufmstar-torch[models]'")
+    from google.protobuf.message import DecodeError
+
     if not Path(path).is_file():
         raise FileNotFoundError(f"no ONNX file {path}")
     try:
-        model = onnx.load(str(path))
+        model: ModelProto = onnx.load(str(path))
     except DecodeError as error:
         raise ValueError(f"{path} is not a readable ONNX file ({error}): cut off or of another kind?") from error
     if not model.graph.node:

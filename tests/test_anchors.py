@@ -135,8 +135,9 @@ def test_what_is_claimed_is_the_larger_of_disagreement_and_lesson():
     assert 0.05 < float((often.anchored[often.valid] == 0).double().mean()) < 0.95, "M is the larger in some places"
     torch.testing.assert_close(often.variance, often.disagreement + often.anchored, rtol=0, atol=0, equal_nan=True)
     d2, m = torch.tensor([[4.0, 4.0, 1.0]]), torch.tensor([[0.1, 0.9, 0.2]])
-    term = anchored_term(d2.sqrt(), torch.tensor([[0.2, 0.2, -0.3]]), m)
-    torch.testing.assert_close(term + m, torch.tensor([[0.8, 0.9, 0.2]]))
+    term, both = anchored_term(d2.sqrt(), torch.tensor([[0.2, 0.2, -0.3]]), m)
+    torch.testing.assert_close(both, torch.tensor([[0.8, 0.9, 0.2]]))
+    torch.testing.assert_close(term, both - m)
 
 
 def rows(values, valid=None, pixel=None):

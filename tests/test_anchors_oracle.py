@@ -12,9 +12,10 @@ import scenes
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.evidence import Evidence, inliers
 from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors, check_values
-from ufmstar_torch.anchors.hook import learn
+from ufmstar_torch.anchors.hook import anchored_term, learn
 from ufmstar_torch.frame import check_frame
 from ufmstar_torch.kernels import anchors_cpu
+from ufmstar_torch.kernels.regress_cpu import all_seen, regress_maps
 from ufmstar_torch.regress import distribute
 
 pytestmark = pytest.mark.numerics
@@ -141,6 +142,36 @@ def test_compiled_checks_are_the_references_own():
             assert torch.equal(getattr(fast, name), getattr(slow, name)), name
         assert torch.equal(fast.index[slow.valid], slow.index[slow.valid])
         assert 0 <= int(fast.index.min()) <= int(fast.index.max()) < size[0] * size[1]
+
+
+def test_the_compiled_term_is_the_references_own():
+    generator = torch.Generator().manual_seed(0)
+    depth, excess, disagreement = torch.rand(3, 2, 30, 40, generator=generator)
+    disagreement[0, :5], excess[1, 5:9] = torch.nan, -1.0
+    given = depth, 0.2 * excess, 0.1 * disagreement
+    for mine, value in zip(anchors_cpu.anchored_term(*given), anchored_term(*given), strict=True):
+        torch.testing.assert_close(mine, value, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_what_was_learnt_may_be_small_and_is_moved_by_the_streams(some):
+    """Sums of tiny features stay tiny; the stream's means are added to two features and no other."""
+    depths, poses, K = scenes.sequence(1, HEIGHT, WIDTH, 0.04)
+    walked = UfMStar(ANCHORED.replace(backend="numba"))
+    walked(torch.tensor(depths[0])[None], torch.tensor(poses[0]), torch.tensor(K))
+    seen, _ = all_seen(walked.mixture.to(torch.float64), features=3)
+    seen[0].features[:] = 1e-32, 0.5, 1.0
+    pixels = torch.arange(0, HEIGHT * WIDTH, 7)[None] if some else None
+    depth = torch.tensor(depths[0], dtype=torch.float32)[None].nan_to_num(0, posinf=0).clamp_min(0)
+    given = seen, depth, torch.tensor(K)[None], ANCHORED, pixels, None
+    plain = regress_maps(*given).features
+    moved = regress_maps(*given, np.array([[0.25, -0.125]])).features
+    offset = torch.tensor([0.25, -0.125, 0.0])
+    torch.testing.assert_close(moved, plain + offset, rtol=0, atol=0, equal_nan=True)
+    fine = plain[~plain[..., 0].isnan()]
+    assert len(fine) > 100
+    assert 0 <= float(fine[:, 0].min()) <= float(fine[:, 0].max()) < 1e-30
+    torch.testing.assert_close(fine[:, 1], 0.5 * fine[:, 2], rtol=1e-6, atol=1e-30)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 2e-6)])

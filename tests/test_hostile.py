@@ -11,6 +11,7 @@ import os
 import numpy as np
 import pytest
 import torch
+from modules import same
 
 import scenes
 from ufmstar_torch import SPGFConfig, UfMStar, UfMStarConfig
@@ -142,11 +143,6 @@ def spoil(rng, given):
     if isinstance(value, torch.Tensor):
         wrong += [value[:1, 1:], value.flatten(), value.to(torch.complex64), value.to("meta"), value[:0]]
     return given | {name: wrong[rng.integers(len(wrong))]}
-
-
-def same(one, other):
-    """Equal bits, NaN where NaN."""
-    return torch.equal(torch.nan_to_num(one, nan=-1.0), torch.nan_to_num(other, nan=-1.0))
 
 
 def assert_in_order(ufm, session):

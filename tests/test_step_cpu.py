@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -145,18 +146,23 @@ def test_what_is_out_of_reach_neither_matches_nor_is_summed(dtype):
     T = torch.tensor(scenes.look((0.3, -0.2, 0.1), 0.7, 0.4)).numpy()
     slots = [v.numpy().astype(dtype) for v in (far, m.covariance[0] * scale, m.weight[0])]
     motion, camera = rigid_cpu.relative(np.eye(4), T), K.numpy()
-    mean, covariance = np.zeros((400, 3)), np.zeros((400, 3, 3))
-    rigid_cpu.move(motion, *slots, 0, np.empty(0, np.bool_), mean, covariance)
-    everyone, weight = np.arange(400), slots[2].astype(np.float64)
-    near, occupied = reach_cpu.reached(motion, *slots, camera, SIZE, 1.0, 1e-6, 0)
+    everyone, here = np.arange(400), np.zeros((rigid_cpu.FIELDS, 400))
+    rigid_cpu.gather(everyone, 400, *slots, here)
+    mean, covariance, weight = here[:3].T, here[3:12].T.reshape(-1, 3, 3), here[12]
+    mean, covariance = mean @ motion[:, :3].T + motion[:, 3], motion[:, :3] @ covariance @ motion[:, :3].T
+    here[:12] = np.concatenate([mean, covariance.reshape(-1, 9)], 1).T
+    near, occupied = numba.njit(lambda *args: reach_cpu.reached(*args))(motion, *slots, camera, SIZE, 1.0, 1e-6, 0)
     u, v = (camera[i, i] * mean[:, i] / mean[:, 2] + camera[i, 2] for i in range(2))
     inside = (u >= -0.5) & (u < SIZE[1] - 0.5) & (v >= -0.5) & (v < SIZE[0] - 0.5) & (mean[:, 2] > 0.05)
-    args = (mean, covariance, weight, weight, np.zeros((400, 0)), camera, np.full(SIZE, 1e4), 1.0, 0.0, 1e-6)
-    summed = in_view(everyone, 400, *args)[0]
+    args = (400, camera, np.full(SIZE, 1e4), 1.0, 0.0, 1e-6)
+    summed = in_view(here, weight.copy(), np.zeros((400, 0)), *args)[0]
     assert occupied == 400
     assert set(everyone[inside]) | set(summed) <= set(near)
     assert 20 < len(set(everyone[inside]) | set(summed)) <= len(near) < 300
-    assert np.array_equal(in_view(near, 400, *args)[0], summed)
+    chosen = np.zeros((rigid_cpu.FIELDS, rigid_cpu.padded(len(near))))
+    chosen[:, : len(near)] = here[:, near]
+    again = in_view(chosen, weight[near], np.zeros((len(near), 0)), *args)[0]
+    assert np.array_equal(near[again], summed)
 
 
 def test_the_state_before_is_not_modified():

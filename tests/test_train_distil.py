@@ -219,8 +219,8 @@ def test_clips_are_whole_and_every_frame_is_in_one_batch(room):
     frames = [[key.frame for key in batch] for step in steps for batch in step]
     assert sorted(frames) == [list(clip) for clip in found]
     truth = truth_at(room.sequences[0][3], room.sequences[0].intrinsics, SIZE)
-    torch.testing.assert_close(room.load(3).depth, torch.from_numpy(truth))
-    torch.testing.assert_close(room.load(3).T_world_cam.numpy(), room.sequences[0][3].T_world_cam)
+    np.testing.assert_array_equal(room.load(3).depth, truth)
+    np.testing.assert_array_equal(room.load(3).T_world_cam, room.sequences[0][3].T_world_cam)
 
 
 def test_what_cannot_be_clips_is_refused(room, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
+from modules import same
 from torch.utils._python_dispatch import TorchDispatchMode
 from walks import HEIGHT, SPGF, WIDTH, oracle_run, oracle_settings, run, walk, walks
 
@@ -98,15 +99,11 @@ def test_streams_together_equal_streams_alone_to_the_last_bit(backend, variant):
         for a, b in zip(together, alone, strict=True):
             for name in ("variance", "disagreement", "labels", "bias", "features"):
                 x, y = getattr(a, name), getattr(b, name)
-                assert x is y is None or same_bits(x[s], y[0]), name
+                assert x is y is None or same(x[s], y[0]), name
             assert a.statistics.components[s] == b.statistics.components[0]
         k = int(single.mixture.components)
         for name, value in single.mixture.tensors().items():
-            assert same_bits(all_three.mixture.tensors()[name][s, :k], value[0, :k]), name
-
-
-def same_bits(a, b):
-    return torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) and torch.equal(a.isnan(), b.isnan())
+            assert same(all_three.mixture.tensors()[name][s, :k], value[0, :k]), name
 
 
 class Products(TorchDispatchMode):
@@ -153,11 +150,11 @@ def test_an_observer_follows_the_stages_and_changes_no_bit(backend):
     watched.observer = Trace()
     for depth, pose, K, anchors in walks(2, 3):
         a, b = (m(depth, pose, K, anchors=anchors) for m in (watched, plain))
-        assert same_bits(a.variance, b.variance)
+        assert same(a.variance, b.variance)
         assert " ".join(watched.observer.events) == OBSERVED[backend]
         watched.observer.events.clear()
     for name, value in plain.state_dict().items():
-        assert same_bits(value, watched.state_dict()[name])
+        assert same(value, watched.state_dict()[name])
     watched.mean_uncertainty(depth, pose, K)
     assert watched.observer.events[-2:] == ["regress", "average"]
 

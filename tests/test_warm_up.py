@@ -137,8 +137,7 @@ def test_the_jobs_of_a_command_compile_all_in_one_pass():
 @pytest.mark.slow
 def test_a_cold_start_compiles_the_regression_beside_and_gives_the_same(tmp_path):
     def run(folder) -> dict:
-        # Unoptimised code takes half the time to compile; here it matters what is compiled where.
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder), "OMP_NUM_THREADS": "1", "NUMBA_OPT": "0"}
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder), "OMP_NUM_THREADS": "1"}
         done = subprocess.run([sys.executable, "-c", COLD], env=environment, capture_output=True, text=True, check=True)
         return json.loads(done.stdout)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import h5py
 import numpy as np
-import torch
 
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import (
@@ -60,8 +59,7 @@ class Numbered:
     def load(self, index: int) -> RawSample:
         if index in self.broken:
             raise SampleError(self.name(index), "torn")
-        image = torch.full((3, 6, 8), index, dtype=torch.uint8)
-        return RawSample(image, torch.full((6, 8), index + 1.0), torch.eye(3, dtype=torch.float64) + 2)
+        return RawSample(np.full((3, 6, 8), index, np.uint8), np.full((6, 8), index + 1, np.float32), np.eye(3) + 2)
 
 
 def numbers(batch) -> list[int]:

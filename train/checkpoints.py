@@ -49,12 +49,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class Checkpoints(pl.Callback):
-    """Writes ``last.ckpt`` every so many steps and at the end of every epoch, after its validation.
-
-    Args:
-        path: of the file.
-        every: steps; 0 = at the end of epochs only.
-    """
+    """Writes ``last.ckpt`` every so many steps (0 = never) and at the end of every epoch, after its validation."""
 
     def __init__(self, path: Path, every: int) -> None:
         self.path = path
@@ -81,16 +76,8 @@ class Checkpoints(pl.Callback):
 
 
 class Stops(pl.Callback):
-    """Ends a training in good order, after a validation: with its last step, at a deadline, or when asked to.
-
-    Args:
-        total: steps of the whole training.
-        deadline: ``time.monotonic()`` at which to stop, or None.
-        asked: returns whether to stop.
-
-    Attributes:
-        reason: why it was stopped, or None.
-    """
+    """Ends a training in good order, after a validation: with its last step of ``total``, at a deadline in
+    ``time.monotonic()``'s seconds, or when ``asked`` returns True. ``reason``: why it was stopped, or None."""
 
     def __init__(self, total: int, deadline: float | None = None, asked: Callable[[], bool] | None = None) -> None:
         self.total = total

@@ -22,14 +22,8 @@ PICTURES = 20
 
 
 class Examples(pl.Callback):
-    """Draws ``examples/epoch_007.png`` in the member's folder, on the first process.
-
-    Args:
-        folder: of the member.
-        data: whose validation part is shown.
-        count: frames, spread over the validation part.
-        epochs: of the training; the last one is drawn always.
-    """
+    """Draws ``examples/epoch_007.png`` in the member's folder, on the first process: ``count`` frames, spread over the
+    validation part. The last of the training's epochs is drawn always."""
 
     def __init__(self, folder: Path, data: DepthDataModule, count: int, epochs: int) -> None:
         self.folder = folder / FOLDER

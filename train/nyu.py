@@ -13,19 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
-from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.eval.results.files import write_atomic
 from ufmstar_torch.eval.sequences.frame import FrameError
+from ufmstar_torch.eval.sequences.intrinsics import pinhole, scale_intrinsics
 from ufmstar_torch.eval.sequences.nyu import INTRINSICS, NATIVE_SIZE, PARTS, part_files, read_h5
 from ufmstar_torch.train.samples import RawSample, SampleError
 
 if TYPE_CHECKING:
     import h5py
 
-# [1] Files whose aspect ratio differs by more were cropped, so that the calibration does not hold for them.
-_ASPECT_TOLERANCE = 0.02
 # Of scenes, taken in alphabetical order, every this many goes into the validation part where no split is given.
 _VALIDATION_EVERY = 4
 
@@ -61,11 +58,7 @@ class NyuFrames:
             rgb, depth = read_h5(path)
         except FrameError as error:
             raise SampleError(str(path), error.reason) from error
-        return RawSample(
-            image=torch.from_numpy(rgb),
-            depth=torch.from_numpy(depth.astype(np.float32)),
-            intrinsics=_intrinsics(path, depth.shape[0], depth.shape[1]),
-        )
+        return RawSample(rgb, depth.astype(np.float32), _intrinsics(path, depth.shape[0], depth.shape[1]))
 
 
 def convert_labelled(
@@ -118,13 +111,13 @@ def convert_labelled(
     return {"train": len(scenes) - len(validation), "val": len(validation)}
 
 
-def _intrinsics(path: Path, height: int, width: int) -> torch.Tensor:
-    """[3, 3] of images of that size."""
-    if abs(width / height / (NATIVE_SIZE[1] / NATIVE_SIZE[0]) - 1) > _ASPECT_TOLERANCE:
-        raise SampleError(str(path), f"is {width} x {height}, not a resized 640 x 480: its intrinsics are not known")
-    fx, fy, cx, cy = INTRINSICS
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return resize_intrinsics(K, NATIVE_SIZE, (height, width))
+def _intrinsics(path: Path, height: int, width: int) -> np.ndarray:
+    """[3, 3] of images of that size; files that were cropped have none."""
+    try:
+        return scale_intrinsics(pinhole(*INTRINSICS), NATIVE_SIZE, (height, width))
+    except ValueError as error:
+        reason = f"is {width} x {height}, not a resized 640 x 480: its intrinsics are not known"
+        raise SampleError(str(path), reason) from error
 
 
 def _matlab_string(characters: h5py.Dataset) -> str:

@@ -6,10 +6,12 @@ import logging
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypedDict
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from ufmstar_torch.eval.sequences.frame import FrameError
 from ufmstar_torch.models.preprocess import Preprocess
 from ufmstar_torch.train.augment import Augmentation
 
@@ -17,21 +19,13 @@ _LOG = logging.getLogger(__name__)
 _UNKNOWN = torch.full((4, 4), torch.nan, dtype=torch.float64)  # a pose
 
 
-class SampleError(Exception):
-    """A sample's file is missing, truncated, or does not hold what it should.
+class SampleError(FrameError):
+    """A sample's file is missing, truncated, or does not hold what it should."""
 
-    Attributes:
-        name: the file.
-        reason: what is wrong with it.
-    """
-
-    def __init__(self, name: str, reason: str) -> None:
-        super().__init__(name, reason)  # both in args, so that it survives pickling by a worker
-        self.name = name
-        self.reason = reason
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.reason}"
+    @property
+    def name(self) -> str:
+        """The file."""
+        return str(self.path)
 
 
 class Sample(TypedDict):
@@ -62,10 +56,10 @@ class SampleKey(NamedTuple):
 class RawSample:
     """A frame with depth registered to its image, at the size it is stored in."""
 
-    image: Tensor  # [3, H, W] uint8 RGB
-    depth: Tensor  # [H, W] float32 [m]; 0 or not finite = none
-    intrinsics: Tensor  # [3, 3] float64 [px]
-    T_world_cam: Tensor | None = None  # [4, 4] float64 camera-to-world [m]; None = not known
+    image: np.ndarray  # [3, H, W] uint8 RGB
+    depth: np.ndarray  # [H, W] float32 [m]; 0 or not finite = none
+    intrinsics: np.ndarray  # [3, 3] float64 [px]
+    T_world_cam: np.ndarray | None = None  # [4, 4] float64 camera-to-world [m]; None = not known
 
 
 class FrameSource(Protocol):
@@ -165,14 +159,14 @@ def make_sample(
     raw: RawSample, preprocess: Preprocess, augmentation: Augmentation | None, seed: tuple[int, ...]
 ) -> Sample:
     """A stored frame as the network sees it: augmented, then preprocessed; ``seed`` is the augmentation's."""
-    image = raw.image.to(torch.float32) / 255
-    depth = torch.where(raw.depth.isfinite() & (raw.depth > 0), raw.depth, 0.0).to(torch.float32)
-    K = raw.intrinsics.to(torch.float64)
+    image, depth, K = (torch.from_numpy(np.array(part)) for part in (raw.image, raw.depth, raw.intrinsics))
+    image = image.contiguous().to(torch.float32) / 255
+    depth = torch.where(depth.isfinite() & (depth > 0), depth, 0.0).to(torch.float32)
     if augmentation is not None:
         image, depth, K = augmentation(image, depth, K, seed)
     x, K_network = preprocess(image[None], K)
     depth = preprocess.apply_depth(depth)
-    pose = _UNKNOWN.clone() if raw.T_world_cam is None else raw.T_world_cam.to(torch.float64)
+    pose = _UNKNOWN.clone() if raw.T_world_cam is None else torch.from_numpy(np.array(raw.T_world_cam))
     return Sample(image=x[0], depth=depth.contiguous(), valid=depth > 0, intrinsics=K_network, T_world_cam=pose)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.eval.sequences.generic import has_images_and_depth, open_unposed
@@ -66,12 +65,8 @@ class SequenceFrames:
             raise SampleError(self.name(index), str(error)) from error
         if depth is None:
             raise SampleError(self.name(index), "has no depth map")
-        return RawSample(
-            image=torch.from_numpy(np.ascontiguousarray(frame.image.transpose(2, 0, 1))),
-            depth=torch.from_numpy(np.ascontiguousarray(depth, np.float32)),
-            intrinsics=torch.from_numpy(frame.intrinsics),
-            T_world_cam=torch.from_numpy(frame.T_world_cam) if self.sequences[number].posed else None,
-        )
+        pose = frame.T_world_cam if self.sequences[number].posed else None
+        return RawSample(frame.image.transpose(2, 0, 1), depth.astype(np.float32), frame.intrinsics, pose)
 
 
 def open_rgbd(source: str | Path) -> FrameSequence:

@@ -103,12 +103,8 @@ class TourFrames:
         seed, frame = self.seeds[index // self.frames], index % self.frames
         try:
             image, depth, pose, camera = self._mapped(seed)
-            return RawSample(
-                image=torch.from_numpy(image[frame].copy()),
-                depth=torch.from_numpy(depth[frame].astype(np.float32) * np.float32(_UNIT)),
-                intrinsics=torch.from_numpy(camera.copy()),
-                T_world_cam=torch.from_numpy(pose[frame].copy()),
-            )
+            metres = depth[frame].astype(np.float32) * np.float32(_UNIT)
+            return RawSample(image[frame].copy(), metres, camera, pose[frame])
         except (OSError, ValueError, IndexError) as error:
             raise SampleError(self.name(index), f"cannot be read: {error}") from error
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Anchors, anchored_term, check_anchors
+from ufmstar_torch.anchors.hook import AnchorInput, Anchors, check_anchors
 from ufmstar_torch.arguments import require_float
 from ufmstar_torch.camera import invert_rigid
 from ufmstar_torch.config import UfMStarConfig
@@ -20,6 +20,7 @@ from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.kernels.select import (
     LateStep,
     select_anchor_check,
+    select_anchored_term,
     select_check,
     select_merge,
     select_posterior,
@@ -418,8 +419,8 @@ class UfMStar(StatefulModule):
         # V = M + A + E (+ B), at least the floor (section "Uncertainty Regression"); NaN stays NaN.
         variance, anchored = out.disagreement, None
         if out.residual is not None:
-            anchored = anchored_term(chosen(frame.depth), out.residual[..., 1], out.disagreement)
-            variance = variance + anchored
+            term = select_anchored_term(self.config.backend, frame.depth.device.type)
+            anchored, variance = term(chosen(frame.depth), out.residual[..., 1], out.disagreement)
         for own in self._own(frame):
             variance = variance + chosen(own)
         if self.config.variance_floor:

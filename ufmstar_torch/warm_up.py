@@ -123,12 +123,12 @@ def description() -> None:
 def regression(kind: str) -> None:
     """Compile the regression of single-precision maps, and at some pixels, on the CPU; ``kind`` as
     ``config.regression``."""
-    from ufmstar_torch.kernels.regress_cpu import regress_maps
+    from ufmstar_torch.kernels.regress_cpu import regress_image
 
     mixture = GaussianMixture.empty(1, 1, dtype=torch.float64, device="cpu")
     depth = torch.full((1, 8, 8), _DISTANCE)
     for pixels in (None, torch.zeros(1, 1, dtype=torch.int64)):
-        regress_maps(mixture, depth, _camera(8, 8)[None], UfMStarConfig(regression=kind), pixels)
+        regress_image(mixture, depth, _camera(8, 8)[None], depth > 0, UfMStarConfig(regression=kind), pixels)
 
 
 def sampling() -> None:

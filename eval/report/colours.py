@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.optional import optional
 
 # Depth and uncertainty get different maps, so that the two pictures cannot be confused.
 DEPTH_MAP = "viridis"
@@ -56,11 +57,7 @@ def colour_table(name: str) -> NDArray[np.uint8]:
 def require_matplotlib() -> Any:
     """The matplotlib package, without pyplot and so without global state. Raises ImportError: it is missing; names the
     extra that brings it."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'ufmstar-torch[viz]'") from error
-    return matplotlib
+    return optional("matplotlib", "pictures need matplotlib", "'ufmstar-torch[viz]'")
 
 
 def plain(text: str) -> str:

@@ -28,6 +28,7 @@ from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.machine import available_cores, device_of
 from ufmstar_torch.eval.results.work import EvalJob, Evaluate, Worker, WorkerTask
 from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.optional import optional
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
 _POLL_SECONDS = 0.05
@@ -194,10 +195,7 @@ def run_slurm(slurm: Slurm, tasks: Sequence[WorkerTask], *, stop: Stop, report: 
     """Submit a job for every task, and wait for all of them; whether every one came to its end. OUT/slurm has their
     output; stopping cancels them. Raises ImportError: submitit is missing; ValueError: a parameter that submitit does
     not take, or no SLURM here."""
-    try:
-        import submitit
-    except ImportError as error:
-        raise ImportError("--slurm needs submitit: pip install 'ufmstar-torch[cluster]'") from error
+    submitit = optional("submitit", "--slurm needs submitit", "'ufmstar-torch[cluster]'")
     folder = f"{tasks[0].job.out}/slurm"
     try:
         executor = submitit.AutoExecutor(folder=folder, cluster=slurm.cluster)

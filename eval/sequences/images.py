@@ -21,6 +21,7 @@ import torch
 from PIL import Image
 
 from ufmstar_torch.eval.sequences.frame import Entry, Frame, FrameError, Loader, Size, Skipped
+from ufmstar_torch.optional import optional
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif", ".tiff")
@@ -237,10 +238,7 @@ def _read_exr(path: Path) -> np.ndarray:
         FrameError: not an OpenEXR file, truncated, a deep image, or no such channel.
         ModuleNotFoundError: OpenEXR is not installed.
     """
-    try:
-        import OpenEXR
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("EXR files need OpenEXR: pip install 'ufmstar-torch[eval]'") from error
+    OpenEXR = optional("OpenEXR", "EXR files need OpenEXR", "'ufmstar-torch[eval]'")
     try:
         with redirect_stdout(StringIO()):  # the library prints a remark on damaged files
             parts = OpenEXR.File(str(path), separate_channels=True).parts

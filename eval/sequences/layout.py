@@ -3,7 +3,6 @@ a folder."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -170,27 +169,25 @@ def find_sequences(root: str | Path, max_depth: int = 4, layout: str = "auto") -
         raise ValueError(f"max_depth must be at least 0, got {max_depth}")
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {', '.join(LAYOUTS)}, got {layout!r}")
-    return sorted(_below(root, root, max_depth, layout, set()), key=lambda result: result.name)
-
-
-def _below(path: Path, root: Path, depth: int, layout: str, seen: set[Path]) -> Iterator[Found]:
-    """The sequences at or below ``path``; ``seen`` gets every folder that was looked at."""
-    real = path.resolve()
-    if real in seen:
-        return
-    seen.add(real)
-    fitting = [name for name in layouts_of(path) if layout in ("auto", name)]
-    if len(fitting) > 1:
-        raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
-    if fitting:
-        for part in parts_of(path, fitting[0]):
-            if part == path or part.resolve() not in seen:
-                seen.add(part.resolve())
-                yield Found(_name(part, root), part, fitting[0])
-        return
-    if depth > 0:
-        for folder in _folders(path):
-            yield from _below(folder, root, depth - 1, layout, seen)
+    found: list[Found] = []
+    seen: set[Path] = set()
+    waiting = [(root, max_depth)]
+    while waiting:
+        path, depth = waiting.pop()
+        if path.resolve() in seen:
+            continue
+        seen.add(path.resolve())
+        fitting = [name for name in layouts_of(path) if layout in ("auto", name)]
+        if len(fitting) > 1:
+            raise ValueError(f"{path} fits the layouts {', '.join(fitting)}: pass layout")
+        if fitting:
+            for part in parts_of(path, fitting[0]):
+                if part == path or part.resolve() not in seen:
+                    seen.add(part.resolve())
+                    found.append(Found(_name(part, root), part, fitting[0]))
+        elif depth > 0:
+            waiting += [(folder, depth - 1) for folder in reversed(_folders(path))]
+    return sorted(found, key=lambda sequence: sequence.name)
 
 
 def _folders(path: Path) -> list[Path]:

@@ -54,10 +54,9 @@ def read_journal(content: bytes, file: Path) -> list[dict]:
 
 
 def _is_record(record: Any) -> bool:
-    if not (isinstance(record, dict) and isinstance(record.get("name"), str)):
-        return False
-    if record.get("state") == "skipped":
-        return isinstance(record.get("reason"), str)
-    K = record.get("intrinsics")
-    numbers = isinstance(K, list) and len(K) == 4 and all(isinstance(value, int | float) for value in K)
-    return record.get("state") == "done" and numbers
+    match record:
+        case {"name": str(), "state": "skipped", "reason": str()}:
+            return True
+        case {"name": str(), "state": "done", "intrinsics": [*K]}:
+            return len(K) == 4 and all(isinstance(value, int | float) for value in K)
+    return False

@@ -29,19 +29,9 @@ _KEPT = 4  # rendered frames kept, so that a frame's image and depth come from o
 
 
 def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, **options: Any) -> FrameSequence:
-    """Opens a recording, or renders a tour; the frames are decoded, or rendered, when they are indexed.
-
-    Args:
-        path: of a recording; or ``tour:SEED``, rooms rendered from a seed, with the options of
-            :func:`open_tour` in the name.
-        layout: see :func:`ufmstar_torch.eval.sequences.open_sequence`, as ``poses`` and ``options``; a tour has none.
-        poses: how the poses are written.
-        options: further options of a recording.
-
-    Raises:
-        FileNotFoundError: ``path`` does not exist.
-        ValueError: see :func:`ufmstar_torch.eval.sequences.open_sequence`; or a layout or option for a tour.
-    """
+    """Opens a recording, as :func:`ufmstar_torch.eval.sequences.open_sequence` with its arguments and errors, or a
+    tour, whose frames are rendered when they are indexed: ``tour:SEED``, with the options of :func:`open_tour` in the
+    name. Raises ValueError: also a layout or an option for a tour."""
     if not str(path).startswith(PREFIX):
         return on_disk.open_sequence(path, layout, poses=poses, **options)
     if layout != "auto":

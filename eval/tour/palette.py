@@ -45,11 +45,11 @@ class Palette:
         self._style, self._rng = style, rng
         self._usual = {role: self._draw(role) for role in ("wood", "cloth", "paint")}
 
-    def finish(self, role: str, glow: float = 0.0) -> Finish:
+    def finish(self, role: str) -> Finish:
         """A finish for a role; wood, cloth and paint are mostly the room's usual ones."""
-        if role in self._usual and glow == 0 and self._rng.random() < 0.6:
+        if role in self._usual and self._rng.random() < 0.6:
             return self._usual[role]
-        return self._draw(role, glow)
+        return self._draw(role)
 
     def picture(self, texture: str, fallback: str, period: float, glow: float = 0.0) -> Finish:
         """A surface that shows a thing, where the style has it; else the fallback role."""
@@ -64,7 +64,7 @@ class Palette:
         texture = "plain" if "plain" in self._style.textures else self._draw("metal").texture
         return Finish(texture, color, other, 0.12, glow)
 
-    def _draw(self, role: str, glow: float = 0.0) -> Finish:
+    def _draw(self, role: str) -> Finish:
         wanted, saturation, value, period = _ROLES[role]
         known = [t for t in wanted if t in self._style.textures]
         known = known or [t for t in self._style.textures if t not in _PICTURES] or list(self._style.textures)
@@ -73,7 +73,7 @@ class Palette:
         if role == "floor" and texture == "wood":
             hues = _WOOD_HUES
         first, second = self._colors(saturation, value, hues)
-        return Finish(texture, first, second, float(self._rng.uniform(*period)) * self._style.scale[0], glow)
+        return Finish(texture, first, second, float(self._rng.uniform(*period)) * self._style.scale[0])
 
     def _colors(self, saturation: Range, value: Range, hues: Range) -> tuple[Color, Color]:
         """A colour, and one that goes with it: as a rule a darker or lighter one of nearly the same hue."""

@@ -6,8 +6,9 @@ things, darker and colder light, and textures that no home has. ``mixed`` begins
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, replace
+
+from ufmstar_torch.checked import Checked
 
 Range = tuple[float, float]
 
@@ -20,7 +21,7 @@ TEXTURES = HOME_TEXTURES + HALL_TEXTURES
 
 
 @dataclass(frozen=True)
-class TourStyle:
+class TourStyle(Checked):
     """Sizes and looks of a tour's rooms; ranges are (lowest, highest), drawn uniformly. Raises ValueError: a value is
     out of its range."""
 
@@ -57,17 +58,6 @@ class TourStyle:
         if not 0 <= self.furniture <= 5:
             raise ValueError(f"furniture must be 0 to 5 pieces per m^2, got {self.furniture}")
 
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TourStyle:
-        """From plain values. Raises ValueError: an unknown name, or a value out of its range."""
-        unknown = sorted(set(values) - {f.name for f in fields(cls)})
-        if unknown:
-            raise ValueError(f"unknown field {unknown} of TourStyle, expected some of {[f.name for f in fields(cls)]}")
-        plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-        if isinstance(plain.get("last"), dict):
-            plain["last"] = cls.from_dict(plain["last"])
-        return cls(**plain)
-
 
 HOME = TourStyle()
 HALL = TourStyle(
@@ -84,17 +74,7 @@ HALL = TourStyle(
 MIXED = TourStyle(
     rooms=(3, 3),
     room_size=(3.2, 4.4),
-    last=TourStyle(
-        name="hall",
-        textures=HALL_TEXTURES,
-        rooms=(1, 1),
-        room_size=(7.0, 9.0),
-        ceiling=(3.6, 4.6),
-        scale=(1.4, 1.7),
-        furniture=0.22,
-        brightness=(0.45, 0.65),
-        warmth=(-0.9, -0.4),
-    ),
+    last=replace(HALL, rooms=(1, 1), room_size=(7.0, 9.0), ceiling=(3.6, 4.6), scale=(1.4, 1.7), furniture=0.22),
 )
 STYLES = {"home": HOME, "hall": HALL, "mixed": MIXED}
 

@@ -144,9 +144,7 @@ def _fill(
 
 
 def _light_table(lights: list[list[Light]]) -> Tensor:
-    table = torch.zeros(len(lights), LIGHTS, 7)
-    table[..., 6] = 1.0
-    for room, of_room in enumerate(lights):
-        for k, light in enumerate(of_room):
-            table[room, k] = torch.tensor([*light.position, *light.color, light.reach])
-    return table
+    """[R, LIGHTS, 7], see ``Tour.lights``."""
+    rows = [[[*light.position, *light.color, light.reach] for light in of_room] for of_room in lights]
+    dark = [0.0] * 6 + [1.0]
+    return torch.tensor([row + [dark] * (LIGHTS - len(row)) for row in rows], dtype=torch.float32)

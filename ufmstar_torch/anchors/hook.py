@@ -29,6 +29,7 @@ __all__ = [
     "Anchors",
     "Evidence",
     "Learnt",
+    "TermKernel",
     "after_regression",
     "anchored_term",
     "before_regression",
@@ -149,12 +150,19 @@ def after_regression(result: Regression, stream: Tensor | None) -> tuple[Regress
     return replace(result, features=result.features[..., :-2]), residual
 
 
-def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> Tensor:
-    """B = max(0, d^2 e - M) [m^2], the mean square error that anchors show beyond M; NaN where M is.
+class TermKernel(Protocol):
+    """B and M + B; see :func:`anchored_term`."""
+
+    def __call__(self, depth: Tensor, excess: Tensor, disagreement: Tensor, /) -> tuple[Tensor, Tensor]: ...
+
+
+def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
+    """B = max(0, d^2 e - M) [m^2], the mean square error that anchors show beyond M, and M + B; NaN where M is.
 
     Args:
         depth: d, any shape [m].
         excess: e, likewise, the relative mean square error that the network does not state (``evidence``).
         disagreement: M, likewise [m^2].
     """
-    return depth.square().mul_(excess).sub_(disagreement).clamp_min_(0)
+    term = depth.square().mul_(excess).sub_(disagreement).clamp_min_(0)
+    return term, disagreement + term

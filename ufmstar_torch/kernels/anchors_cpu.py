@@ -19,11 +19,6 @@ from ufmstar_torch.anchors.evidence import (
     CLAIM,
     COUNTS,
     LEAST_SIGMA,
-    LOWER_QUARTILE,
-    NEIGHBOURS,
-    SIMILAR_SIGMAS,
-    SUPPORT,
-    TIE,
     Evidence,
 )
 from ufmstar_torch.anchors.given import FARTHEST_OFF, AnchorInput, Anchors, claimed
@@ -32,19 +27,18 @@ from ufmstar_torch.anchors.hook import learn as learn_reference
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.compile_cpu import kernel, part
-from ufmstar_torch.kernels.regress_cpu import EPSILON
-from ufmstar_torch.kernels.regress_points_cpu import _boxes, _touched, prepare
-from ufmstar_torch.kernels.regress_vectors_cpu import add_shares
+from ufmstar_torch.kernels.compile_cpu import kernel, leaf, part
+from ufmstar_torch.kernels.neighbours_cpu import grid, supported
+from ufmstar_torch.kernels.regress_cpu import Seen, View, all_seen, look
+from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull
+from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, add_shares
+from ufmstar_torch.kernels.rigid_cpu import padded
 from ufmstar_torch.kernels.threads_cpu import each
-from ufmstar_torch.kernels.vectors_cpu import LANES
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import distribute
 
-_LOG2_E = math.log2(math.e)
-
-# Anchors of a cell, on average, where neighbours are searched and where components are.
-_FEW, _SOME = 3, 32
+_SOME = 16  # anchors of a cell, on average, where components are searched
+_NOTHING = 1e-30  # of a mean: less is 0 and not a number too small for single precision
 
 
 def check_values(anchors: Anchors, frame: FrameInput, own: Sequence[Tensor]) -> AnchorInput:
@@ -91,7 +85,7 @@ def inliers(anchors: AnchorInput) -> Tensor:
 @kernel
 def _inliers(pixel, predicted, depth, variance, valid, out):
     """One stream, N anchors, into ``out`` [N]."""
-    _supported(pixel, predicted, depth, variance, valid, out)
+    supported(pixel, predicted, depth, variance, valid, out)
 
 
 def learn(
@@ -100,72 +94,100 @@ def learn(
     frame: FrameInput,
     anchors: AnchorInput | None,
     config: UfMStarConfig,
-    near: Sequence[tuple[NDArray[np.int64], int]] | None = None,
 ) -> Learnt:
     """As :func:`ufmstar_torch.anchors.hook.learn`, for CPU tensors, of evidence that may have less room than the
-    mixture; with the exact sum, shares are right to twice the error of the regression's in the dtype of the evidence.
-
-    ``near`` are the slots of each stream that can matter, in increasing order, and how many are occupied; None = all.
-    """
+    mixture."""
     if config.regression != "exact":
-        padded = evidence.padded(mixture_cam.capacity)
-        return learn_reference(padded, mixture_cam, frame, anchors, config, distribute, inliers)
-    b, capacity = mixture_cam.weight.shape
-    dtype = evidence.overall.dtype
-    if near is None:
-        near = [(slots, slots.size) for slots in map(np.flatnonzero, array(mixture_cam.weight) > 0)]
-    # In float64 for every dtype, so that there is one kernel to compile.
-    component, beyond = np.empty((b, capacity, 3)), np.empty((b, capacity, 2))
-    overall, stream, used = np.empty((b, 3)), np.empty((b, 2)), np.zeros((b, 1), np.int64)
+        padded_evidence = evidence.padded(mixture_cam.capacity)
+        return learn_reference(padded_evidence, mixture_cam, frame, anchors, config, distribute, inliers)
+    seen, slots = all_seen(mixture_cam, features=3)
+    views = look(seen, frame.depth, frame.intrinsics, config, evidence.overall.dtype)
+    return learn_in_view(evidence, mixture_cam.capacity, slots, seen, views, frame, anchors, config)
+
+
+def learn_in_view(
+    evidence: Evidence,
+    capacity: int,
+    slots: Sequence[NDArray[np.int64]],
+    seen: Sequence[Seen],
+    views: Sequence[View],
+    frame: FrameInput,
+    anchors: AnchorInput | None,
+    config: UfMStarConfig,
+) -> Learnt:
+    """:func:`learn` with the exact sum, of what is in view (``regress_cpu.look``); shares are right to twice the error
+    of the regression's. Of the last three features of ``seen`` and ``views`` the first two, which are what was learnt
+    of the components, are written.
+
+    Args:
+        evidence, frame, anchors, config: as :func:`learn`.
+        capacity: of the mixture.
+        slots: of each stream's ``seen`` components.
+    """
+    b, before, overall_before = len(views), array(evidence.component), array(evidence.overall)
+    component, overall = np.empty((b, capacity, 3), before.dtype), np.empty((b, 3), before.dtype)
+    beyond, stream, used = np.empty((b, capacity, 2)), np.empty((b, 2)), np.zeros((b, 1), np.int64)
     if anchors is None:
         fields = [np.empty((b, 0), np.int64), np.empty((b, 0, 2)), *np.empty((4, b, 0)), np.empty((b, 0), np.bool_)]
     else:
         given = (anchors.pixel, anchors.predicted, anchors.depth, anchors.variance, anchors.own_variance)
         fields = [array(anchors.index), *map(array, given), array(anchors.valid)]
-    own = (mixture_cam.mean, mixture_cam.covariance, mixture_cam.weight, frame.intrinsics)
-    doubles = [np.asarray(array(v), np.float64) for v in (*own, evidence.component, evidence.overall)]
-    settings = (
-        frame.size[1], 0.5 ** (1 / config.anchor_half_life), config.anchor_shrinkage, config.prior_weight,
-        EPSILON[dtype], dtype == torch.float32,
-    )  # fmt: skip
-    arrays = zip(*fields, *doubles, strict=True)
+    features = [one.features for one in seen]
+    settings = frame.size[1], 0.5 ** (1 / config.anchor_half_life), config.anchor_shrinkage
+    arrays = zip(slots, views, features, *fields, array(frame.intrinsics), before, overall_before, strict=True)
     out = zip(component, overall, used, beyond, stream, strict=True)
-    calls = zip(near, arrays, out, strict=True)
-    each(_learn, [(*slots, *arguments, *settings, *into) for slots, arguments, into in calls])
-    learnt = Evidence(torch.from_numpy(component).to(dtype), torch.from_numpy(overall).to(dtype))
+    each(_learn, [(*arguments, *settings, *into) for arguments, into in zip(arrays, out, strict=True)])
+    learnt = Evidence(torch.from_numpy(component), torch.from_numpy(overall))
     return Learnt(learnt, torch.from_numpy(used[:, 0]), torch.from_numpy(beyond), torch.from_numpy(stream))
+
+
+def anchored_term(depth: Tensor, excess: Tensor, disagreement: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`ufmstar_torch.anchors.hook.anchored_term`, for CPU tensors, in one pass."""
+    d, e, M = (array(value) for value in (depth, excess, disagreement))
+    term, both = np.empty_like(M), np.empty_like(M)
+    _add_term(*(value.reshape(-1) for value in (d, e, M, term, both)))
+    return torch.from_numpy(term), torch.from_numpy(both)
+
+
+@kernel
+def _add_term(depth, excess, disagreement, term, both):
+    for i in range(term.size):
+        beyond = depth[i] * depth[i] * excess[i] - disagreement[i]
+        term[i] = term.dtype.type(0) if beyond < 0 else beyond
+        both[i] = disagreement[i] + term[i]
 
 
 @kernel
 def _learn(
-    slots, occupied, index, pixel, predicted, depth, variance, own, valid, mean, covariance, weight, K, before,
-    overall_before, width, memory, shrinkage, prior_weight, epsilon, single, component, overall, used, beyond, stream,
+    slots, view, features, index, pixel, predicted, depth, variance, own, valid, K, before, overall_before,
+    width, memory, shrinkage, component, overall, used, beyond, stream,
 ):  # fmt: skip
-    """One stream: N anchors, K components, of which only ``slots`` [n] can explain a point."""
-    supported = np.empty(valid.size, np.bool_)
+    """One stream: N anchors, K components, of which only ``view`` can explain a point."""
+    chosen = np.empty(valid.size, np.bool_)
     rows, sums = np.empty((valid.size, 3)), np.zeros((component.shape[0], 3))
-    _supported(pixel, predicted, depth, variance, valid, supported)
-    used[0] = _rows(predicted, depth, variance, own, supported, rows)
+    supported(pixel, predicted, depth, variance, valid, chosen)
+    used[0] = _rows(predicted, depth, variance, own, chosen, rows)
     if valid.size > 0:
-        mixture = (slots, occupied, mean, covariance, weight)
-        _distribute(index, predicted, supported, rows, K, width, mixture, prior_weight, epsilon, sums)
+        _distribute(index, predicted, chosen, rows, K, width, slots, view, sums)
     fade = memory if used[0] > 0 else 1.0
-    for c in range(3):
-        overall[c] = _rounded(fade * overall_before[c] + _folded(rows[:, c]), single)
+    for c in range(3):  # rounded as the state keeps it
+        overall[c] = fade * overall_before[c] + _folded(rows[:, c])
     for c in range(2):
-        stream[c] = overall[c + 1] / (overall[0] + shrinkage)
+        stream[c] = np.float64(overall[c + 1]) / (np.float64(overall[0]) + shrinkage)
     for k in range(component.shape[0]):
         for c in range(3):
-            old = before[k, c] if k < before.shape[0] else 0.0
-            component[k, c] = _rounded(fade * old + sums[k, c], single)
+            old = np.float64(before[k, c]) if k < before.shape[0] else 0.0
+            component[k, c] = fade * old + sums[k, c]
+        n = np.float64(component[k, 0])
         for c in range(2):
-            beyond[k, c] = (component[k, c + 1] - component[k, 0] * stream[c]) / (component[k, 0] + shrinkage)
-
-
-@part
-def _rounded(value, single):
-    """A value as the state keeps it."""
-    return np.float64(np.float32(value)) if single else value
+            value = (np.float64(component[k, c + 1]) - n * stream[c]) / (n + shrinkage)
+            beyond[k, c] = value if abs(value) > _NOTHING else 0.0
+    last = features.shape[1] - 1
+    for i in range(slots.size):
+        features[i, last - 2], features[i, last - 1] = beyond[slots[i], 0], beyond[slots[i], 1]
+    for i in range(view[0].size):
+        k = slots[view[0][i]]
+        view[3][i, TERMS - 1], view[3][i, TERMS - 2] = beyond[k, 0], beyond[k, 1]
 
 
 @part
@@ -214,186 +236,55 @@ def _folded(values):
 
 
 @part
-def _grid(pixel, chosen, mean_count):
-    """Cells over the chosen ones of N pixels [N, 2], about so many in each: their first corner and side [px], columns
-    and rows, where each cell starts in the order [cells + 1], and the order."""
-    low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
-    for i in range(chosen.size):
-        if chosen[i]:
-            count += 1
-            for j in range(2):
-                low[j], high[j] = min(low[j], pixel[i, j]), max(high[j], pixel[i, j])
-    if count == 0:
-        low[:], high[:] = 0.0, 0.0
-    wide, tall, share = high[0] - low[0], high[1] - low[1], mean_count / max(count, 1)
-    # Not smaller than on a line, so that there are no more cells than about anchors, wherever they lie.
-    side = max(math.sqrt(wide * tall * share), max(wide, tall) * share, 1e-6)
-    columns, rows = int(wide / side) + 1, int(tall / side) + 1
-    cell, start = np.empty(chosen.size, np.int64), np.zeros(columns * rows + 1, np.int64)
-    for i in range(chosen.size):
-        if chosen[i]:
-            column = min(int((pixel[i, 0] - low[0]) / side), columns - 1)
-            cell[i] = min(int((pixel[i, 1] - low[1]) / side), rows - 1) * columns + column
-            start[cell[i] + 1] += 1
-    for c in range(columns * rows):
-        start[c + 1] += start[c]
-    place, order = start.copy(), np.empty(count, np.int64)
-    for i in range(chosen.size):
-        if chosen[i]:
-            order[place[cell[i]]] = i
-            place[cell[i]] += 1
-    return low, side, columns, rows, start, order
-
-
-@part
-def _supported(pixel, predicted, depth, variance, valid, out):
-    """Which of N anchors are valid and supported by their neighbours (``evidence.inliers``), into ``out`` [N]."""
-    n = valid.size
-    most = max(min(NEIGHBOURS, n - 1), 0)
-    neighbour, count, ratio = np.empty((n, most), np.int64), np.empty(n, np.int64), np.empty(n)
-    differ = np.empty(n * most)
-    total = _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ)
-    _support(variance, depth, valid, ratio, neighbour, count, _lower_quartile(differ, total), out)
-
-
-@part
-def _lower_quartile(values, n):
-    """``torch.quantile(values[:n], 0.25)``, 0 where n = 0; reorders the values."""
-    if n == 0:
-        return 0.0
-    rank = 0.25 * (n - 1)
-    below, first, last = int(rank), 0, n - 1
-    while first < last:  # Hoare's selection: what is not above values[below] moves before it
-        pivot, i, j = values[below], first, last
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        if j < below:
-            first = i
-        if below < i:
-            last = j
-    low, high, weight = values[below], values[min(below + 1, n - 1)], rank - below
-    for i in range(below + 1, n):
-        high = min(high, values[i])
-    return low + weight * (high - low) if weight < 0.5 else high - (high - low) * (1 - weight)
-
-
-@part
-def _neighbours(pixel, predicted, depth, valid, ratio, neighbour, count, differ):
-    """Write log g/d of the valid anchors of N, their nearest ones [N, most] and how many these are; return the number
-    of differences of log g/d that are written to ``differ``."""
-    low, side, columns, rows, start, order = _grid(pixel, valid, _FEW)
-    ordered, distance, total = np.empty((order.size, 2)), np.empty(neighbour.shape[1]), 0
-    for place in range(order.size):
-        a = order[place]
-        ordered[place, 0], ordered[place, 1] = pixel[a, 0], pixel[a, 1]
-        ratio[a] = math.log(depth[a] / predicted[a])
-    if order.size <= SUPPORT:
-        return 0
-    for a in order:
-        count[a] = _nearest(
-            ordered, pixel[a, 0], pixel[a, 1], a, low, side, columns, rows, start, order, distance, neighbour
-        )
-        for i in range(count[a]):
-            differ[total] = abs(ratio[a] - ratio[neighbour[a, i]])
-            total += 1
-    return total
-
-
-@part
-def _support(variance, depth, valid, ratio, neighbour, count, quartile, out):
-    """Which of the valid anchors enough of their neighbours support; all of a few."""
-    sigma2, few = (quartile / LOWER_QUARTILE) * (quartile / LOWER_QUARTILE) + 2 * LEAST_SIGMA**2, 0
-    for a in range(valid.size):
-        few += valid[a]
-    for a in range(valid.size):
-        out[a] = valid[a]
-        if not valid[a] or few <= SUPPORT:
-            continue
-        support, noise = 0, variance[a] / (depth[a] * depth[a])
-        for i in range(count[a]):
-            b = neighbour[a, i]
-            allowed = sigma2 + noise + variance[b] / (depth[b] * depth[b])
-            support += abs(ratio[a] - ratio[b]) <= SIMILAR_SIGMAS * math.sqrt(allowed)
-        out[a] = support >= SUPPORT
-
-
-@part
-def _nearest(ordered, u_a, v_a, a, low, side, columns, rows, start, order, distance, neighbour):
-    """The anchors nearest to anchor a at (u_a, v_a), and how many there are: ring after ring of cells around its own,
-    until all beyond the ring are farther than the farthest of them. ``ordered`` [N, 2] are pixels in the grid's order.
-    """
-    u, v = (u_a - low[0]) / side, (v_a - low[1]) / side
-    column, row = min(int(u), columns - 1), min(int(v), rows - 1)
-    # [cells] From the anchor to the border of its cell; a billionth less for rounding.
-    margin = max(min(min(u - column, column + 1 - u), min(v - row, row + 1 - v)) - 1e-9, 0.0)
-    n, most = 0, neighbour.shape[1]
-    for ring in range(max(columns, rows)):
-        for y in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-            step = 1 if abs(y - row) == ring else 2 * ring  # all of the first and the last row, else both ends
-            for x in range(column - ring, column + ring + 1, max(step, 1)):
-                if x < 0 or x >= columns:
-                    continue
-                for place in range(start[y * columns + x], start[y * columns + x + 1]):
-                    du, dv, b = u_a - ordered[place, 0], v_a - ordered[place, 1], order[place]
-                    apart = du * du + dv * dv + TIE * b
-                    if b != a and (n < most or apart < distance[n - 1]):
-                        n = min(n + 1, most)
-                        i = n - 1
-                        while i > 0 and distance[i - 1] > apart:
-                            distance[i], neighbour[a, i] = distance[i - 1], neighbour[a, i - 1]
-                            i -= 1
-                        distance[i], neighbour[a, i] = apart, b
-        beyond = (ring + margin) * side
-        if n == most and beyond * beyond > distance[n - 1]:
-            break
-    return n
-
-
-@part
-def _distribute(index, predicted, chosen, rows, K, width, mixture, prior_weight, epsilon, sums):
+def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
     """Add the rows [N, 3] of the chosen anchors to the components [K, 3] that explain their points, by their shares.
 
-    Left out is what adds less than eps/K of the prior to the denominator.
+    What is left out of each cell of anchors is what the regression leaves out of a tile.
     """
-    slots, count, mean, covariance, weight = mixture
+    visible, fields, packed, _, settings = view
     points, pixel = np.empty((chosen.size, 3)), np.empty((chosen.size, 2))
     for i in range(chosen.size):
         u, v, z = np.float64(index[i] % width), np.float64(index[i] // width), predicted[i]
         pixel[i, 0], pixel[i, 1] = u, v
         points[i, 0], points[i, 1], points[i, 2] = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z
-    occupied, whitening, log_peak = prepare(slots.copy(), mean, covariance, weight)
-    share = math.log(epsilon / max(count, 1))
-    boxes = _boxes(mean, covariance, occupied, log_peak, share + math.log(prior_weight))
-    start, order = _grid(pixel, chosen, _SOME)[4:]
-    near = _touched(points, order, np.arange(occupied.size), boxes)
-    room = (near.size + LANES - 1) // LANES * LANES
-    fields, density, added = np.empty((10, room)), np.empty(room), np.empty((3, room))
-    point, row, scale = np.empty(3), np.empty(4), math.sqrt(0.5 * _LOG2_E)
-    row[3] = prior_weight
+    start, order = grid(pixel, chosen, _SOME)[4:]
+    room = packed.shape[1]
+    kept, work = np.empty(visible.size, np.int64), np.empty(8 + room, packed.dtype)
+    near, density, added = np.empty((FIELDS, room)), np.empty(room), np.empty((3, room))
+    point, row = np.empty(3), np.empty(4)
+    row[3] = settings[0]
     for cell in range(start.size - 1):
         if start[cell] == start[cell + 1]:
             continue
-        kept = _touched(points, order[start[cell] : start[cell + 1]], near, boxes)
-        n = (kept.size + LANES - 1) // LANES * LANES
-        for i in range(n):
-            k = kept[i] if i < kept.size else -1
-            for axis in range(3):
-                fields[axis, i] = mean[occupied[k], axis] if k >= 0 else 0.0
+        box = _box(points, order, start[cell], start[cell + 1])
+        count = cull(packed, visible.size, settings[4], box, settings, work, kept)
+        n = padded(count)
+        for i in range(count):
+            for field in range(FIELDS):
+                near[field, i] = fields[kept[i], field]
+        for i in range(count, n):  # nowhere
+            for field in range(FIELDS - 1):
+                near[field, i] = 0.0
+            near[FIELDS - 1, i] = -np.inf
+        for axis in range(3):
+            for i in range(n):
                 added[axis, i] = 0.0
-            for entry in range(6):
-                fields[3 + entry, i] = whitening[k, entry] * scale if k >= 0 else 0.0
-            fields[9, i] = log_peak[k] * _LOG2_E if k >= 0 else -np.inf
         for place in range(start[cell], start[cell + 1]):
             p = order[place]
             for axis in range(3):
                 point[axis], row[axis] = points[p, axis], rows[p, axis]
-            add_shares(fields, room, n, point, row, density, added)
-        for i in range(kept.size):
+            add_shares(near, room, n, point, row, density, added)
+        for i in range(count):
             for axis in range(3):
-                sums[occupied[kept[i]], axis] += added[axis, i]
+                sums[slots[visible[kept[i]]], axis] += added[axis, i]
+
+
+@leaf
+def _box(points, order, first, last):
+    """The least and the greatest corner of the points in those places of an order."""
+    a = b = c = np.inf
+    d = e = f = -np.inf
+    for place in range(first, last):
+        x, y, z = points[order[place], 0], points[order[place], 1], points[order[place], 2]
+        a, b, c, d, e, f = min(a, x), min(b, y), min(c, z), max(d, x), max(e, y), max(f, z)
+    return a, b, c, d, e, f

@@ -1,4 +1,8 @@
-"""Correspondence on the CPU (numba) as a list of pairs: what is out of view costs nothing, and no matrix is formed."""
+"""Correspondence by overlap on the CPU (numba), as a list of pairs.
+
+The work is done per segment: the mixture's candidates that overlap with it are few, so hiding is tested
+among those only.
+"""
 
 from __future__ import annotations
 
@@ -6,38 +10,35 @@ import math
 
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import part
+from ufmstar_torch.kernels.compile_cpu import leaf, part
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
 
 
 @part
-def matches(slots, mean_k, cov_k, weight_k, mean_c, cov_c, weight_c, K, height, width, eta, eta_occl, near, widening):
+def matches(fields, n, fields_c, n_c, K, height, width, eta, eta_occl, near, widening):
     """The matched pairs of one stream, as :func:`ufmstar_torch.correspond.correspond` states them.
 
-    Components k [K] and c [C] are in the camera frame, float64. Of the k only ``slots`` [n], increasing, are looked at.
+    The n components k and the n_c components c are in the camera frame, by field [13, n and more] (``rigid_cpu``).
 
     Returns:
         c [P], k [P] and the overlap beta_ck [P] of every pair, in increasing c and then k.
     """
-    index_k, image_k = _project(slots, mean_k, cov_k, weight_k, K, height, width, near, widening)
-    index_c, image_c = _project(np.arange(weight_c.size), mean_c, cov_c, weight_c, K, height, width, near, widening)
+    image, image_c = np.empty((6, n)), np.empty((6, n_c))
+    index, index_c = np.empty(n, np.int64), np.empty(n_c, np.int64)
+    count = _project(fields, n, K, height, width, near, widening, index, image)
+    count_c = _project(fields_c, n_c, K, height, width, near, widening, index_c, image_c)
     limit, limit_occl = _limit(eta), _limit(eta_occl)
-    members, overlap = np.empty(index_k.size, np.int64), np.empty(index_k.size)
+    close, members, overlap = np.empty(count, np.uint8), np.empty(count, np.int64), np.empty(count)
     c, k, beta = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64)
     pairs = 0
-    for i in range(index_c.size):
-        n = 0
-        for j in range(index_k.size):
-            if _far(image_c[i], image_k[j], limit):
-                continue
-            overlap[n] = _bhattacharyya(image_c[i], image_k[j])
-            members[n] = j
-            n += overlap[n] >= eta
-        for a in range(n):
-            if _hidden(image_k, members, n, a, eta_occl, limit_occl):
+    for i in range(count_c):
+        m = _overlapping(image_c, i, image, eta, limit, close, members, overlap)
+        for a in range(m):
+            if _hidden(image, members, m, a, eta_occl, limit_occl):
                 continue
             if pairs == c.size:
                 c, k, beta = _longer(c), _longer(k), _longer(beta)
-            c[pairs], k[pairs], beta[pairs] = index_c[i], index_k[members[a]], overlap[a]
+            c[pairs], k[pairs], beta[pairs] = index_c[i], index[members[a]], overlap[a]
             pairs += 1
     return c[:pairs], k[:pairs], beta[:pairs]
 
@@ -56,55 +57,80 @@ def _longer(values):
     return out
 
 
-@part
+@leaf
+def _overlapping(image_c, i, image, eta, limit, close, members, overlap):
+    """Write those whose overlap with projected Gaussian i is at least eta, and it; return how many there are.
+
+    ``close`` has room for every one. Few are close enough for the overlap: the others are left out in vectors.
+    """
+    half, u, v, xx, yy = limit * 0.5, image_c[0, i], image_c[1, i], image_c[2, i], image_c[4, i]
+    for j in range(close.size):
+        dx, dy = u - image[0, j], v - image[1, j]
+        close[j] = (dx * dx <= half * (xx + image[2, j])) & (dy * dy <= half * (yy + image[4, j]))
+    n = 0
+    for j in range(close.size):
+        if close[j]:
+            overlap[n] = _bhattacharyya(image_c, i, image, j)
+            members[n] = j
+            n += overlap[n] >= eta
+    return n
+
+
+@leaf
 def _hidden(image, members, n, a, eta_occl, limit):
     """Whether a nearer member covers member ``a``."""
-    far = image[members[a]]
+    far = members[a]
     for b in range(n):
-        near = image[members[b]]
-        if near[5] < far[5] and not _far(near, far, limit) and _bhattacharyya(near, far) > eta_occl:
+        near = members[b]
+        if image[5, near] >= image[5, far] or _far(image, near, far, limit):
+            continue
+        if _bhattacharyya(image, near, image, far) > eta_occl:
             return True
     return False
 
 
-@part
-def _project(slots, mean, covariance, weight, K, height, width, near, widening):
-    """Indices of the candidates among ``slots``, and per candidate u, v, the covariance's xx, xy, yy, and the depth."""
-    index = np.empty(slots.size, np.int64)
-    image = np.empty((slots.size, 6))
-    n = 0
+@leaf
+def _project(fields, n, K, height, width, near, widening, index, image):
+    """Write the indices of the candidates among n components, and of each u, v, the covariance's xx, xy, yy, and the
+    depth [6, n]; return how many there are."""
+    count = 0
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    for k in slots:
-        x, y, z = mean[k]
-        if not (weight[k] > 0 and z > near):
+    for k in range(n):
+        x, y, z = fields[0, k], fields[1, k], fields[2, k]
+        if not (fields[WEIGHT, k] > 0 and z > near):
             continue
+        if abs(fx * x + (cx - 0.5 * width) * z) > (0.5 * width + 1) * z:
+            continue  # a pixel beyond the image at least: no division
         u, v = fx * x / z + cx, fy * y / z + cy
         if not (u >= -0.5 and u < width - 0.5 and v >= -0.5 and v < height - 0.5):
             continue
-        S = covariance[k]
+        xx, xy, xz = fields[COVARIANCE, k], fields[COVARIANCE + 1, k], fields[COVARIANCE + 2, k]
+        yy, yz, zy, zz = (
+            fields[COVARIANCE + 4, k], fields[COVARIANCE + 5, k], fields[COVARIANCE + 7, k], fields[COVARIANCE + 8, k],
+        )  # fmt: skip
         a, b, c, d = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)  # A = [[a, 0, b], [0, c, d]]
-        index[n] = k
-        image[n, 0], image[n, 1], image[n, 5] = u, v, z
-        image[n, 2] = a * a * S[0, 0] + 2 * a * b * S[0, 2] + b * b * S[2, 2] + widening
-        image[n, 3] = a * c * S[0, 1] + a * d * S[0, 2] + b * c * S[2, 1] + b * d * S[2, 2]
-        image[n, 4] = c * c * S[1, 1] + 2 * c * d * S[1, 2] + d * d * S[2, 2] + widening
-        n += 1
-    return index[:n], image[:n]
+        index[count] = k
+        image[0, count], image[1, count], image[5, count] = u, v, z
+        image[2, count] = a * a * xx + 2 * a * b * xz + b * b * zz + widening
+        image[3, count] = a * c * xy + a * d * xz + b * c * zy + b * d * zz
+        image[4, count] = c * c * yy + 2 * c * d * yz + d * d * zz + widening
+        count += 1
+    return count
 
 
-@part
-def _far(p, q, limit):
+@leaf
+def _far(image, i, j, limit):
     """Whether two projected Gaussians are too far apart: d^T S^-1 d >= d_x^2 / S_xx, S their mean covariance."""
-    dx, dy = p[0] - q[0], p[1] - q[1]
-    return dx * dx > limit * 0.5 * (p[2] + q[2]) or dy * dy > limit * 0.5 * (p[4] + q[4])
+    dx, dy = image[0, i] - image[0, j], image[1, i] - image[1, j]
+    return dx * dx > limit * 0.5 * (image[2, i] + image[2, j]) or dy * dy > limit * 0.5 * (image[4, i] + image[4, j])
 
 
-@part
-def _bhattacharyya(p, q):
+@leaf
+def _bhattacharyya(one, i, other, j):
     """Overlap of two projected Gaussians."""
-    xx, xy, yy = 0.5 * (p[2] + q[2]), 0.5 * (p[3] + q[3]), 0.5 * (p[4] + q[4])
+    xx, xy, yy = 0.5 * (one[2, i] + other[2, j]), 0.5 * (one[3, i] + other[3, j]), 0.5 * (one[4, i] + other[4, j])
     det = xx * yy - xy * xy
-    product = (p[2] * p[4] - p[3] * p[3]) * (q[2] * q[4] - q[3] * q[3])
-    dx, dy = p[0] - q[0], p[1] - q[1]
+    product = (one[2, i] * one[4, i] - one[3, i] * one[3, i]) * (other[2, j] * other[4, j] - other[3, j] * other[3, j])
+    dx, dy = one[0, i] - other[0, j], one[1, i] - other[1, j]
     squared = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det
     return math.exp(-squared / 8) * min(1.0, math.sqrt(math.sqrt(product) / det))

@@ -173,9 +173,9 @@ def floored(mean, covariance, weight, near, focal, widening, epsilon, covariance
 @part
 def fuse_pairs(
     mean, covariance, weight, disagreement, count, features,
-    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon, changed,
+    mean_c, cov_c, weight_c, features_c, pair_c, pair_k, overlap, distance, weighted, epsilon,
 ):  # fmt: skip
-    """Fuse the pairs [P] of one stream in their order, in place, and set ``changed`` [K] at every k.
+    """Fuse the pairs [P] of one stream in their order, in place.
 
     After each pair the values take the precision they are stored in. ``distance`` [P] takes the place of W2^2 where it
     is not empty; with ``weighted``, pi_c is multiplied by the overlap [P].
@@ -184,7 +184,6 @@ def fuse_pairs(
     mean_k, cov_k, least = np.empty(3), np.empty((3, 3)), np.empty(1)
     for p in range(pair_c.size):
         c, k = pair_c[p], pair_k[p]
-        changed[k] = True
         pi_k = np.float64(weight[k])
         pi_c = weight_c[c] * (overlap[p] if weighted else 1.0)
         lam = pi_c / (pi_k + pi_c)
@@ -210,14 +209,11 @@ def fuse_pairs(
 
 @part
 def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_c, weight_c, features_c, new, occupied):
-    """Add the components c where ``new`` [C] from slot ``occupied`` on, in place; return how many found no free one."""
+    """Add the components c where ``new`` [C] from slot ``occupied`` on, in place, as far as there are free ones; return
+    how many slots are in use."""
     slot = occupied
-    dropped = 0
     for c in range(weight_c.size):
-        if not new[c]:
-            continue
-        if slot == weight.size:
-            dropped += 1
+        if not new[c] or slot == weight.size:
             continue
         for i in range(3):
             mean[slot, i] = mean_c[c, i]
@@ -227,4 +223,4 @@ def append(mean, covariance, weight, disagreement, count, features, mean_c, cov_
             features[slot, g] = features_c[c, g]
         weight[slot], disagreement[slot], count[slot] = weight_c[c], 0.0, 1
         slot += 1
-    return dropped
+    return slot

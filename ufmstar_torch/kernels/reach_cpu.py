@@ -8,8 +8,8 @@ lies in an ellipsoid around the mean, which reaches r sqrt(n^T Sigma n) along a 
 
 A component is left out where the ellipsoid lies behind the camera, or in front of it and outside of one of the sides of
 the viewing pyramid, with room for rounding: both the matching and the regression would leave it out themselves, so
-that no bit of the result depends on it. The test takes no root and no logarithm: the peak's logarithm is bounded from
-above by the bits of a float64.
+that no bit of the result depends on it. The test takes no root, no quotient but one and no logarithm: the peak's
+logarithm is bounded from above by the bits of a float64. Several components are tested at a time.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import leaf, part
 from ufmstar_torch.kernels.regress_cull_cpu import negligible
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, gather, padded
+from ufmstar_torch.kernels.vectors_cpu import vectors
 
+_GROUP = 64  # slots at a time, a multiple of LANES
 _LOG2_PEAK = -1.5 * math.log2(2 * math.pi)
-_MANTISSA = 0.0861  # log2(1 + f) <= f + .0861
 _FLAT = 1e-13  # share of tr^3 below which a determinant may be rounding: such a component is kept
 _ROUNDING = 1e-9  # of a spread
 _WIDER = 1.01  # [px] beyond the first and the last pixel
@@ -45,17 +47,21 @@ def reached(motion, mean, covariance, weight, K, size, prior_weight, epsilon, mo
         occupied += weight[k] > 0
     if epsilon == 0:
         return index[:occupied], occupied
-    least = negligible(prior_weight, epsilon, occupied + more)
-    planes = np.empty((5, 4))  # outside: n . x > 0
+    planes = np.empty((6, 4))  # outside: n . x > 0; and log2 of the least density that counts
     _plane(planes, 0, motion, -K[0, 0], 0.0, -(K[0, 2] + _WIDER))
     _plane(planes, 1, motion, K[0, 0], 0.0, K[0, 2] + 1 - size[1] - _WIDER)
     _plane(planes, 2, motion, 0.0, -K[1, 1], -(K[1, 2] + _WIDER))
     _plane(planes, 3, motion, 0.0, K[1, 1], K[1, 2] + 1 - size[0] - _WIDER)
     _plane(planes, 4, motion, 0.0, 0.0, -1.0)
-    n = 0
-    for i in range(occupied):
-        index[n] = index[i]
-        n += not _outside(planes, mean, covariance, weight, index[i], least)
+    planes[5, 0] = negligible(prior_weight, epsilon, occupied + more)
+    n, group, kept = 0, np.empty((FIELDS, _GROUP)), np.empty(_GROUP)
+    for first in range(0, occupied, _GROUP):
+        slots = index[first : min(first + _GROUP, occupied)]
+        gather(slots, slots.size, mean, covariance, weight, group)
+        _within(planes, padded(slots.size), group, kept)
+        for i in range(slots.size):
+            index[n] = slots[i]
+            n += kept[i] > 0
     return index[:n], occupied
 
 
@@ -66,49 +72,34 @@ def _plane(planes, i, motion, x, y, z):
         planes[i, j] = x * motion[0, j] + y * motion[1, j] + z * motion[2, j]
 
 
-@leaf
-def _outside(planes, mean, covariance, weight, k, least):
-    """Whether component k lies behind the camera, or in front of it and outside of a side, for certain."""
-    z = -_beyond(planes, 4, mean, k)
-    worst, side = 0.0, 4
-    if z > 0:
-        for i in range(4):
-            beyond = _beyond(planes, i, mean, k)
-            if beyond > 0 and beyond * beyond > worst * _spread(planes, i, covariance, k):
-                worst, side = beyond * beyond / _spread(planes, i, covariance, k), i
-        if side == 4:
-            return False
-    square, depth = _square_radius(covariance, weight, k, least), _spread(planes, 4, covariance, k)
-    return z * z > square * depth and (z < 0 or worst > square)
+@vectors
+def _within(code, planes, n, group, kept):
+    """Write 0 to ``kept`` [64] where a component lies behind the camera, or in front of it and outside of a side, for
+    certain, else 1.
 
-
-@leaf
-def _beyond(planes, i, mean, k):
-    """How far the mean of component k lies outside of a plane, times the length of its normal."""
-    x, y, z = np.float64(mean[k, 0]), np.float64(mean[k, 1]), np.float64(mean[k, 2])
-    return planes[i, 0] * x + planes[i, 1] * y + planes[i, 2] * z + planes[i, 3]
-
-
-@leaf
-def _spread(planes, i, covariance, k):
-    """n^T Sigma n of a plane's normal, a little more than rounding leaves of it."""
-    x, y, z = planes[i, 0], planes[i, 1], planes[i, 2]
-    a, b, c = np.float64(covariance[k, 0, 0]), np.float64(covariance[k, 1, 1]), np.float64(covariance[k, 2, 2])
-    d, e, f = np.float64(covariance[k, 0, 1]), np.float64(covariance[k, 0, 2]), np.float64(covariance[k, 1, 2])
-    value = x * x * a + y * y * b + z * z * c + 2 * (x * y * d + x * z * e + y * z * f)
-    return value + _ROUNDING * (x * x + y * y + z * z) * (a + b + c)
-
-
-@leaf
-def _square_radius(covariance, weight, k, least):
-    """r^2 of the ellipsoid outside of which the density of component k is certainly below 2^least."""
-    a, b, c = np.float64(covariance[k, 0, 0]), np.float64(covariance[k, 1, 1]), np.float64(covariance[k, 2, 2])
-    d, e, f = np.float64(covariance[k, 0, 1]), np.float64(covariance[k, 0, 2]), np.float64(covariance[k, 1, 2])
-    trace = a + b + c
-    det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
-    if not det > _FLAT * trace * trace * trace:
-        return np.inf
-    ratio = np.float64(np.float64(weight[k]) ** 2 / det)
-    log2 = np.float64(ratio.view(np.int64)) * 2.0**-52 - 1023 + _MANTISSA
-    peak = 0.5 * log2 + _LOG2_PEAK + 0.05
-    return max((peak - least) * (2 * math.log(2.0)), 0.0) * 1.001
+    Args:
+        planes: [6, 4] the planes, the camera's own the last, and log2 of the least density that counts.
+        n: of the components, a multiple of a vector's length.
+        group: [13, 64] the components by field.
+    """
+    normals = [[planes.one(4 * i + j) for j in range(4)] for i in range(5)]
+    least = planes.one(20)
+    with code.loop(n, code.lanes) as at:
+        mean = [group.load(at, i * _GROUP) for i in range(3)]
+        xx, xy, xz, _, yy, yz, _, _, zz = (group.load(at, (COVARIANCE + i) * _GROUP) for i in range(9))
+        trace, weight = xx + yy + zz, group.load(at, WEIGHT * _GROUP)
+        det = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+        peak = (weight * weight).over(det).log2_above() * 0.5 + (_LOG2_PEAK + 0.05)
+        square = ((peak - least) * (2 * math.log(2.0))).at_least(0.0) * 1.001
+        square = (det > trace * trace * trace * _FLAT).select(square, math.inf)
+        beyond, spread = [], []
+        for x, y, z, offset in normals:
+            beyond.append(x * mean[0] + y * mean[1] + z * mean[2] + offset)
+            value = x * x * xx + y * y * yy + z * z * zz + (x * y * xy + x * z * xz + y * z * yz) * 2.0
+            spread.append(value + (x * x + y * y + z * z) * trace * _ROUNDING)
+        none = weight * 0.0
+        outside = (beyond[4] > 0.0).select(none + 1.0, none)
+        for side in range(4):
+            outside = (beyond[side] * beyond[side].size() > square * spread[side]).select(none + 1.0, outside)
+        outside = (beyond[4] * beyond[4] > square * spread[4]).select(outside, none)
+        kept.store(none + 1.0 - outside, at)

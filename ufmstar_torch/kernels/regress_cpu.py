@@ -7,7 +7,7 @@ out components that cannot matter, and state the error. The paper's neighbourhoo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from ufmstar_torch.kernels.regress_cull_cpu import in_view
 from ufmstar_torch.kernels.regress_near_cpu import near_image, near_points
 from ufmstar_torch.kernels.regress_points_cpu import at_points
 from ufmstar_torch.kernels.regress_tiles_cpu import exact, exact_at
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, FIELDS, WEIGHT, padded
 from ufmstar_torch.kernels.threads_cpu import each, shares_of_stream
 from ufmstar_torch.mixture import GaussianMixture
 from ufmstar_torch.regress import Regression, regress_pixels
@@ -28,6 +29,49 @@ from ufmstar_torch.regress import Regression, regress_pixels
 # Share of the denominator that culling may leave out: about the rounding of a sum in the dtype, so that culling is no
 # coarser than the arithmetic itself.
 EPSILON = {torch.float32: 1e-6, torch.float64: 1e-14}
+
+
+View = tuple[Any, ...]  # what `in_view` returns
+
+
+class Seen(NamedTuple):
+    """What of a stream's mixture can matter in an image: n components by field [13, n and more] in the camera's frame
+    (``rigid_cpu``), their disagreement [n] and features [n, F], and how many components the mixture has."""
+
+    components: NDArray[np.float64]
+    disagreement: NDArray[np.float64]
+    features: NDArray[np.float64]
+    occupied: int
+
+    def moments(self) -> tuple[NDArray[np.float64], ...]:
+        """Mean [n, 3], covariance [n, 3, 3] and weight [n]."""
+        rows = self.components[:, : len(self.disagreement)].T
+        mean, covariance, weight = np.split(rows, (COVARIANCE, WEIGHT), axis=1)
+        return mean.copy(), np.ascontiguousarray(covariance).reshape(-1, 3, 3), weight[:, 0].copy()
+
+
+def in_slots(seen: Sequence[Seen], slots: Sequence[NDArray[np.int64]], capacity: int) -> GaussianMixture:
+    """The components in those slots [n] of a mixture [B, capacity] in the camera's frame, the others empty."""
+    features = seen[0].features.shape[1]
+    mixture = GaussianMixture.empty(len(seen), capacity, features=features, dtype=torch.float64, device="cpu")
+    for b, (one, at) in enumerate(zip(seen, map(torch.from_numpy, slots), strict=True)):
+        values = map(torch.from_numpy, (*one.moments(), one.disagreement, one.features))
+        for field, value in zip(_tensors(mixture), values, strict=True):
+            field[b, at] = value
+    return mixture
+
+
+def all_seen(mixture_cam: GaussianMixture, features: int | None = None) -> tuple[list[Seen], list[NDArray[np.int64]]]:
+    """All components of each stream, and their slots; with so many features, zeros, in place of their own."""
+    seen, slots = [], []
+    for mean, covariance, weight, disagreement, own in zip(*_fields(mixture_cam), strict=True):
+        at = np.flatnonzero(weight > 0)
+        n = len(at)
+        components = np.zeros((FIELDS, padded(n)))
+        components[:, :n] = np.column_stack([mean[at], covariance[at].reshape(n, 9), weight[at]]).T
+        seen.append(Seen(components, disagreement[at], own[at] if features is None else np.zeros((n, features)), n))
+        slots.append(at)
+    return seen, slots
 
 
 def regress_image(
@@ -39,43 +83,61 @@ def regress_image(
     pixels: Tensor | None = None,
 ) -> Regression:
     """As :func:`ufmstar_torch.regress.regress_image`, for CPU tensors; every feature is a contiguous map."""
-    return regress_maps(mixture_cam, torch.where(valid, depth.detach(), 0), intrinsics, config, pixels)
+    depth = torch.where(valid, depth.detach(), 0)
+    return regress_maps(all_seen(mixture_cam)[0], depth, intrinsics, config, pixels)
+
+
+def look(
+    seen: Sequence[Seen], depth: Tensor, intrinsics: Tensor, config: UfMStarConfig, *others: torch.dtype
+) -> list[View]:
+    """What each stream's mixture has in view, as the exact sum takes it, with the error of the depth's dtype or of a
+    more precise one of the ``others``."""
+    epsilon = min(EPSILON[dtype] for dtype in (depth.dtype, *others))
+    streams = zip(seen, _doubles(intrinsics)[0], array(depth), strict=True)
+    return [in_view(*one, K, z, config.prior_weight, config.prior_mean, epsilon) for one, K, z in streams]
 
 
 def regress_maps(
-    mixture_cam: GaussianMixture,
+    seen: Sequence[Seen],
     depth: Tensor,
     intrinsics: Tensor,
     config: UfMStarConfig,
     pixels: Tensor | None = None,
-    near: Sequence[tuple[NDArray[np.int64], int]] | None = None,
+    views: Sequence[View] | None = None,
+    shift: NDArray[np.float64] | None = None,
 ) -> Regression:
-    """:func:`regress_image` of a depth that is positive where it is valid, and only there.
+    """:func:`regress_image` of a depth that is positive where it is valid, and only there, and of what each stream's
+    mixture has in view.
 
-    ``near`` are the slots of each stream that can matter, in increasing order, and how many are occupied; None = all.
+    With the exact sum, ``views`` are those of :func:`look`, which None makes, and ``shift`` [B, 2] is added to the two
+    features before the last, of three or more; None = nothing.
     """
     if pixels is not None and config.regression != "exact":
-        return regress_pixels(mixture_cam, depth, intrinsics, depth > 0, config, pixels, regress)
+        most = max(len(one.disagreement) for one in seen)
+        mixture = in_slots(seen, [np.arange(len(one.disagreement)) for one in seen], most)
+        return regress_pixels(mixture, depth, intrinsics, depth > 0, config, pixels, regress)
     z, K = array(depth), _doubles(intrinsics)[0]
-    shape = z.shape if pixels is None else tuple(pixels.shape)
-    out, features = np.empty(shape, z.dtype), np.empty((len(z), mixture_cam.features.shape[2], *shape[1:]), z.dtype)
+    shape, features = z.shape if pixels is None else tuple(pixels.shape), seen[0].features.shape[1]
+    out, out_f = np.empty(shape, z.dtype), np.empty((len(z), features, *shape[1:]), z.dtype)
     shares = 1 if pixels is not None else shares_of_stream(len(z), z[0].size)
-    settings = _settings(config, depth.dtype)
+    settings, moved = _settings(config, depth.dtype), np.zeros((len(z), 2)) if shift is None else shift
     kernel = near_image if config.regression != "exact" else exact if pixels is None else exact_at
+    if views is None and kernel is not near_image:
+        views = look(seen, depth, intrinsics, config)
     calls: list[tuple[Any, ...]] = []
-    for b, fields in enumerate(zip(*_fields(mixture_cam), strict=True)):
-        if kernel is near_image:
-            calls += [(z[b], K[b], *fields, *settings, out[b], features[b], i, shares) for i in range(shares)]
+    for b, one in enumerate(seen):
+        into = out[b], out_f[b]
+        if views is None:
+            given = (z[b], K[b], *one.moments(), one.disagreement, one.features, *settings, *into)
+            calls += [(*given, i, shares) for i in range(shares)]
             continue
-        slots = np.flatnonzero(fields[2] > 0) if near is None else near[b][0]
-        occupied = len(slots) if near is None else near[b][1]
-        view = in_view(slots, occupied, *fields, K[b], z[b], *settings)
+        view = views[b]
         if pixels is None:
-            calls += [(z[b], K[b], view, fields[4], out[b], features[b], i, shares) for i in range(shares)]
+            calls += [(z[b], K[b], view, one.features, moved[b], *into, i, shares) for i in range(shares)]
         else:
-            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, fields[4], out[b], features[b]))
+            calls.append((z[b], K[b], pixels[b].contiguous().numpy(), view, one.features, moved[b], *into))
     each(kernel, calls)
-    return _regression(out, features)
+    return _regression(out, out_f)
 
 
 def regress(mixture: GaussianMixture, points: Tensor, config: UfMStarConfig) -> Regression:
@@ -120,8 +182,12 @@ def _doubles(*values: Tensor) -> list[NDArray[np.float64]]:
     return [np.asarray(array(value), np.float64) for value in values]
 
 
+def _tensors(m: GaussianMixture) -> tuple[Tensor, ...]:
+    return m.mean, m.covariance, m.weight, m.disagreement, m.features
+
+
 def _fields(m: GaussianMixture) -> list[NDArray[np.float64]]:
-    return _doubles(m.mean, m.covariance, m.weight, m.disagreement, m.features)
+    return _doubles(*_tensors(m))
 
 
 def _regression(out: NDArray[Any], features: NDArray[Any]) -> Regression:

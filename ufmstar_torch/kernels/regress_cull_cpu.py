@@ -27,9 +27,11 @@ import math
 import numpy as np
 
 from ufmstar_torch.kernels.compile_cpu import kernel, leaf
-from ufmstar_torch.kernels.regress_points_cpu import prepare
-from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds
+from ufmstar_torch.kernels.regress_points_cpu import HALF_LOG_TWO_PI_CUBED
+from ufmstar_torch.kernels.regress_vectors_cpu import TERMS, bounds, largest
+from ufmstar_torch.kernels.rigid_cpu import padded
 from ufmstar_torch.kernels.vectors_cpu import LANES
+from ufmstar_torch.kernels.whiten_cpu import PEAK, SQUARE, WHITENED, meets, whiten
 
 _PRIOR = 1e-3  # share of the prior in a threshold
 FIELDS = 10  # of a component: mean (3), whitening (6), log2 of the peak
@@ -37,27 +39,28 @@ _LOG2_E = math.log2(math.e)
 
 
 @kernel
-def in_view(slots, occupied, mean, covariance, weight, m, features, K, depth, prior_weight, prior_mean, epsilon):
-    """The components of a mixture [K, ...] that can matter in an image, as :func:`exact` takes them.
+def in_view(components, m, features, occupied, K, depth, prior_weight, prior_mean, epsilon):
+    """The components that can matter in an image, as :func:`exact` takes them.
 
     Args:
-        slots: [n] increasing, the only ones that are looked at.
+        components: in the camera's frame by field [13, n and more] (``rigid_cpu``).
+        m, features: of the n components [n], [n, F].
         occupied: how many components the mixture has, others than those included.
         depth: [H, W], not positive where there is none.
 
     Returns:
         Indices [n], fields [n, 10], the same in the dtype of ``depth`` and by field [10, n and more], the terms of the
-        sum but their offsets [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold,
+        sum [n, TERMS], and the settings: prior weight and mean, epsilon, log2 of the least threshold,
         and how many components level 1 left.
     """
     height, width = depth.shape
-    index, whitening, log_peak = prepare(slots.copy(), mean, covariance, weight)
     least, limit = math.log2(_PRIOR * prior_weight), negligible(prior_weight, epsilon, occupied)
-    fields, constants = np.empty((index.size, FIELDS)), np.empty((index.size, TERMS), depth.dtype)
-    n = _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features)
-    packed, kept = np.empty((FIELDS, _padded(n)), depth.dtype), np.empty(n, np.int64)
-    _pack(fields, n, packed)
-    z = _farthest(depth)
+    whitened = np.empty((WHITENED, components.shape[1]))
+    index, kept = np.empty(m.size, np.int64), np.empty(m.size, np.int64)
+    n = _visible(components, m.size, whitened, K, height, width, limit, np.empty((2, 3)), index)
+    packed = np.empty((FIELDS, padded(n)), depth.dtype)
+    _pack(components, whitened, index, n, packed)
+    z = _farthest(depth, np.empty(1, depth.dtype))
     left, top = (0 - K[0, 2]) / K[0, 0] * z, (0 - K[1, 2]) / K[1, 1] * z
     right, bottom = (width - 1 - K[0, 2]) / K[0, 0] * z, (height - 1 - K[1, 2]) / K[1, 1] * z
     box = min(left, 0.0), min(top, 0.0), 0.0, max(right, 0.0), max(bottom, 0.0), z
@@ -65,40 +68,54 @@ def in_view(slots, occupied, mean, covariance, weight, m, features, K, depth, pr
     # Blocks take n components; a few more lower the threshold by more than what rounding can make of two boxes.
     chosen = cull(packed, n, n + n // 64 + 1, box, settings, work, kept)
     for i in range(chosen):
-        k = kept[i]
-        index[i] = index[k]
-        for j in range(FIELDS):
-            fields[i, j] = fields[k, j]
-        for j in range(TERMS):
-            constants[i, j] = constants[k, j]
-    packed = np.empty((FIELDS, _padded(chosen)), depth.dtype)
-    _pack(fields, chosen, packed)
+        index[i] = index[kept[i]]
+    fields, constants = np.empty((chosen, FIELDS)), np.empty((chosen, TERMS), depth.dtype)
+    _terms(components, whitened, index, m, features, fields, constants)
+    packed = np.empty((FIELDS, padded(chosen)), depth.dtype)
+    _pack(components, whitened, index, chosen, packed)
     return index[:chosen], fields, packed, constants, settings
 
 
 @leaf
-def _pack(fields, n, packed):
-    """The fields [n, 10] by field, and behind them components that are nowhere."""
-    for i in range(FIELDS):
+def _pack(components, whitened, index, n, packed):
+    """The fields of the first n chosen components by field, and behind them components that are nowhere.
+
+    The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
+    """
+    for i in range(3):
         for k in range(n):
-            packed[i, k] = fields[k, i]
+            packed[i, k] = components[i, index[k]]
+    for i in range(3, FIELDS):
+        for k in range(n):
+            packed[i, k] = whitened[i - 3, index[k]]
     pad(packed, n)
 
 
 @leaf
-def _farthest(depth):
-    """The largest depth, in four chains of comparisons, which do not wait for each other."""
-    most = np.float64(0)
-    for v in range(depth.shape[0]):
-        row = depth[v]
-        a = b = c = d = row[0]
-        for u in range(0, depth.shape[1] - 3, 4):
-            a, b = row[u] if row[u] > a else a, row[u + 1] if row[u + 1] > b else b
-            c, d = row[u + 2] if row[u + 2] > c else c, row[u + 3] if row[u + 3] > d else d
-        for u in range(depth.shape[1] - depth.shape[1] % 4, depth.shape[1]):
-            a = row[u] if row[u] > a else a
-        most = max(most, np.float64(max(max(a, b), max(c, d))))
-    return most
+def _terms(components, whitened, index, m, features, fields, constants):
+    """Write the fields [n, 10] of the chosen components, and the terms of the sum."""
+    for i in range(fields.shape[0]):
+        k = index[i]
+        for j in range(3):
+            fields[i, j] = components[j, k]
+        for j in range(7):
+            fields[i, 3 + j] = constants[i, j] = whitened[j, k]
+        constants[i, 7] = m[k]
+        for g in range(min(3, features.shape[1])):
+            constants[i, 8 + g] = features[k, features.shape[1] - 1 - g]
+
+
+@leaf
+def _farthest(depth, work):
+    """The largest depth; ``work`` is scratch."""
+    flat = depth.reshape(-1)
+    n = flat.size - flat.size % (4 * LANES)
+    work[0] = 0
+    largest(flat, n, work)
+    most = work[0]
+    for i in range(n, flat.size):
+        most = flat[i] if flat[i] > most else most
+    return np.float64(most)
 
 
 @leaf
@@ -114,74 +131,33 @@ def _limit(epsilon, count):
 
 
 @leaf
-def _padded(n):
-    """A multiple, not below n, of what a vector loop takes at a time: its remainder would take as long again."""
-    return (n + LANES - 1) // LANES * LANES
-
-
-@leaf
 def pad(packed, n):
     """Fill the fields behind n components up to the padded number with those of one that is nowhere."""
-    for j in range(n, _padded(n)):
+    for j in range(n, padded(n)):
         for i in range(FIELDS - 1):
             packed[i, j] = 0
         packed[FIELDS - 1, j] = -1e30
 
 
 @leaf
-def _visible(mean, covariance, index, whitening, log_peak, K, height, width, limit, fields, constants, m, features):
-    """Write the fields of the components whose density can exceed 2^limit at a pixel of the image.
-
-    The fields are mean, whitening and log2 of the peak: 2^(peak - |whitening (x - mean)|^2) is the density.
-    ``constants`` are the terms of the sum. The indices of these components move to the head of
-    ``index``; returns how many there are.
-    """
-    scale, n = math.sqrt(0.5 * _LOG2_E), 0
-    for k in range(index.size):
-        square = 2 * (log_peak[k] - limit / _LOG2_E) * (1 + 1e-6)
-        if not _meets(mean, covariance, index[k], square, K, height, width):
-            continue
-        for i in range(3):
-            fields[n, i] = mean[index[k], i]
-        for i in range(6):
-            fields[n, 3 + i] = whitening[k, i] * scale
-        fields[n, 9] = log_peak[k] * _LOG2_E
-        for i in range(6):
-            constants[n, i] = fields[n, 3 + i]
-        constants[n, 6], constants[n, 7] = fields[n, 9], m[index[k]]
-        for g in range(min(3, features.shape[1])):
-            constants[n, 8 + g] = features[index[k], features.shape[1] - 1 - g]
-        index[n] = index[k]
-        n += 1
-    return n
-
-
-@leaf
-def _meets(mean, covariance, k, square, K, height, width):
-    """Whether the ellipsoid (x - mu)^T S^-1 (x - mu) = square can have a point in the view.
-
-    Its silhouette lies between the planes x = s z (and y = s z) that touch it, (mu_x - s mu_z)^2 =
-    square (S_xx - 2 s S_xz + s^2 S_zz): a quadratic equation in s. One that reaches z = 0 may be anywhere.
-    """
-    sxx, syy, szz = covariance[k, 0, 0], covariance[k, 1, 1], covariance[k, 2, 2]
-    z = mean[k, 2]
-    least = 1e-14 * max(sxx, syy, szz)  # as in prepare
-    szz = square * (szz + least)
-    a = z * z - szz
-    if square <= 0 or (z < 0 and a > 1e-6 * szz):
-        return False  # its peak is too low, or it lies behind the camera
-    if a <= 1e-6 * szz:
-        return True
+def _visible(components, count, whitened, K, height, width, limit, view, index):
+    """Write whitening and log2 of the peak of the first ``count`` components, and the indices of those whose density
+    can exceed 2^limit at a pixel of the image; return how many these are. ``view`` [2, 3] is scratch."""
+    whiten(components, components.shape[1], padded(count), whitened)
+    for k in range(count):
+        log_peak = math.log(whitened[PEAK, k]) - HALF_LOG_TWO_PI_CUBED
+        whitened[PEAK, k] = log_peak * _LOG2_E
+        whitened[SQUARE, k] = 2 * (log_peak - limit / _LOG2_E) * (1 + 1e-6)
+    for k in range(count, padded(count)):
+        whitened[SQUARE, k] = 0
     for axis in range(2):
-        x, sx = mean[k, axis], covariance[k, axis, axis] + least
-        half_b = x * z - square * covariance[k, axis, 2]
-        root = math.sqrt(max(half_b * half_b - a * (x * x - square * sx), 0.0))
-        root += 1e-9 * (abs(half_b) + root)
-        p = (half_b - root) / a * K[axis, axis] + K[axis, 2]
-        q = (half_b + root) / a * K[axis, axis] + K[axis, 2]
-        if max(p, q) < -1 or min(p, q) > (width if axis == 0 else height):
-            return False
-    return True
+        view[axis, 0], view[axis, 1], view[axis, 2] = K[axis, axis], K[axis, 2], height if axis else width
+    meets(components, components.shape[1], padded(count), whitened, view)
+    n = 0
+    for k in range(count):
+        index[n] = k
+        n += whitened[SQUARE, k] > 0
+    return n
 
 
 @leaf
@@ -199,7 +175,7 @@ def cull(packed, n, level, box, settings, work, kept):
         work[i], work[3 + i] = centre, half + slack * (half + abs(centre))
     work[6], work[7] = slack, least
     upper = work[8:]
-    bounds(packed, packed.shape[1], _padded(n), work, upper)
+    bounds(packed, packed.shape[1], padded(n), work, upper)
     threshold = work[7] + real(_limit(epsilon, level))
     count = 0
     for j in range(n):

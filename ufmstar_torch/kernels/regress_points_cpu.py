@@ -14,7 +14,7 @@ import numpy as np
 from ufmstar_torch.kernels.compile_cpu import kernel, part
 
 _LEAF = 16  # points; below that choosing components costs more than it saves
-_HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
+HALF_LOG_TWO_PI_CUBED = 1.5 * math.log(2 * math.pi)
 
 
 @part
@@ -34,7 +34,7 @@ def prepare(index, mean, covariance, weight):
         whitening[i, 1], whitening[i, 2] = -l10 / (l00 * l11), 1 / l11
         whitening[i, 4], whitening[i, 5] = -l21 / (l11 * l22), 1 / l22
         whitening[i, 3] = -(l20 * whitening[i, 0] + l21 * whitening[i, 1]) / l22
-        log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - _HALF_LOG_TWO_PI_CUBED
+        log_peak[i] = math.log(weight[index[i]] / (l00 * l11 * l22)) - HALF_LOG_TWO_PI_CUBED
     return index, whitening, log_peak
 
 

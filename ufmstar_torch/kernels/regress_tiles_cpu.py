@@ -18,8 +18,8 @@ from ufmstar_torch.kernels.compile_cpu import contracted, kernel, leaf, part
 from ufmstar_torch.kernels.regress_cull_cpu import FIELDS, cull, pad
 from ufmstar_torch.kernels.regress_vectors_cpu import (
     PIXELS,
-    TERMS,
     TILE,
+    TINY,
     mix,
     mix_more,
     mix_three,
@@ -36,13 +36,13 @@ _EVIDENCE, _TOTAL, _LAST = range(3)  # rows of a tile's sums and averages, as `m
 
 
 @kernel
-def exact(depth, K, view, features, out, out_f, first, shares):
+def exact(depth, K, view, features, shift, out, out_f, first, shares):
     """One stream; of its blocks every ``shares``-th, from ``first`` on.
 
     depth [H, W], K [3, 3], what is in view (:func:`in_view`) and features [K, F] into out [H, W] and out_f [F, H, W];
-    NaN where the depth is not positive.
+    NaN where the depth is not positive. ``shift`` [2] is added to the two features before the last, of three or more.
     """
-    tiles, lists, sums = _scratch(view, out_f)
+    tiles, lists, sums = _scratch(view, out_f, shift)
     grid = tiles[0]
     for i in range(PIXELS):
         grid[0, i] = (i % TILE - 0.5 * (TILE - 1)) / K[0, 0]
@@ -51,25 +51,25 @@ def exact(depth, K, view, features, out, out_f, first, shares):
 
 
 @kernel
-def exact_at(depth, K, pixels, view, features, out, out_f):
+def exact_at(depth, K, pixels, view, features, shift, out, out_f):
     """One stream at some pixels [n], indices into the flattened image, into out [n] and out_f [F, n]."""
     height, width = depth.shape
     columns, rows = (width + _BLOCK - 1) // _BLOCK, (height + _BLOCK - 1) // _BLOCK
-    begin, order = np.zeros(rows * columns + 1, np.int64), np.empty(pixels.size, np.int64)
-    _by_block(pixels, width, columns, begin, order)
-    tiles, lists, sums = _scratch(view, out_f)
-    _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f)
+    begin, sorted_pixels = np.zeros(rows * columns + 1, np.int64), np.empty((4, pixels.size), np.int64)
+    _by_block(pixels, width, columns, begin, sorted_pixels)
+    tiles, lists, sums = _scratch(view, out_f, shift)
+    _at_pixels(depth, K, begin, sorted_pixels, view, features, tiles, lists, sums, out, out_f)
 
 
 @part
-def _scratch(view, out_f):
+def _scratch(view, out_f, shift):
     """Memory for the work on one block, of the n components in view, in the dtype of the maps.
 
     Returns:
         Of the tiles: their pixels' rays less that through the middle [2, 64], the depths of one of them [64], points
         [16, 192], boxes and origins [16, 9] in float64, whether they have a pixel, what :func:`place` adds in holes
         [16, 64], and its work [10]. Of lists of components: their fields, work of :func:`cull`, and two lists. Of sums
-        at a tile: what they start with [3], terms and densities of components, the sums [5, 64], averages of the
+        at a tile: what they start with [6], offsets and densities of components, the sums [5, 64], averages of the
         other features, and the values of one of them.
     """
     n, dtype, more = view[2].shape[1], view[2].dtype, out_f.shape[0] - _mixed(out_f.shape[0])  # n is padded
@@ -78,13 +78,14 @@ def _scratch(view, out_f):
         np.empty((_TILES, 9)), np.empty(_TILES, np.bool_), np.empty((_TILES, PIXELS), dtype), np.empty(10, dtype),
     )  # fmt: skip
     lists = np.empty((FIELDS, n), dtype), np.empty(n + 8, dtype), np.empty(n, np.int64), np.empty(n, np.int64)
-    start = np.zeros(3, dtype)
-    start[_EVIDENCE], start[_TOTAL] = view[4][0], view[4][0] * view[4][1]
+    start = np.zeros(6, dtype)
+    start[_EVIDENCE], start[_TOTAL], start[3] = view[4][0], view[4][0] * view[4][1], TINY
+    start[4], start[5] = shift[1], shift[0]
     densities = np.empty((n if more > 0 else 0, PIXELS), dtype)
     return (
         tiles, lists,
         (
-            start, np.empty((n, TERMS), dtype), densities, np.empty((5, PIXELS), dtype),
+            start, np.empty((n, 3), dtype), densities, np.empty((5, PIXELS), dtype),
             np.empty((more, PIXELS), dtype), np.empty(n, dtype),
         ),
     )  # fmt: skip
@@ -132,15 +133,21 @@ def _blocks(depth, K, view, features, tiles, lists, sums, out, out_f, first, sha
 
 
 @leaf
-def _by_block(pixels, width, columns, begin, order):
-    """Sort pixels by block, keeping their order within one: ``begin`` [blocks + 1] and ``order`` [n]."""
+def _by_block(pixels, width, columns, begin, out):
+    """Sort pixels by block, keeping their order within one: ``begin`` [blocks + 1], and ``out`` [3 and more, n] with
+    the number of each, its row and its column."""
     for i in range(pixels.size):
-        begin[_block(pixels[i], width, columns) + 1] += 1
+        v = pixels[i] // width
+        out[3, i] = v
+        begin[_block(v, pixels[i] - v * width, columns) + 1] += 1
     for block in range(1, begin.size):
         begin[block] += begin[block - 1]
     for i in range(pixels.size):
-        block = _block(pixels[i], width, columns)
-        order[begin[block]] = i
+        v = out[3, i]
+        u = pixels[i] - v * width
+        block = _block(v, u, columns)
+        at = begin[block]
+        out[0, at], out[1, at], out[2, at] = i, v, u
         begin[block] += 1
     for block in range(begin.size - 1, 0, -1):
         begin[block] = begin[block - 1]
@@ -148,32 +155,33 @@ def _by_block(pixels, width, columns, begin, order):
 
 
 @leaf
-def _block(pixel, width, columns):
+def _block(v, u, columns):
     """The block of a pixel."""
-    v = pixel // width
-    return v // _BLOCK * columns + (pixel - v * width) // _BLOCK
+    return v // _BLOCK * columns + u // _BLOCK
 
 
 @leaf
-def _at_pixels(depth, K, pixels, begin, order, view, features, tiles, lists, sums, out, out_f):
-    """The blocks of an image at some pixels, up to 64 at a time."""
+def _at_pixels(depth, K, begin, pixels, view, features, tiles, lists, sums, out, out_f):
+    """The blocks of an image at some pixels, up to 64 at a time; ``begin`` and ``pixels`` are those of
+    :func:`_by_block`."""
     grid, z, kept, averages, more, last = tiles[0], tiles[1], lists[2], sums[3], sums[4], out_f.shape[0] - 1
-    nan, columns = out.dtype.type(np.nan), (depth.shape[1] + _BLOCK - 1) // _BLOCK
+    nan, columns, order = out.dtype.type(np.nan), (depth.shape[1] + _BLOCK - 1) // _BLOCK, pixels[0]
     for block in range(begin.size - 1):
         v0, u0 = block // columns * _BLOCK + 0.5 * (_BLOCK - 1), block % columns * _BLOCK + 0.5 * (_BLOCK - 1)
         for low in range(begin[block], begin[block + 1], PIXELS):
-            high = min(low + PIXELS, begin[block + 1])
-            for i in range(PIXELS):
-                p = pixels[order[min(low + i, high - 1)]]
-                v, u = p // depth.shape[1], p % depth.shape[1]
+            count = min(PIXELS, begin[block + 1] - low)
+            for i in range(count):
+                v, u = pixels[1, low + i], pixels[2, low + i]
                 grid[0, i], grid[1, i] = (u - u0) / K[0, 0], (v - v0) / K[1, 1]
                 z[i] = depth[v, u]
+            for i in range(count, PIXELS):  # the last one again
+                grid[0, i], grid[1, i], z[i] = grid[0, count - 1], grid[1, count - 1], z[count - 1]
             some = _place((u0 - K[0, 2]) / K[0, 0], (v0 - K[1, 2]) / K[1, 1], tiles, 0)
             if some:
-                count = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], kept)
-                filled = (high - low + LANES - 1) // LANES * LANES
-                _average(filled, tiles, 0, kept, count, view, features, sums)
-            for i in range(high - low):
+                chosen = cull(view[2], view[0].size, view[4][4], _box(tiles[3], 0), view[4], lists[1], kept)
+                filled = (count + LANES - 1) // LANES * LANES
+                _average(filled, tiles, 0, kept, chosen, view, features, sums)
+            for i in range(count):
                 out[order[low + i]] = averages[_TOTAL, i] if some else nan
                 for g in range(more.shape[0]):
                     out_f[g, order[low + i]] = more[g, i] if some else nan
@@ -244,13 +252,14 @@ def _blank(v_low, u_low, out, out_f):
 def _average(some, tiles, tile, chosen, count, view, features, sums):
     """As :func:`mix` at the first points of a tile, over ``chosen`` components, with averages of further features."""
     points, boxes, hole = tiles[2], tiles[3], tiles[5]
-    start, terms, densities, averages, more, values = sums
-    index, fields, _, constants, _ = view
-    _offsets(fields, constants, chosen, count, boxes[tile], terms)
+    start, offsets, densities, averages, more, values = sums
+    index, fields, _, terms, _ = view
+    _offsets(fields, chosen, count, boxes[tile], offsets)
+    into = averages, densities, more.shape[0] > 0
     if features.shape[1] < 3:
-        mix(terms, count, points[tile], some, start, hole[tile], averages, densities, more.shape[0] > 0)
+        mix(terms, chosen, offsets, count, points[tile], some, start, hole[tile], *into)
     else:
-        mix_three(terms, count, points[tile], some, start, hole[tile], averages, densities, more.shape[0] > 0)
+        mix_three(terms, chosen, offsets, count, points[tile], some, start, hole[tile], *into)
     for g in range(more.shape[0]):
         for j in range(count):
             values[j] = features[index[chosen[j]], g]
@@ -258,18 +267,15 @@ def _average(some, tiles, tile, chosen, count, view, features, sums):
 
 
 @contracted
-def _offsets(fields, constants, chosen, count, box, terms):
-    """The terms of the chosen components, with the whitened offsets of a tile's origin from their means."""
+def _offsets(fields, chosen, count, box, offsets):
+    """The whitened offsets of a tile's origin from the means of the chosen components."""
     x, y, z = box[6], box[7], box[8]
     for j in range(count):
-        k, row = fields[chosen[j]], terms[j]
-        given = constants[chosen[j]]
+        k = fields[chosen[j]]
         dx, dy, dz = x - k[0], y - k[1], z - k[2]
-        for i in range(TERMS - 3):
-            row[i] = given[i]
-        row[TERMS - 3] = k[3] * dx
-        row[TERMS - 2] = k[4] * dx + k[5] * dy
-        row[TERMS - 1] = k[6] * dx + k[7] * dy + k[8] * dz
+        offsets[j, 0] = k[3] * dx
+        offsets[j, 1] = k[4] * dx + k[5] * dy
+        offsets[j, 2] = k[6] * dx + k[7] * dy + k[8] * dz
 
 
 @leaf

@@ -9,9 +9,10 @@ from ufmstar_torch.kernels.vectors_cpu import Lanes, vectors
 
 TILE = 8  # pixels, the side of a tile
 PIXELS = TILE * TILE
-# Of a component: whitening (6), log2 of the peak, m, the last three features from the last on, whitened offset of the
-# tile's origin (3).
-TERMS = 14
+TERMS = 11  # of a component: whitening (6), log2 of the peak, m, the last three features from the last on
+# Sums of features that may have any size start from it, and lose it at the end: a number too small for a normal float,
+# a small feature of a component far away, takes an addition a hundred times as long. It rounds off 1e-7 of it.
+TINY = 2.0**-100
 
 
 @vectors
@@ -78,25 +79,28 @@ def bounds(code, packed, stride, n, box, upper):
 
 
 @vectors
-def mix(code, terms, count, points, some, start, hole, sums, densities, keep):
+def mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep):
     """Averages of m and of the last feature (:func:`_mix`)."""
-    _mix(code, terms, count, points, some, start, hole, sums, densities, keep, 1)
+    _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep, 1)
 
 
 @vectors
-def mix_three(code, terms, count, points, some, start, hole, sums, densities, keep):
+def mix_three(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep):
     """Averages of m and of the last three features (:func:`_mix`)."""
-    _mix(code, terms, count, points, some, start, hole, sums, densities, keep, 3)
+    _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep, 3)
 
 
-def _mix(code, terms, count, points, some, start, hole, sums, densities, keep, features):
+def _mix(code, terms, chosen, offsets, count, points, some, start, hole, sums, densities, keep, features):
     """Averages over components at the points of a tile, weighted by their densities.
 
     Args:
-        terms: [n, TERMS] of the components, of which the first ``count`` take part.
+        terms: [n, TERMS] of the components.
+        chosen: of them take part, of which the first ``count`` count.
+        offsets: [count, 3] whitened, of the tile's origin from theirs.
         points: [3, 64] x, y and z from the tile's origin.
         some: of the points are computed, from the first on; a multiple of a vector's length.
-        start: [3] what the prior adds to each sum.
+        start: [6] what the sums start with: of the densities, of m, of the last feature, of those before it (lost at
+            the end); and what the averages of the feature before the last and of the one before it are moved by.
         hole: [64] NaN where there is a hole, else 0.
         sums: [5, 64] the sum of the densities, the average of m, and those of so many features from the last on; the
             averages are NaN in a hole.
@@ -105,12 +109,11 @@ def _mix(code, terms, count, points, some, start, hole, sums, densities, keep, f
     """
     with code.loop(some, code.lanes) as i:
         x, y, z = (points.load(i, axis * PIXELS) for axis in range(3))
-        totals = [code.variable(start.one(min(row, 2))) for row in range(2 + features)]
+        totals = [code.variable(start.one(min(row, 3))) for row in range(2 + features)]
         with code.loop(count) as j:
-            at = code.times(j, TERMS)
-            a, b, c, d, e, f, peak, *averaged, x0, y0, z0 = (
-                terms.one(at, term) for term in (*range(8 + features), TERMS - 3, TERMS - 2, TERMS - 1)
-            )
+            at, beside = code.times(chosen.whole(j), TERMS), code.times(j, 3)
+            a, b, c, d, e, f, peak, *averaged = (terms.one(at, term) for term in range(8 + features))
+            x0, y0, z0 = (offsets.one(beside, axis) for axis in range(3))
             p, q, r = a * x + x0, b * x + (c * y + y0), d * x + (e * y + (f * z + z0))
             density = (((peak - p * p) - q * q) - r * r).exp2()
             for total, part in zip(totals, (density, *(density * value for value in averaged)), strict=True):
@@ -120,7 +123,9 @@ def _mix(code, terms, count, points, some, start, hole, sums, densities, keep, f
         evidence, holes = totals[0].value, hole.load(i)
         sums.store(evidence, i)
         for row in range(1, 2 + features):
-            sums.store(totals[row].value.over(evidence) + holes, i, row * PIXELS)
+            total = totals[row].value
+            mean = total.over(evidence) if row < 3 else (total - start.one(3)).over(evidence) + start.one(1 + row)
+            sums.store(mean + holes, i, row * PIXELS)
 
 
 @vectors
@@ -166,6 +171,42 @@ def add_shares(code, fields, stride, n, point, row, density, added):
         for axis, share in enumerate(shares):
             place = code.plus(j, code.times(stride, axis))
             added.store(added.load(place) + density.load(j) * share, place)
+
+
+@vectors
+def largest(code, values, n, most):
+    """The greatest of the first n values, a multiple of four vectors' lengths, or of what ``most`` [1] is; to ``most``.
+
+    In four chains of comparisons, which do not wait for each other.
+    """
+    chains = [code.variable(most.one(0)) for _ in range(4)]
+    with code.loop(n, 4 * code.lanes) as i:
+        for part, chain in enumerate(chains):
+            chain.value = values.load(i, part * code.lanes).at_least(chain.value)
+    most.put(functools.reduce(Lanes.at_least, (chain.value for chain in chains)).everywhere(Lanes.at_least), 0)
+
+
+@vectors
+def square_distances(code, u, v, more, first, n, point, out, at):
+    """Of n points (u, v) from ``first`` on the squared distances from ``point`` [2], plus ``more``; to ``out`` from
+    ``at`` on. Up to a vector's length more is read and written."""
+    x, y = point.one(0), point.one(1)
+    with code.loop(n, code.lanes) as j:
+        i = code.plus(first, j)
+        du, dv = u.load(i) - x, v.load(i) - y
+        out.store(du * du + dv * dv + more.load(i), code.plus(at, j))
+
+
+@vectors
+def count_less(code, values, n, limit):
+    """How many of n values are less than ``limit`` [0], to ``limit`` [1]. Up to a vector's length more is read, which
+    must not be less."""
+    most = limit.one(0)
+    count = code.variable(most * 0.0)
+    with code.loop(n, code.lanes) as j:
+        less = most > values.load(j)
+        count.value = count.value + less.select(most * 0.0 + 1.0, 0.0)
+    limit.put(count.value.everywhere(Lanes.__add__), 1)
 
 
 @vectors

@@ -1,14 +1,27 @@
 """Changes of frame on the CPU (numba): components from one camera's frame into another's.
 
 Products and sums are in the order of ``ufmstar_torch.fixed_order``, so that the results equal the reference's to the
-last bit.
+last bit. Components in a camera's frame are kept by field, [13, n]: mean (3), covariance row by row (9) and weight, so
+that a vector instruction takes several of them; n is padded (:func:`padded`).
 """
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
-from ufmstar_torch.kernels.compile_cpu import part
+from ufmstar_torch.kernels.compile_cpu import leaf, part
+from ufmstar_torch.kernels.vectors_cpu import LANES, vectors
+
+FIELDS = 13  # of a component: mean (3), covariance (9), weight
+COVARIANCE, WEIGHT = 3, 12  # the first field of the covariance, and the weight's
+
+
+@leaf
+def padded(n):
+    """A multiple, not below n, of what a vector loop takes at a time: its remainder would take as long again."""
+    return (n + LANES - 1) // LANES * LANES
 
 
 @part
@@ -23,21 +36,49 @@ def relative(T_a, T_b):
     return motion
 
 
+@leaf
+def gather(slots, n, mean, covariance, weight, fields):
+    """Write the first n of some slots by field, as they are; behind them zeros up to the padded number."""
+    for j in range(n):
+        k = slots[j]
+        for i in range(3):
+            fields[i, j] = mean[k, i]
+            for axis in range(3):
+                fields[COVARIANCE + 3 * i + axis, j] = covariance[k, i, axis]
+        fields[WEIGHT, j] = weight[k]
+    for j in range(n, padded(n)):
+        for i in range(FIELDS):
+            fields[i, j] = 0.0
+
+
+@functools.partial(vectors, joined=False)
+def turn(code, motion, n, stride, fields):
+    """Move the first n columns, a multiple of a vector's length, of fields [13, stride] in place by (R, t) [3, 4]."""
+    R = [[motion.one(4 * i + j) for j in range(4)] for i in range(3)]
+    with code.loop(n, code.lanes) as column:
+        at = [code.plus(column, code.times(stride, i)) for i in range(WEIGHT)]
+        x, y, z, *S = (fields.load(place) for place in at)
+        half = [[a * S[j] + b * S[3 + j] + c * S[6 + j] for j in range(3)] for a, b, c, _ in R]
+        for i, (a, b, c, t) in enumerate(R):
+            fields.store(a * x + b * y + c * z + t, at[i])
+            for j, (d, e, f, _) in enumerate(R):
+                fields.store(half[i][0] * d + half[i][1] * e + half[i][2] * f, at[COVARIANCE + 3 * i + j])
+
+
 @part
-def move(motion, mean, covariance, weight, first, changed, mean_out, covariance_out):
-    """Write the moved mean [K, 3] and covariance [K, 3, 3] of occupied slots, before slot ``first`` only where
-    ``changed`` [K] is True. What is not written stays as it is."""
+def move(motion, mean, covariance, weight, mean_out, covariance_out):
+    """Write the moved mean [K, 3] and covariance [K, 3, 3] of occupied slots. What is not written stays as it is."""
     half = np.empty((3, 3))
     for k in range(weight.size):
-        if not weight[k] > 0 or (k < first and not changed[k]):
+        if not weight[k] > 0:
             continue
-        x, y, z = np.float64(mean[k, 0]), np.float64(mean[k, 1]), np.float64(mean[k, 2])
+        x, y, z = mean[k]
         S = covariance[k]
         for i in range(3):
             a, b, c = motion[i, 0], motion[i, 1], motion[i, 2]
             mean_out[k, i] = a * x + b * y + c * z + motion[i, 3]
             for j in range(3):
-                half[i, j] = a * np.float64(S[0, j]) + b * np.float64(S[1, j]) + c * np.float64(S[2, j])
+                half[i, j] = a * S[0, j] + b * S[1, j] + c * S[2, j]
         for i in range(3):
             for j in range(3):
                 value = half[i, 0] * motion[j, 0] + half[i, 1] * motion[j, 1] + half[i, 2] * motion[j, 2]

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.given import CheckKernel as AnchorCheckKernel
 from ufmstar_torch.anchors.given import check_values as check_anchor_values
+from ufmstar_torch.anchors.hook import TermKernel, anchored_term
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.frame import CheckKernel, check_values
 from ufmstar_torch.merge import REFERENCE as MERGE_REFERENCE
@@ -86,6 +87,15 @@ def select_anchor_check(name: str, device_type: str) -> AnchorCheckKernel:
 
         return anchors_cpu.check_values
     return check_anchor_values
+
+
+def select_anchored_term(name: str, device_type: str) -> TermKernel:
+    """What anchors add to the variance; arguments and errors as :func:`select_step`."""
+    if _compiled(name, device_type):
+        from ufmstar_torch.kernels import anchors_cpu
+
+        return anchors_cpu.anchored_term
+    return anchored_term
 
 
 def select_merge(name: str, device_type: str) -> MergeKernels:

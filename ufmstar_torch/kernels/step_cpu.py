@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ufmstar_torch import unmeasured
-from ufmstar_torch.anchors.hook import AnchorInput, Evidence
+from ufmstar_torch.anchors.hook import AnchorInput, Evidence, Learnt
 from ufmstar_torch.config import UfMStarConfig
 from ufmstar_torch.disagree import overlap_disagreement
 from ufmstar_torch.frame import FrameInput
 from ufmstar_torch.gaussian import PIXEL_VARIANCE
-from ufmstar_torch.kernels.anchors_cpu import learn
+from ufmstar_torch.kernels.anchors_cpu import learn, learn_in_view
 from ufmstar_torch.kernels.arrays_cpu import array
-from ufmstar_torch.kernels.regress_cpu import EPSILON, regress_maps
+from ufmstar_torch.kernels.regress_cpu import EPSILON, Seen, View, in_slots, look, regress_maps
 from ufmstar_torch.kernels.regress_cpu import smooth as smooth_maps
+from ufmstar_torch.kernels.rigid_cpu import COVARIANCE, WEIGHT
 from ufmstar_torch.kernels.segment_cpu import feature_means, fit, most_gaussians
 from ufmstar_torch.kernels.stream_cpu import describe, join, match, tally
 from ufmstar_torch.kernels.threads_cpu import each
@@ -44,8 +45,7 @@ _COUNTS += ("unmeasured", "anchors", "anchors_used")
 
 
 class _Pairs(NamedTuple):
-    """The matched pairs [P] of one stream; which segments [C] are new; how many segments there are, how many of them
-    are matched, how many new, and how many components the mixture had; the slots within reach of the frame [n]."""
+    """What :func:`match` returns of a stream."""
 
     c: NDArray[np.int64]
     k: NDArray[np.int64]
@@ -56,6 +56,15 @@ class _Pairs(NamedTuple):
     created: int
     occupied: int
     near: NDArray[np.int64]
+    here: NDArray[np.float64]
+
+
+class _Joined(NamedTuple):
+    """The mixture after the fusion by field; of each stream the slots within reach [n], and what is in them."""
+
+    mixture: dict[str, Tensor]
+    slots: list[NDArray[np.int64]]
+    seen: list[Seen]
 
 
 def step(
@@ -70,69 +79,32 @@ def step(
 ) -> tuple[UfMStarState, StepOutput]:
     """As :func:`ufmstar_torch.step.step`, for CPU tensors."""
     stage, kernel = (observer.stage, observer.kernel) if observer is not None else (_unobserved, nullcontext)
-    streams = range(len(frame.depth))
-    camera = _, present, intrinsics = array(frame.fault), array(frame.T_world_cam), array(frame.intrinsics)
-
-    segments, labels = _segment(frame, intrinsics, config, state.covariance.dtype, kernel)
+    segments, labels = _segment(frame, array(frame.intrinsics), config, state.covariance.dtype, kernel)
     current_cam = GaussianMixture(*map(torch.from_numpy, segments))
     stage("segment")
 
-    slots = tuple(array(getattr(state, name)) for name in _NAMES)
-    before = tuple(array(value) for value in (state.T_world_first, state.started, state.frames, state.skipped))
-    after = first, started, frames, skipped = tuple(map(np.empty_like, before))
-    mean_cam, covariance_cam = np.empty(slots[0].shape), np.empty(slots[1].shape)
-    thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
-    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchored else 1.0)
-    reach = config.prior_weight, least if config.regression == "exact" else 0.0
-    given = (camera, before, after, slots[:3], segments[:3], frame.size, thresholds, reach, mean_cam, covariance_cam)
     with kernel("correspond"):
-        pairs = [_Pairs(*found) for found in each(match, [(b, *given) for b in streams])]
+        cameras, pairs = _match(state, frame, segments, config)
     stage("correspond")
 
-    needed = max(pair.occupied + pair.created for pair in pairs)
-    capacity = _capacity(slots[0].shape[1], needed, config.max_components)
-    updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
-    regressed = (
-        _grown(mean_cam, capacity), _grown(covariance_cam, capacity), np.empty(updated[2].shape),
-        np.empty(updated[2].shape), np.empty((*updated[2].shape, config.features + (3 if config.anchored else 1))),
-    )  # fmt: skip
-    stated = config.prior_mean if config.unmeasured == "prior" else -1.0
-    settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps), stated
-    fused = present, first, slots, updated, (*segments[:3], segments[5])
     with kernel("fuse"):
-        distances = [_distance(b, pair, segments, regressed, config) for b, pair in enumerate(pairs)]
-        joining = zip(streams, pairs, distances, strict=True)
-        joined = each(
-            join,
-            [
-                (b, *fused, pair[:3], d, pair.new, pair.occupied, pair.near, settings, regressed)
-                for b, pair, d in joining
-            ],
-        )
+        joined = _join(state, frame, segments, cameras[0], pairs, config)
     stage("fuse")
 
-    mean, covariance, weight, disagreement, features = map(torch.from_numpy, regressed)
-    mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
-    mixture_cam = GaussianMixture(mean, covariance, weight, disagreement, mixture["count"], features)
-    evidence, stream = Evidence(state.evidence, state.overall_evidence), None
-    totals = np.zeros((len(_COUNTS), len(streams)), np.int64)
-    counts = dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))
+    learnt, views = None, None
     if config.anchored:
-        learnt = learn(evidence, mixture_cam, frame, anchors, config, joined)
-        features[..., -3:-1] = learnt.beyond  # before the share that was measured, as `before_regression` has them
-        evidence, stream = learnt.evidence, learnt.stream
-        counts["anchors_used"].copy_(learnt.used)
-    if anchors is not None:
-        counts["anchors"].copy_(anchors.valid.sum(1))
+        learnt, views = _learn(state, joined, frame, anchors, config)
     stage("append")
 
     with kernel("regress_image"):
-        result = regress_maps(mixture_cam, frame.depth, frame.intrinsics, config, pixels, joined)
-    if stream is not None:
-        result.features[..., -3:-1] += stream.to(frame.depth.dtype).view(-1, *[1] * (result.features.dim() - 2), 2)
+        shift = None if learnt is None or views is None else array(learnt.stream)
+        result = regress_maps(joined.seen, frame.depth, frame.intrinsics, config, pixels, views, shift)
+    if learnt is not None and views is None:
+        shape = -1, *[1] * (result.features.dim() - 2), 2
+        result.features[..., -3:-1] += learnt.stream.to(frame.depth.dtype).view(shape)
     result, _, measured = after_regress(result, None, frame, config, pixels)
     residual = None
-    if stream is not None:
+    if learnt is not None:
         residual, result = result.features[..., -2:], replace(result, features=result.features[..., :-2])
     stage("regress")
 
@@ -141,13 +113,15 @@ def step(
         smoothed, disagreement = moving_average(
             smoothed, disagreement, frame.size, config.ema_alpha, pixels, smooth_maps
         )
-    _count(totals, frame, pairs, [components for _, components in joined], measured)
+    counts = _counts(frame, pairs, joined.seen, measured, anchors, None if learnt is None else learnt.used)
+    evidence = Evidence(state.evidence, state.overall_evidence) if learnt is None else learnt.evidence
+    first, started, frames, skipped = map(torch.from_numpy, cameras)
     state_after = UfMStarState(
-        **mixture,
-        T_world_first=torch.from_numpy(first),
-        started=torch.from_numpy(started),
-        frames=torch.from_numpy(frames),
-        skipped=torch.from_numpy(skipped),
+        **joined.mixture,
+        T_world_first=first,
+        started=started,
+        frames=frames,
+        skipped=skipped,
         smoothed=smoothed,
         evidence=evidence.component,
         overall_evidence=evidence.overall,
@@ -191,13 +165,72 @@ def _segment(
     return (mean, covariance, weight, zero, count, features), labels
 
 
-def _distance(
-    b: int, pair: _Pairs, segments: Sequence[Floats], mixture_cam: Sequence[Floats], config: UfMStarConfig
-) -> NDArray[np.float64]:
+def _match(
+    state: UfMStarState, frame: FrameInput, segments: Sequence[NDArray[Any]], config: UfMStarConfig
+) -> tuple[tuple[NDArray[Any], ...], list[_Pairs]]:
+    """Step 3: of the state after the frame, camera-to-world of the first camera, started, frames and skipped; and what
+    each stream matches."""
+    camera = array(frame.fault), array(frame.T_world_cam), array(frame.intrinsics)
+    before = tuple(array(value) for value in (state.T_world_first, state.started, state.frames, state.skipped))
+    after = tuple(map(np.empty_like, before))
+    mixture = tuple(array(value) for value in (state.mean, state.covariance, state.weight))
+    thresholds = (config.eta, config.eta_occlusion, config.near_plane, PIXEL_VARIANCE)
+    least = min(EPSILON[frame.depth.dtype], EPSILON[state.covariance.dtype] if config.anchored else 1.0)
+    reach = config.prior_weight, least if config.regression == "exact" else 0.0
+    given = (camera, before, after, mixture, segments[:3], frame.size, thresholds, reach)
+    return after, [_Pairs(*found) for found in each(match, [(b, *given) for b in range(len(frame.depth))])]
+
+
+def _join(
+    state: UfMStarState,
+    frame: FrameInput,
+    segments: Sequence[NDArray[Any]],
+    first: Floats,
+    pairs: Sequence[_Pairs],
+    config: UfMStarConfig,
+) -> _Joined:
+    """Step 4, and the mixture as the regression takes it; ``first`` is camera-to-world of the first cameras."""
+    slots = tuple(array(getattr(state, name)) for name in _NAMES)
+    needed = max(pair.occupied + pair.created for pair in pairs)
+    capacity = _capacity(slots[0].shape[1], needed, config.max_components)
+    updated = tuple(np.empty((value.shape[0], capacity, *value.shape[2:]), value.dtype) for value in slots)
+    stated = config.prior_mean if config.unmeasured == "prior" else -1.0
+    settings = config.overlap_weighted, float(np.finfo(slots[1].dtype).eps), stated
+    fused = array(frame.T_world_cam), first, slots, updated, (*segments[:3], segments[5])
+    calls = [
+        (
+            b, *fused, pair[:3], _distance(b, pair, segments, config), pair.new, pair.occupied, pair.near, pair.here,
+            settings, 3 if config.anchored else 1,
+        )
+        for b, pair in enumerate(pairs)
+    ]  # fmt: skip
+    joined = each(join, calls)
+    mixture = dict(zip(_NAMES, map(torch.from_numpy, updated), strict=True))
+    seen = [Seen(pair.here, *one[1:]) for pair, one in zip(pairs, joined, strict=True)]
+    return _Joined(mixture, [one[0] for one in joined], seen)
+
+
+def _learn(
+    state: UfMStarState, joined: _Joined, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig
+) -> tuple[Learnt, list[View] | None]:
+    """What anchors teach, and what is in view where the exact sum asks; what each component's error is beyond the
+    stream's goes to the features, before the share that was measured, as ``hook.before_regression`` has them."""
+    evidence, capacity = Evidence(state.evidence, state.overall_evidence), joined.mixture["weight"].shape[1]
+    if config.regression == "exact":
+        views = look(joined.seen, frame.depth, frame.intrinsics, config, evidence.overall.dtype)
+        return learn_in_view(evidence, capacity, joined.slots, joined.seen, views, frame, anchors, config), views
+    learnt = learn(evidence, in_slots(joined.seen, joined.slots, capacity), frame, anchors, config)
+    for slots, one, beyond in zip(joined.slots, joined.seen, array(learnt.beyond), strict=True):
+        one.features[:, -3:-1] = beyond[slots]
+    return learnt, None
+
+
+def _distance(b: int, pair: _Pairs, segments: Sequence[Floats], config: UfMStarConfig) -> NDArray[np.float64]:
     """The disagreement [P] of the pairs of a stream where the step does not take W2^2, else [0]."""
     if config.disagreement != "overlap":
         return np.empty(0)
-    both = [value[b][at] for values, at in ((segments, pair.c), (mixture_cam, pair.k)) for value in values[:2]]
+    mean, covariance = pair.here[:COVARIANCE, pair.k].T, pair.here[COVARIANCE:WEIGHT, pair.k].T.reshape(-1, 3, 3)
+    both = segments[0][b][pair.c], segments[1][b][pair.c], mean, covariance
     return overlap_disagreement(*map(torch.from_numpy, both)).numpy()
 
 
@@ -209,23 +242,21 @@ def _capacity(present: int, needed: int, limit: int | None) -> int:
     return capacity if limit is None else max(present, min(capacity, limit))
 
 
-def _grown(value: Floats, capacity: int) -> Floats:
-    """[B, K, ...] with ``capacity`` slots, new ones zero."""
-    missing = capacity - value.shape[1]
-    if missing <= 0:
-        return value
-    return np.concatenate([value, np.zeros((value.shape[0], missing, *value.shape[2:]))], axis=1)
-
-
-def _count(
-    totals: NDArray[np.int64], frame: FrameInput, pairs: list[_Pairs], components: list[int], measured: Tensor
-) -> None:
-    """Write the statistics [n, B] that the step counts itself, in the order of ``_COUNTS``."""
+def _counts(
+    frame: FrameInput,
+    pairs: Sequence[_Pairs],
+    seen: Sequence[Seen],
+    measured: Tensor,
+    anchors: AnchorInput | None,
+    used: Tensor | None,
+) -> dict[str, Tensor]:
+    """The statistics [B] that the step counts itself."""
+    totals = np.zeros((len(_COUNTS), len(pairs)), np.int64)
     valid, shares = array(frame.valid), array(measured)
-    for b, (pair, occupied) in enumerate(zip(pairs, components, strict=True)):
-        new = occupied - pair.occupied
+    for b, (pair, one) in enumerate(zip(pairs, seen, strict=True)):
+        new = one.occupied - pair.occupied
         totals[:8, b] = (
-            occupied,
+            one.occupied,
             pair.found,
             pair.matched,
             pair.c.size,
@@ -233,3 +264,8 @@ def _count(
             pair.found - pair.matched - new,  # without a slot, or too near
             *tally(valid[b].reshape(-1), shares[b].reshape(-1), unmeasured.HALF),
         )
+    if anchors is not None:
+        totals[-2] = array(anchors.valid).sum(1)
+    if used is not None:
+        totals[-1] = array(used)
+    return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))

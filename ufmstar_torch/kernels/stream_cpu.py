@@ -8,7 +8,7 @@ from ufmstar_torch.kernels.compile_cpu import kernel, part
 from ufmstar_torch.kernels.correspond_cpu import matches
 from ufmstar_torch.kernels.fuse_cpu import append, floored, fuse_pairs
 from ufmstar_torch.kernels.reach_cpu import reached
-from ufmstar_torch.kernels.rigid_cpu import move, relative
+from ufmstar_torch.kernels.rigid_cpu import FIELDS, gather, move, padded, relative, turn
 from ufmstar_torch.kernels.segment_image_cpu import write_gaussians
 
 
@@ -30,9 +30,9 @@ def describe(fit, rounded, near, focal, widening, epsilon, mean, covariance, wei
 
 
 @kernel
-def match(b, camera, before, after, mixture, segments, size, thresholds, reach, mean_cam, covariance_cam):
-    """Step 3 of stream ``b``: what the frame can reach of M_(i-1) [B, K] into the camera frame, written to ``mean_cam``
-    and ``covariance_cam``, and its pairs with C_i [B, C].
+def match(b, camera, before, after, mixture, segments, size, thresholds, reach):
+    """Step 3 of stream ``b``: what the frame can reach of M_(i-1) [B, K] in the camera frame, and its pairs with C_i
+    [B, C].
 
     Args:
         camera: fault [B], camera-to-world [B, 4, 4] and intrinsics [B, 3, 3] of this frame.
@@ -45,7 +45,8 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, reach, 
 
     Returns:
         The pairs c [P], k [P] and their overlap [P]; which segments are new [C]; how many segments there are, how many
-        of them are matched, how many new, and how many components the mixture had; the slots within reach [n].
+        of them are matched, how many new, and how many components the mixture had; the slots within reach [n], to
+        which k refers; and these by field [13, n + C and more], with room for what is new.
     """
     fine, started = camera[0][b] == 0, before[1][b]
     present, K, first = camera[1][b], camera[2][b], after[0][b]
@@ -55,18 +56,14 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, reach, 
     after[1][b], after[2][b], after[3][b] = started or fine, before[2][b] + fine, before[3][b] + (not fine)
     mean, covariance, weight = mixture[0][b], mixture[1][b], mixture[2][b]
     mean_c, cov_c, weight_c = segments[0][b], segments[1][b], segments[2][b]
-    moved, turned = mean_cam[b], covariance_cam[b]
-    motion, pi, chosen = relative(first, present), np.zeros(weight.size), np.zeros(weight.size, np.bool_)
+    motion = relative(first, present)
     near, occupied = reached(motion, mean, covariance, weight, K, size, reach[0], reach[1], weight_c.size)
-    for k in near:
-        pi[k], chosen[k] = weight[k], True
-    for k in range(weight.size):
-        for i in range(3):
-            moved[k, i] = 0.0
-            for j in range(3):
-                turned[k, i, j] = 0.0
-    move(motion, mean, covariance, weight, weight.size, chosen, moved, turned)
-    c, k, overlap = matches(near, moved, turned, pi, mean_c, cov_c, weight_c, K, *size, *thresholds)
+    here = np.empty((FIELDS, padded(near.size + weight_c.size)))
+    segments_here = np.empty((FIELDS, padded(weight_c.size)))
+    gather(near, near.size, mean, covariance, weight, here)
+    turn(motion, padded(near.size), here.shape[1], here)
+    gather(np.arange(weight_c.size), weight_c.size, mean_c, cov_c, weight_c, segments_here)
+    c, k, overlap = matches(here, near.size, segments_here, weight_c.size, K, *size, *thresholds)
     new, found, matched, created = np.ones(weight_c.size, np.bool_), 0, 0, 0
     for i in range(c.size):
         new[c[i]] = False
@@ -76,13 +73,13 @@ def match(b, camera, before, after, mixture, segments, size, thresholds, reach, 
         # What is nearer than the near plane could never be matched again: it is not remembered.
         new[i] = new[i] and weight_c[i] > 0 and mean_c[i, 2] > thresholds[2]
         created += new[i]
-    return c, k, overlap, new, found, matched, created, occupied, near
+    return c, k, overlap, new, found, matched, created, occupied, near, here
 
 
 @kernel
-def join(b, present, first, before, after, segments, pairs, distance, new, occupied, near, settings, regressed):
-    """Step 4 of stream ``b``: the mixture with the pairs fused and what is new appended, and the same in float64 as the
-    regression takes it, in the camera frame.
+def join(b, present, first, before, after, segments, pairs, distance, new, occupied, near, here, settings, extra):
+    """Step 4 of stream ``b``: the mixture with the pairs fused and what is new appended, and what of it is within reach
+    as the regression takes it, in the camera frame.
 
     Args:
         present, first: camera-to-world [B, 4, 4].
@@ -92,60 +89,79 @@ def join(b, present, first, before, after, segments, pairs, distance, new, occup
         pairs: c, k and overlap [P].
         distance: as :func:`fuse_pairs`.
         new: [C] which segments to append, from slot ``occupied`` on.
-        near: the slots within reach [n] of :func:`match`.
+        near, here: the slots within reach [n], and they by field [13, n + C and more], as :func:`match` returns them;
+            what has changed of the latter is written, and what is new behind it.
         settings: ``weighted`` and ``epsilon`` as :func:`fuse_pairs`; the disagreement [m^2] of what was seen from one
             view, negative for its own.
-        regressed: mean, covariance, weight, disagreement and features [B, K, ...] for the regression, the last feature
-            as ``unmeasured.before_regression``, others behind the mixture's own unset. Its mean and covariance are
-            those of :func:`match`; what has changed is written, and the rest of the fields.
+        extra: features of the regression behind the mixture's own. The last one is that of
+            ``unmeasured.before_regression``, the others are unset.
 
     Returns:
-        The slots within reach, with those of the new components, and how many components the mixture has.
+        The slots within reach [n], with those of the new components, their disagreement [n] and features [n, F] for the
+        regression, and how many components the mixture has.
     """
     weighted, epsilon, stated = settings
     mean_c, cov_c, weight_c, features_c = segments[0][b], segments[1][b], segments[2][b], segments[3][b]
     mean, covariance, weight, disagreement, count, features = (
         after[0][b], after[1][b], after[2][b], after[3][b], after[4][b], after[5][b],
     )  # fmt: skip
-    _extend(before[0][b], mean)
-    _extend(before[1][b].reshape(-1, 9), covariance.reshape(-1, 9))
-    _extend(before[5][b], features)
-    for k in range(weight.size):
-        old = k < before[2].shape[1]
-        weight[k] = before[2][b, k] if old else 0
-        disagreement[k] = before[3][b, k] if old else 0
-        count[k] = before[4][b, k] if old else 0
+    _extend(before[0][b].reshape(-1), mean.reshape(-1))
+    _extend(before[1][b].reshape(-1), covariance.reshape(-1))
+    _extend(before[2][b], weight)
+    _extend(before[3][b], disagreement)
+    _extend(before[4][b], count)
+    _extend(before[5][b].reshape(-1), features.reshape(-1))
     moved, turned = np.zeros(mean_c.shape), np.zeros(cov_c.shape)
-    move(relative(present[b], first[b]), mean_c, cov_c, weight_c, 0, np.empty(0, np.bool_), moved, turned)
-    changed = np.zeros(weight.size, np.bool_)
+    move(relative(present[b], first[b]), mean_c, cov_c, weight_c, moved, turned)
     slots, given = (mean, covariance, weight, disagreement, count, features), (moved, turned, weight_c, features_c)
-    fuse_pairs(*slots, *given, *pairs, distance, weighted, epsilon, changed)
-    dropped = append(*slots, *given, new, occupied)
-    motion = relative(first[b], present[b])
-    move(motion, mean, covariance, weight, occupied, changed, regressed[0][b], regressed[1][b])
-    more, last = regressed[4][b], features.shape[1]
-    for k in range(weight.size):
-        seen_again = count[k] > 1
-        regressed[2][b, k] = weight[k]
-        regressed[3][b, k] = disagreement[k] if seen_again or stated < 0 else stated
-        for f in range(last):
-            more[k, f] = features[k, f]
-        more[k, more.shape[1] - 1] = 1.0 if seen_again else 0.0
-    components = occupied - dropped
-    for c in range(new.size):
-        components += new[c]
+    c, k, overlap = pairs
+    fuse_pairs(*slots, *given, c, _at(near, k), overlap, distance, weighted, epsilon)
+    components = append(*slots, *given, new, occupied)
     slots_near = np.empty(near.size + components - occupied, np.int64)
     for i in range(slots_near.size):
         slots_near[i] = near[i] if i < near.size else occupied + i - near.size
-    return slots_near, components
+    _renew(relative(first[b], present[b]), slots_near, k, near.size, mean, covariance, weight, here)
+    m, more = np.empty(slots_near.size), np.empty((slots_near.size, features.shape[1] + extra))
+    for i in range(slots_near.size):
+        k = slots_near[i]
+        seen_again = count[k] > 1
+        m[i] = disagreement[k] if seen_again or stated < 0 else stated
+        for f in range(features.shape[1]):
+            more[i, f] = features[k, f]
+        more[i, more.shape[1] - 1] = 1.0 if seen_again else 0.0
+    return slots_near, m, more, components
+
+
+@part
+def _at(values, index):
+    """``values[index]``, which takes longer to compile."""
+    out = np.empty(index.size, np.int64)
+    for i in range(index.size):
+        out[i] = values[index[i]]
+    return out
 
 
 @part
 def _extend(before, after):
-    """Copy the slots [K, n], and fill the others with zeros."""
-    for k in range(after.shape[0]):
-        for i in range(after.shape[1]):
-            after[k, i] = before[k, i] if k < before.shape[0] else 0
+    """Copy numbers, and fill those behind them with zeros."""
+    for i in range(before.size):
+        after[i] = before[i]
+    for i in range(before.size, after.size):
+        after[i] = 0
+
+
+@part
+def _renew(motion, slots, fused, old, mean, covariance, weight, here):
+    """Write the ``fused`` columns [P] by field in the camera frame again, and those from ``old`` on."""
+    columns = np.empty(fused.size + slots.size - old, np.int64)
+    for i in range(columns.size):
+        columns[i] = fused[i] if i < fused.size else old + i - fused.size
+    changed = np.empty((FIELDS, padded(columns.size)))
+    gather(_at(slots, columns), columns.size, mean, covariance, weight, changed)
+    turn(motion, changed.shape[1], changed.shape[1], changed)
+    for field in range(FIELDS):
+        for i in range(columns.size):
+            here[field, columns[i]] = changed[field, i]
 
 
 @kernel

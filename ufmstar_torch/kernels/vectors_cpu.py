@@ -26,27 +26,28 @@ _INDEX = ir.IntType(64)
 class Lanes:
     """A vector of numbers, or of truth values, with the operators of its code.
 
-    A product and a sum become one instruction where the processor has it: one rounding less.
+    A product and a sum become one instruction where the processor has it, one rounding less, where ``flags``
+    allow it.
     """
 
-    def __init__(self, builder: Any, value: Any) -> None:
-        self._builder, self.value = builder, value
+    def __init__(self, builder: Any, value: Any, flags: tuple[str, ...]) -> None:
+        self._builder, self.value, self._flags = builder, value, flags
 
     def _other(self, other: Lanes | float) -> Any:
         kind = self.value.type
         return other.value if isinstance(other, Lanes) else ir.Constant(kind, [other] * kind.count)
 
     def _new(self, value: Any) -> Lanes:
-        return Lanes(self._builder, value)
+        return Lanes(self._builder, value, self._flags)
 
     def __add__(self, other: Lanes | float) -> Lanes:
-        return self._new(self._builder.fadd(self.value, self._other(other), flags=("contract",)))
+        return self._new(self._builder.fadd(self.value, self._other(other), flags=self._flags))
 
     def __sub__(self, other: Lanes | float) -> Lanes:
-        return self._new(self._builder.fsub(self.value, self._other(other), flags=("contract",)))
+        return self._new(self._builder.fsub(self.value, self._other(other), flags=self._flags))
 
     def __mul__(self, other: Lanes | float) -> Lanes:
-        return self._new(self._builder.fmul(self.value, self._other(other), flags=("contract",)))
+        return self._new(self._builder.fmul(self.value, self._other(other), flags=self._flags))
 
     def __gt__(self, other: Lanes | float) -> Lanes:
         return self._new(self._builder.fcmp_ordered(">", self.value, self._other(other)))
@@ -70,6 +71,20 @@ class Lanes:
     def over(self, by: Lanes) -> Lanes:
         """The quotient."""
         return self._new(self._builder.fdiv(self.value, by.value))
+
+    def root(self) -> Lanes:
+        """The square root."""
+        kind = self.value.type
+        name = f"llvm.sqrt.v{kind.count}f{64 if isinstance(kind.element, ir.DoubleType) else 32}"
+        sqrt = cgutils.get_or_insert_function(self._builder.module, ir.FunctionType(kind, [kind]), name)
+        return self._new(self._builder.call(sqrt, [self.value]))
+
+    def log2_above(self) -> Lanes:
+        """Of positive doubles an upper bound of the logarithm, at most .0862 above it: their bits, read as an integer,
+        are a straight line between powers of two."""
+        b, count = self._builder, self.value.type.count
+        bits = b.bitcast(self.value, ir.VectorType(ir.IntType(64), count))
+        return self._new(b.sitofp(bits, self.value.type)) * 2.0**-52 + (0.0861 - 1023)
 
     def everywhere(self, choose: Callable[[Lanes, Lanes], Lanes]) -> Lanes:
         """The least or greatest number (``Lanes.at_most``, ``Lanes.at_least``) in all places."""
@@ -107,8 +122,9 @@ class Lanes:
 class Memory:
     """A contiguous array; places count from its first number."""
 
-    def __init__(self, builder: Any, data: Any) -> None:
+    def __init__(self, builder: Any, data: Any, flags: tuple[str, ...]) -> None:
         real = data.type.pointee
+        self._flags = flags
         self._builder, self._data, self._size = builder, data, 8 if isinstance(real, ir.DoubleType) else 4
         self._vector = ir.VectorType(real, _BYTES // self._size)
 
@@ -116,11 +132,14 @@ class Memory:
         place = _INDEX(place) if isinstance(place, int) else place
         return self._builder.gep(self._data, [self._builder.add(place, _INDEX(offset)) if offset else place])
 
+    def _lanes(self, value: Any) -> Lanes:
+        return Lanes(self._builder, value, self._flags)
+
     def load(self, place: Any, offset: int = 0) -> Lanes:
         """The vector from ``place + offset`` on."""
         value = self._builder.load(self._builder.bitcast(self._at(place, offset), self._vector.as_pointer()))
         value.align = self._size
-        return Lanes(self._builder, value)
+        return self._lanes(value)
 
     def store(self, value: Lanes, place: Any, offset: int = 0) -> None:
         """Write a vector from ``place + offset`` on."""
@@ -135,9 +154,9 @@ class Memory:
             parts.append(self._builder.load(self._builder.bitcast(at, row.as_pointer())))
             parts[-1].align = self._size
         if len(parts) == 1:
-            return Lanes(self._builder, parts[0])
+            return self._lanes(parts[0])
         places = ir.Constant(ir.VectorType(ir.IntType(32), count), list(range(count)))
-        return Lanes(self._builder, self._builder.shuffle_vector(*parts, places))
+        return self._lanes(self._builder.shuffle_vector(*parts, places))
 
     def store_rows(self, value: Lanes, width: int, place: Any, stride: Any) -> None:
         """Write the rows that :meth:`load_rows` reads."""
@@ -157,7 +176,11 @@ class Memory:
         none, first = ir.Constant(self._vector, ir.Undefined), ir.IntType(32)(0)
         filled = self._builder.insert_element(none, self._builder.load(self._at(place, offset)), first)
         places = ir.Constant(ir.VectorType(ir.IntType(32), self._vector.count), [0] * self._vector.count)
-        return Lanes(self._builder, self._builder.shuffle_vector(filled, none, places))
+        return self._lanes(self._builder.shuffle_vector(filled, none, places))
+
+    def whole(self, place: Any) -> Any:
+        """A number of an array of int64, as a place in another one."""
+        return self._builder.load(self._at(place, 0))
 
     def put(self, value: Lanes, place: Any, offset: int = 0) -> None:
         """Write the first number of a vector."""
@@ -203,22 +226,28 @@ class Variable:
 
     def __init__(self, builder: Any, value: Lanes) -> None:
         self._builder, self._place = builder, cgutils.alloca_once_value(builder, value.value)
+        self._like = value
 
     @property
     def value(self) -> Lanes:
-        return Lanes(self._builder, self._builder.load(self._place))
+        return self._like._new(self._builder.load(self._place))
 
     @value.setter
     def value(self, value: Lanes) -> None:
         self._builder.store(value.value, self._place)
 
 
-def vectors(function: Callable[..., None]) -> Any:
+def vectors(function: Callable[..., None], *, joined: bool = True) -> Any:
     """Make a function of compiled code from one that writes vector instructions.
 
     ``function(code, ...)`` gets a :class:`Code`, and a :class:`Memory` for each contiguous array of one floating dtype;
     integers (int64) and truth values as LLVM's. It returns nothing.
+
+    Args:
+        function: the writer.
+        joined: whether products and sums may become one instruction; otherwise each result has the bits of scalar code.
     """
+    flags = ("contract",) if joined else ()
 
     def typed(typing: Any, *arguments: Any) -> Any:
         real = next(kind.dtype for kind in arguments if isinstance(kind, types.Array))
@@ -226,7 +255,7 @@ def vectors(function: Callable[..., None]) -> Any:
 
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             given = [
-                Memory(builder, context.make_array(kind)(context, builder, value).data)
+                Memory(builder, context.make_array(kind)(context, builder, value).data, flags)
                 if isinstance(kind, types.Array)
                 else value
                 for kind, value in zip(signature.args, values, strict=True)
