@@ -337,7 +337,7 @@ def check_result(result):
 
 
 def test_a_long_run_compares_the_same_room_early_and_late():
-    run = measure_long_run(RenderedRoom(period=10), UfMStarConfig(), size=48, frames=40, early=10, window=10)
+    run = measure_long_run(RenderedRoom(period=10), UfMStarConfig(), size=48, frames=40, window=10)
     assert (run["early"]["frames"], run["late"]["frames"]) == ([6, 15], [31, 40])
     assert run["ratio"] == run["late"]["step_median_ms"] / run["early"]["step_median_ms"]
     assert [row["frames"] for row in run["rows"]] == [[1, 10], [11, 20], [21, 30], [31, 40]]
@@ -345,7 +345,7 @@ def test_a_long_run_compares_the_same_room_early_and_late():
     assert components == sorted(components)
     assert components[-1] == run["memory"]["components"]
     with pytest.raises(ValueError, match="at least 25 frames"):
-        measure_long_run(RenderedRoom(), UfMStarConfig(), size=48, frames=24, early=10, window=10)
+        measure_long_run(RenderedRoom(), UfMStarConfig(), size=48, frames=24, window=10)
 
 
 @pytest.mark.slow

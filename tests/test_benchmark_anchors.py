@@ -48,7 +48,7 @@ def report(one_core):
     before, seen = threads(), rendered()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackedTour, "frames", lambda _, count: seen[:count])
-        patch.setattr("ufmstar_torch.eval.bench.step.reference_networks", lambda size, fastdepth, runtime: ({}, {}))
+        patch.setattr(benchmark, "reference_networks", lambda size, fastdepth, runtime: ({}, {}))
         result = benchmark.run_benchmark(options)
     assert threads() == before
     return result

@@ -7,8 +7,9 @@ import torch
 from walks import SPGF, walks
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.eval.bench.benchmark import BenchSettings, run_benchmark
+from ufmstar_torch.eval.bench.benchmark import run_benchmark
 from ufmstar_torch.eval.bench.device import device_text, touched_bytes
+from ufmstar_torch.eval.bench.settings import BenchSettings
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

@@ -165,4 +165,4 @@ def test_a_sequence_that_is_too_short(tmp_path):
         build_up(source, UfMStarConfig(), size=48, in_view=5, history=9, rounds=5)
     assert build_up(source, UfMStarConfig(), size=48, in_view=10**6, history=9, rounds=3)[2] == 2
     with pytest.raises(ValueError, match="there are 5"):
-        measure_long_run(source, UfMStarConfig(), size=48, frames=40, early=10, window=10)
+        measure_long_run(source, UfMStarConfig(), size=48, frames=40, window=10)

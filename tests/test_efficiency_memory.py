@@ -11,7 +11,7 @@ from onnx_files import small_network, write_fastdepth
 
 from ufmstar_torch.eval.bench.memory import overhead_percent, weight_bytes
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, depth_alone, timed_networks
-from ufmstar_torch.eval.bench.race import MultiviewStep, NetworkInput
+from ufmstar_torch.eval.bench.race import MultiviewStep
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.report.efficiency import megabytes
@@ -30,8 +30,8 @@ def step_memory(name, size, K):
     """What the table counts for the multiview step of a row after one frame."""
     step = MultiviewStep(Row(Method.parse(name)), torch.device("cpu"))
     depth, variance = torch.full((1, *size), 2.0), torch.full((1, *size), 0.01)
-    given = NetworkInput(torch.zeros(1, 3, 1, 1), torch.eye(4, dtype=torch.float64)[None], torch.tensor([K]).double())
-    step(DepthPrediction(depth, aleatoric_variance=variance), given)
+    prediction = DepthPrediction(depth, aleatoric_variance=variance)
+    step(prediction, torch.eye(4, dtype=torch.float64)[None], torch.tensor([K]).double())
     step.note()
     return step.memory()
 

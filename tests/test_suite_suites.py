@@ -12,7 +12,7 @@ from ufmstar_torch import UfMStarConfig
 from ufmstar_torch.eval.engine.estimators import ufm_star_config
 from ufmstar_torch.eval.methods.method import BASES, MANY, UFM_STAR
 from ufmstar_torch.eval.methods.row import Row, plain_rows
-from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from, value_of
+from ufmstar_torch.eval.methods.setting import DEFAULT, Setting, configured, default_of, setting_from
 from ufmstar_torch.eval.methods.suite import Suite, names, suite_named
 from ufmstar_torch.eval.report.data import listed_rows
 from ufmstar_torch.eval.report.names import row_label, row_labels, shared_words
@@ -27,6 +27,12 @@ Aleatoric UfM-Aleatoric UfM-Aleatoric-100K UfM*-Aleatoric"""
 TABLE_2 = """Ensemble UfM-Ensemble UfM-Ensemble-100K UfM*-Ensemble
 Aleatoric UfM-Aleatoric UfM-Aleatoric-100K UfM*-Aleatoric"""
 TABLE_3 = "UfM-DepthOnly-300K UfM*-DepthOnly-fixed-param UfM*-DepthOnly"
+
+
+def value_of(row, name):
+    """What a row sets a name to, or UfM*'s own value."""
+    changed = row.setting.to_dict()
+    return changed[name] if name in changed else default_of(name, row.setting.ufm_preset)
 
 
 def methods(name, base=None):
@@ -75,7 +81,7 @@ def test_one_preset_for_all_rows():
         assert all(row.setting.ufm_preset == preset for row in suite.rows if row.method.fusion == UFM_STAR)
     # What the preset says anyway is no change; what an ablation varies stays.
     rows = suite_named("ablation-segmentation", preset="paper").rows
-    own = {value_of(row.setting.to_dict(), "segment.min_pixels") for row in rows[1:] if row.setting.plain}
+    own = {value_of(row, "segment.min_pixels") for row in rows[1:] if row.setting.plain}
     assert own == {2000}
     assert {"none", "both", "either"} == {configured(r.setting).segment.prune for r in rows[1:]}
     tried = {configured(r.setting).regression for r in suite_named("ablation-regression", preset="paper").rows[1:]}
@@ -164,7 +170,7 @@ def test_an_ablation_tries_the_default_and_others_against_the_base_alone(name, f
     suite = suite_named(f"ablation-{name}", "depth_only")
     assert suite.rows[:2] == rows_of(["DepthOnly", "UfM*-DepthOnly"])
     assert field in suite.sweep
-    tried = {value_of(row.setting.to_dict(), field) for row in suite.rows[1:]}
+    tried = {value_of(row, field) for row in suite.rows[1:]}
     assert len(tried) > 1
     assert getattr(UfMStarConfig(), field) in tried
 

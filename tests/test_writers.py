@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -237,6 +238,20 @@ class TestFullDisk:
         with pytest.raises(KeyboardInterrupt):
             write_atomic(path, interrupted)
         assert tree(tmp_path) == {"x": b"old"}
+
+    def test_a_pipe_is_written_to_and_a_link_leads_to_the_new_file(self, tmp_path: Path) -> None:
+        pipe, path, link = tmp_path / "pipe", tmp_path / "x", tmp_path / "link"
+        os.mkfifo(pipe)
+        path.write_text("old")
+        link.symlink_to(path)
+        with ThreadPoolExecutor(1) as pool:
+            received = pool.submit(pipe.read_bytes)
+            for target in (pipe, link):
+                write_json_atomic(target, {"ms": 1})
+            assert received.result(10) == path.read_bytes() == b'{\n  "ms": 1\n}\n'
+        assert pipe.is_fifo()
+        assert link.is_symlink()
+        assert {file.name for file in tmp_path.iterdir()} == {"pipe", "x", "link"}
 
 
 @dataclass

@@ -67,8 +67,8 @@ def correspond(
         config: eta, eta_occlusion, near_plane.
     """
     dtype = torch.float64
-    seen_k, mean_k, cov_k = _candidates(previous_cam, intrinsics.to(dtype), size, config.near_plane)
-    seen_c, mean_c, cov_c = _candidates(current_cam, intrinsics.to(dtype), size, config.near_plane)
+    seen_k, mean_k, cov_k = candidates(previous_cam, intrinsics.to(dtype), size, config.near_plane)
+    seen_c, mean_c, cov_c = candidates(current_cam, intrinsics.to(dtype), size, config.near_plane)
     overlap = bhattacharyya(mean_c[:, :, None], cov_c[:, :, None], mean_k[:, None], cov_k[:, None])
     overlap = overlap * (seen_c[:, :, None] & seen_k[:, None])
     match = overlap >= config.eta
@@ -88,10 +88,11 @@ def _hidden(match: Tensor, mean: Tensor, covariance: Tensor, depth: Tensor, conf
     return torch.cat(hidden, dim=2)
 
 
-def _candidates(
+def candidates(
     mixture_cam: GaussianMixture, intrinsics: Tensor, size: tuple[int, int], near_plane: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mask [B, K], image-plane mean [B, K, 2] and covariance [B, K, 2, 2]; harmless values where masked."""
+    """The mask of components in view [B, K], image-plane mean [B, K, 2] and covariance [B, K, 2, 2]; harmless values
+    where they are not."""
     height, width = size
     mean_cam = mixture_cam.mean.to(intrinsics.dtype)
     in_front = mixture_cam.valid & (mean_cam[..., 2] > near_plane)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ufmstar_torch.checked import Checked, choice
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.stateful import flat
 
 SCALAR, ISOTONIC = "scalar", "isotonic"
 _SHOWN = 12  # digits of a digest
@@ -95,10 +96,10 @@ class Recalibration(Checked):
         Raises:
             ValueError: the map was fitted under other settings of UfM*, or to another network.
         """
-        now = _flat(config.to_dict())
+        now = flat(config.to_dict())
         changed = [
             f"{name} = {value!r} (now {now[name]!r})"
-            for name, value in _flat(self.ufm).items()
+            for name, value in flat(self.ufm).items()
             if name in now and name not in _HARMLESS and now[name] != value
         ]
         if changed:
@@ -153,11 +154,3 @@ def file_digest(file: str | Path) -> str:
 def beside(weights: str | Path) -> Path:
     """The file of a recalibration that lies beside weights: fastdepth.onnx -> fastdepth.recalibration.json."""
     return Path(weights).with_suffix(".recalibration.json")
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted name."""
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat

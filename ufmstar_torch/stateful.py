@@ -88,8 +88,8 @@ class StatefulModule(nn.Module):
     def set_extra_state(self, state: Tensor) -> None:
         """Warn where the config of a loaded state differs from this module's."""
         # A setting younger than the state had its default.
-        saved = _flat(type(self.config)().to_dict()) | _flat(_config_of(state))
-        ours = _flat(self.config.to_dict())
+        saved = flat(type(self.config)().to_dict()) | flat(_config_of(state))
+        ours = flat(self.config.to_dict())
         changed = sorted(k for k in saved.keys() | ours.keys() if saved.get(k) != ours.get(k))
         if changed:
             each = ", ".join(f"{key} was {saved.get(key)!r}, is {ours.get(key)!r}" for key in changed)
@@ -192,12 +192,12 @@ def _config_of(state: object) -> dict[str, Any]:
     return config
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested values by dotted name, as segment.min_pixels."""
-    flat: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-    return flat
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return found
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[object]:

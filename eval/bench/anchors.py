@@ -16,6 +16,7 @@ from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench.frames import FrameSource, PosedDepth
 from ufmstar_torch.eval.bench.memory import state_memory, tensor_bytes
+from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.eval.bench.step import build_up
 from ufmstar_torch.eval.bench.timing import TimedCalls, pinned_threads, spread_of_counts
 from ufmstar_torch.eval.engine.clock import CallTimes
@@ -60,23 +61,12 @@ class TrackedTour:
         return [sequence[index] for index in range(count)]
 
 
-def measure_anchors(
-    source: FrameSource,
-    config: UfMStarConfig,
-    *,
-    points: int,
-    frames: int,
-    history: int,
-    in_view: int,
-    step_size: int,
-) -> dict[str, Any]:
-    """Time the tracker and the anchored step with ``points`` corners, on one thread of torch, numba and OpenCV.
+def measure_anchors(options: BenchSettings, source: FrameSource, config: UfMStarConfig, size: int) -> dict[str, Any]:
+    """Time the tracker and the anchored step with ``options.anchors`` corners; torch, numba and OpenCV on one thread.
 
     Args:
-        source, config, step_size: of the step and its depth maps [px].
-        points: corners to follow on average, and anchors of a step.
-        frames: timed.
-        history, in_view: as :func:`~ufmstar_torch.eval.bench.step.build_up` takes them.
+        options: of the benchmark.
+        source, config, size: of the step and its depth maps [px].
 
     Returns:
         "tracker" (see :func:`measure_tracker`), "step" (see :func:`measure_anchored_step`) and the settings.
@@ -85,12 +75,14 @@ def measure_anchors(
         ValueError: too few frames.
         ModuleNotFoundError: OpenCV is not installed.
     """
-    tour, rounds = TrackedTour(), _STEP_WARM_UP + frames
+    assert options.anchors is not None
+    tour, points, frames = TrackedTour(), options.anchors, options.frames
     with pinned_threads(1, opencv=True):
         tracker = measure_tracker(tour.frames(_TRACKER_WARM_UP + frames), points)
         built, depths, _ = build_up(
-            source, config.replace(anchored=True), size=step_size, in_view=in_view, history=history, rounds=rounds
-        )
+            source, config.replace(anchored=True), size=size, in_view=options.in_view, history=options.history,
+            rounds=_STEP_WARM_UP + frames,
+        )  # fmt: skip
         step = measure_anchored_step(built, depths, points)
     return {"points": points, "frames": frames, "threads": 1, "tour": asdict(tour), "tracker": tracker, "step": step}
 
@@ -180,13 +172,13 @@ class _TimedTracker(LandmarkTracker):
                 clock["rest"][-1] -= times[-1]
         return landmarks
 
-    def _followed(self, gray: NDArray[np.uint8], T: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-        return self.times.time("following", super()._followed, gray, T)
+    def _followed(self, *args: Any) -> tuple[NDArray, NDArray]:
+        return self.times.time("following", super()._followed, *args)
 
     def _fill(self, gray: NDArray[np.uint8]) -> None:
-        free = int((~self._seen[:, self._view]).sum())
+        before = self._seen[:, self._view].sum()
         self.times.time("searching", super()._fill, gray)
-        self.refilled.append(free != int((~self._seen[:, self._view]).sum()))
+        self.refilled.append(bool(before != self._seen[:, self._view].sum()))
 
     def _landmarks(self, tracked: int) -> Landmarks:
         return self.times.time("triangulating", super()._landmarks, tracked)
@@ -207,11 +199,7 @@ def _spread(times: CallTimes, name: str) -> dict[str, float | int]:
     """Median, 90th percentile, mean and minimum of wall-clock and processor times [ms], and their count."""
     figures: dict[str, float | int] = {"count": len(times.wall[name])}
     for prefix, values in (("", times.wall[name]), ("cpu_", times.cpu[name])):
-        of: dict[str, Any] = {
-            "median": np.median(values),
-            "p90": np.percentile(values, 90),
-            "mean": np.mean(values),
-            "min": min(values),
-        }
-        figures |= {f"{prefix}{key}_ms": float(value) for key, value in of.items()}
+        least, median, p90 = np.percentile(values, (0, 50, 90)).tolist()
+        of = {"median": median, "p90": p90, "mean": float(np.mean(values)), "min": least}
+        figures |= {f"{prefix}{key}_ms": value for key, value in of.items()}
     return figures

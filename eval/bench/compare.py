@@ -47,13 +47,10 @@ def measure_peer(command: str, frames: Iterable[PosedDepth]) -> dict[str, Any]:
             np.savez(Path(folder, f"{number:04}.npz"), allow_pickle=False, **{k: v.numpy() for k, v in arrays.items()})
         for _ in range(_RUNS):
             before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+            environment = os.environ | {FRAMES: folder}
             try:
                 done = subprocess.run(
-                    shlex.split(command),
-                    env=os.environ | {FRAMES: folder},
-                    stdout=subprocess.PIPE,
-                    text=True,
-                    check=True,
+                    shlex.split(command), env=environment, stdout=subprocess.PIPE, text=True, check=True
                 )
             except (OSError, ValueError, subprocess.CalledProcessError) as error:
                 raise ValueError(f"--peer {command!r} failed: {error}") from error

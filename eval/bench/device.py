@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.bench.frames import PosedDepth, RenderedRoom
+from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.output import UfMStarOutput
 
 STREAMS = (1, 64, 256)
@@ -22,15 +23,11 @@ _COPIED = 2**30  # bytes copied to measure the bandwidth
 _LAUNCHES = ("LaunchKernel", "MemcpyAsync", "MemsetAsync", "GraphLaunch")  # in the names of runtime and driver calls
 
 
-def measure_device(
-    device: str, sizes: tuple[int, ...], frames: int, seed: int, progress: Callable[[str], object]
-) -> dict[str, Any]:
+def measure_device(options: BenchSettings, progress: Callable[[str], object]) -> dict[str, Any]:
     """Time steps of :data:`STREAMS` streams, and networks of one image, on a GPU ("cuda" or "cuda:N").
 
     Args:
-        device, seed: of the steps, of the rooms.
-        sizes: of the square depth maps [px].
-        frames: that are timed.
+        options: of the benchmark.
         progress: is called with a description of what is measured next.
 
     Returns:
@@ -42,18 +39,18 @@ def measure_device(
         ValueError: torch sees no such device.
     """
     if not torch.cuda.is_available():
-        raise ValueError(f"--device {device} needs a CUDA device, torch sees none")
-    chosen = torch.device(device)
+        raise ValueError(f"--device {options.device} needs a CUDA device, torch sees none")
+    chosen = torch.device(options.device)
     bandwidth = _bandwidth(chosen)
     results, networks = [], {}
-    for size in sizes:
+    for size in options.sizes:
         progress(f"{size} x {size}, networks")
-        networks[str(size)] = {name: _time(run, frames) for name, run in _networks(size, chosen)}
-        rooms = [list(RenderedRoom(seed=seed + room).frames(size, _FRAMES)) for room in range(_ROOMS)]
+        networks[str(size)] = {name: _time(run, options.frames) for name, run in _networks(size, chosen)}
+        rooms = [list(RenderedRoom(seed=options.seed + room).frames(size, _FRAMES)) for room in range(_ROOMS)]
         for streams in STREAMS:
             progress(f"{size} x {size}, {streams} streams")
             given = [_batch([room[i] for room in rooms], streams, chosen) for i in range(_FRAMES)]
-            results.append(_measure(given, frames, bandwidth))
+            results.append(_measure(given, options.frames, bandwidth))
     name = torch.cuda.get_device_name(chosen)
     return {"name": name, "bandwidth": bandwidth, "networks": networks, "results": results}
 

@@ -10,12 +10,13 @@ part until it is long enough; several windows per part, in alternating order, sh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from queue import Empty
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 GPU, CPU, DRAM, OTHER = "gpu", "cpu", "dram", "other"
 NOT_MEASURABLE = "not measurable here"
@@ -29,10 +30,14 @@ READING_ERRORS: tuple[type[Exception], ...] = (OSError, Empty)
 
 # Repeats a part for at least so many seconds and returns how many frames that were.
 Work = Callable[[float], int]
+Key = TypeVar("Key", bound=Hashable)
 
 
 class SensorError(Exception):
     """A counter could not be read; the message is the reason."""
+
+
+Reading = float | SensorError  # of a rail [J]
 
 
 @dataclass(frozen=True)
@@ -124,17 +129,16 @@ class PowerMeter:
 
     def measure(self, work: Callable[[], object]) -> Window:
         """What ``work()`` consumes; it must have finished on every device when it returns."""
-        began, before, failed_before = self._read()
+        began, before = self._read()
         work()
-        ended, after, failed_after = self._read()
+        ended, after = self._read()
         joules: dict[str, float] = {}
-        unusable = {**failed_after, **failed_before}
+        unusable: dict[str, str] = {}
         for rail in self.rails:
-            if rail.name not in unusable:
-                try:
-                    joules[rail.name] = consumed(rail, before[rail.name], after[rail.name], ended - began)
-                except SensorError as error:
-                    unusable[rail.name] = str(error)
+            try:
+                joules[rail.name] = consumed(rail, before[rail.name], after[rail.name], ended - began)
+            except SensorError as error:
+                unusable[rail.name] = str(error)
         return Window(ended - began, joules, unusable)
 
     def idle(self, seconds: float, sleep: Callable[[float], object] = time.sleep) -> dict[str, float]:
@@ -144,31 +148,33 @@ class PowerMeter:
         window = self.measure(lambda: sleep(max(seconds, self.shortest)))
         return {name: joules / window.seconds for name, joules in window.joules.items()}
 
-    def _read(self) -> tuple[float, dict[str, float], dict[str, str]]:
-        """The time, the joules by rail, and by rail why it could not be read."""
-        joules: dict[str, float] = {}
-        failed: dict[str, str] = {}
+    def _read(self) -> tuple[float, dict[str, Reading]]:
+        """The time, and the readings by rail."""
+        readings: dict[str, Reading] = {}
         at = self._clock()
         for source in self._sources:
             try:
-                joules |= source.read()
+                readings |= source.read()
             except SensorError as error:
-                failed |= {rail.name: str(error) for rail in source.rails}
-        return at, joules, failed
+                readings |= dict.fromkeys((rail.name for rail in source.rails), error)
+        return at, readings
 
 
-def consumed(rail: Rail, start: float, end: float, seconds: float) -> float:
+def consumed(rail: Rail, start: Reading, end: Reading, seconds: float) -> float:
     """Energy between two readings of a rail's counter [J], ``seconds`` apart [s], also where it has wrapped in between.
 
     Raises:
-        SensorError: the counter did not move, went back, or may have wrapped more than once.
+        SensorError: a reading failed; the counter did not move, went back, or may have wrapped more than once.
     """
-    if rail.wraps_at is None:
-        joules = end - start
-    elif seconds * _MOST_WATTS >= rail.wraps_at:
-        raise SensorError(f"a window of {seconds:.0f} s is too long for the counter of {rail.name}, which wraps")
-    else:
-        joules = (end - start) % rail.wraps_at
+    if isinstance(start, SensorError):
+        raise start
+    if isinstance(end, SensorError):
+        raise end
+    joules = end - start
+    if rail.wraps_at is not None:
+        if seconds * _MOST_WATTS >= rail.wraps_at:
+            raise SensorError(f"a window of {seconds:.0f} s is too long for the counter of {rail.name}, which wraps")
+        joules %= rail.wraps_at
     if joules < 0:
         raise SensorError(f"the counter of {rail.name} went back")
     if joules == 0:
@@ -179,94 +185,90 @@ def consumed(rail: Rail, start: float, end: float, seconds: float) -> float:
 # ---- energy per frame ----
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PartEnergy:
-    """Of one part, on the rails of the unit that it runs on; one number per window.
+    """Of one part, on the rails of the unit that it runs on.
 
     Attributes:
-        joules: per frame [J], all that the rails counted.
-        net: likewise, less what they count in the same time while the process is idle.
-        seconds: per frame [s].
-        reason: why nothing was measured; the lists are empty then.
+        windows: [N, 3] per window and frame: all that the rails counted [J]; the same, less what they count in the same
+            time while the process is idle [J]; and the time [s].
+        reason: why nothing was measured; there are no windows then.
     """
 
-    joules: tuple[float, ...] = ()
-    net: tuple[float, ...] = ()
-    seconds: tuple[float, ...] = ()
+    windows: NDArray[np.float64]
     reason: str | None = None
 
     def minus(self, other: PartEnergy) -> PartEnergy:
         """What this part takes beyond another one, window by window."""
-        if self.reason is not None or other.reason is not None:
-            return PartEnergy(reason=self.reason or other.reason)
-        pairs = [(self.joules, other.joules), (self.net, other.net), (self.seconds, other.seconds)]
-        joules, net, seconds = (tuple(a - b for a, b in zip(x, y, strict=True)) for x, y in pairs)
-        return PartEnergy(joules, net, seconds)
+        if reason := self.reason or other.reason:
+            return unmeasured(reason)
+        return PartEnergy(self.windows - other.windows)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: medians and quartiles per frame [mJ], the time that goes with them [s], and power while the part
         runs [W]; or the reason."""
         if self.reason is not None:
             return {"not_measurable": self.reason}
+        low, middle, high = np.percentile(self.windows, (25, 50, 75), axis=0).tolist()
+        *joules, seconds = self.windows.sum(0).tolist()
         figures: dict[str, Any] = {}
-        for name, values in (("gross", self.joules), ("net", self.net)):
-            low, middle, high = (1e3 * float(v) for v in np.percentile(values, (25, 50, 75)))
-            total = sum(self.seconds)  # of a difference, it may be negative: there is no power then
+        for column, name in enumerate(("gross", "net")):
             figures[name] = {
-                "millijoules": middle, "q1": low, "q3": high,
-                "seconds": float(np.median(self.seconds)), "watts": sum(values) / total if total > 0 else None,
+                "millijoules": 1e3 * middle[column], "q1": 1e3 * low[column], "q3": 1e3 * high[column],
+                # The time of a difference may be negative: there is no power then.
+                "seconds": middle[2], "watts": joules[column] / seconds if seconds > 0 else None,
             }  # fmt: skip
-        return {**figures, "windows": len(self.joules)}
+        return {**figures, "windows": len(self.windows)}
+
+
+def unmeasured(reason: str) -> PartEnergy:
+    """The energy of a part that could not be measured."""
+    return PartEnergy(np.zeros((0, 3)), reason)
 
 
 def run_windows(
     meter: PowerMeter,
-    work: Mapping[tuple[str, str], tuple[str, Work]],
+    work: Mapping[Key, tuple[str, Work]],
     idle: Mapping[str, float],
     *,
     seconds: float,
     windows: int,
-) -> dict[tuple[str, str], PartEnergy]:
+) -> dict[Key, PartEnergy]:
     """Measure every part.
 
     Args:
         meter: the rails.
-        work: by owner and part: the part of the machine whose rails count ("gpu" or "cpu"), and what to repeat.
+        work: by part: the unit of the machine whose rails count ("gpu" or "cpu"), and what to repeat.
         idle: power by rail [W].
         seconds: that a window lasts, at least [s].
         windows: per part.
     """
-    results: dict[tuple[str, str], list[tuple[float, ...]]] = {key: [] for key in work}
-    reasons = {key: meter.missing.get(unit, NOT_MEASURABLE) for key, (unit, _) in work.items() if not meter.names(unit)}
-    measured = [key for key in work if key not in reasons]
+    results: dict[Key, list[list[float]]] = {key: [] for key in work}
+    reasons: dict[Key, str] = {}
     for turn in range(windows):
-        for key in measured[:: 1 if turn % 2 == 0 else -1]:
-            value = _one(meter, *work[key], idle, max(seconds, meter.shortest))
-            if isinstance(value, str):
-                reasons[key] = value
-            else:
-                results[key].append(value)
-    energies = {key: PartEnergy(reason=reason) for key, reason in reasons.items()}
-    for key in work.keys() - reasons.keys():
-        joules, net, times = zip(*results[key], strict=True)
-        energies[key] = PartEnergy(joules, net, times)
-    return energies
+        for key in list(work)[:: 1 if turn % 2 == 0 else -1]:
+            try:
+                results[key].append(_one(meter, *work[key], idle, max(seconds, meter.shortest)))
+            except SensorError as error:
+                reasons[key] = str(error)
+    return {key: unmeasured(reasons[key]) if key in reasons else PartEnergy(np.array(results[key])) for key in work}
 
 
-def _one(
-    meter: PowerMeter, unit: str, repeat: Work, idle: Mapping[str, float], seconds: float
-) -> tuple[float, ...] | str:
-    """Joules, net joules and seconds per frame of one window, or why there are none."""
+def _one(meter: PowerMeter, unit: str, repeat: Work, idle: Mapping[str, float], seconds: float) -> list[float]:
+    """Joules, net joules and seconds per frame of one window. Raises SensorError: there are none."""
+    names = meter.names(unit)
+    if not names:
+        raise SensorError(meter.missing.get(unit, NOT_MEASURABLE))
     frames: list[int] = []
     window = meter.measure(lambda: frames.append(repeat(seconds)))
-    for name in meter.names(unit):
+    for name in names:
         if name in window.unusable:
-            return window.unusable[name]
+            raise SensorError(window.unusable[name])
         if name not in idle:
-            return f"the idle power of {name} could not be measured"
-    gross = sum(window.joules[name] for name in meter.names(unit))
-    resting = sum(idle[name] for name in meter.names(unit)) * window.seconds
-    return gross / frames[0], (gross - resting) / frames[0], window.seconds / frames[0]
+            raise SensorError(f"the idle power of {name} could not be measured")
+    gross = sum(window.joules[name] for name in names)
+    resting = sum(idle[name] for name in names) * window.seconds
+    return [gross / frames[0], (gross - resting) / frames[0], window.seconds / frames[0]]
 
 
 def repeated(

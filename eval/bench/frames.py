@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -39,25 +39,25 @@ class PosedDepth(NamedTuple):
     intrinsics: Tensor
 
 
-class FrameSource(Protocol):
-    """Where frames come from.
-
-    Attributes:
-        available: how many there are, None = as many as one likes.
-    """
+class FrameSource(ABC):
+    """Where frames come from."""
 
     @property
-    def available(self) -> int | None: ...
+    def available(self) -> int | None:
+        """How many frames there are, None = as many as one likes."""
+        return None
 
+    @abstractmethod
     def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
         """The first ``count`` frames at size x size pixels, or fewer where there are not so many."""
 
+    @abstractmethod
     def describe(self) -> dict[str, object]:
         """What it is, for the report."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rendered(ABC):
+class _Rendered(FrameSource):
     """Frames whose depth flickers as a network's does, without an end.
 
     Attributes:
@@ -71,13 +71,7 @@ class _Rendered(ABC):
     seed: int = 0
     max_depth: float = math.inf
 
-    @property
-    def available(self) -> int | None:
-        """None: it goes on for ever."""
-        return None
-
     def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
-        """The first ``count`` frames at size x size pixels."""
         K, rng = synthetic.intrinsics(size, size), np.random.default_rng(self.seed)
         for room, T, origin in itertools.islice(self._views(), count):
             depth = synthetic.flicker(synthetic.render(room, T, K, size, size), self.flicker, rng)
@@ -86,7 +80,6 @@ class _Rendered(ABC):
             yield PosedDepth(torch.from_numpy(depth).float()[None], torch.from_numpy(T), torch.from_numpy(K))
 
     def describe(self) -> dict[str, object]:
-        """The settings, for the report."""
         settings = {name: value for name, value in asdict(self).items() if value != math.inf}
         return {"kind": f"rendered {self.KIND}", **settings}
 
@@ -172,7 +165,7 @@ class RenderedStreet(_Rendered):
 
 
 @dataclass(frozen=True)
-class RecordedSequence:
+class RecordedSequence(FrameSource):
     """Frames on disk with their own depth, or with FastDepth's prediction from their images.
 
     Attributes:
@@ -184,8 +177,7 @@ class RecordedSequence:
     network: FastDepth | None = None
 
     @property
-    def available(self) -> int | None:
-        """The number of its frames."""
+    def available(self) -> int:
         return len(self._open())
 
     def frames(self, size: int, count: int) -> Iterator[PosedDepth]:
@@ -205,7 +197,9 @@ class RecordedSequence:
             if self.network is None:
                 assert frame.depth is not None  # checked above
                 own = frame.intrinsics if frame.depth_intrinsics is None else frame.depth_intrinsics
-                yield _square(torch.from_numpy(frame.depth)[None], T, torch.from_numpy(own), size)
+                depth, K = torch.from_numpy(frame.depth)[None], torch.from_numpy(own)
+                square = Preprocess(resize_height=size, crop=(size, size))
+                yield PosedDepth(square.apply_depth(depth), T, square.apply_intrinsics(K, *depth.shape[-2:]))
             else:
                 yield _predicted(self.network, image_tensor(frame), T, torch.from_numpy(frame.intrinsics), size)
 
@@ -218,11 +212,6 @@ class RecordedSequence:
         from ufmstar_torch.eval.sequences import open_sequence
 
         return open_sequence(self.path)
-
-
-def _square(depth: Tensor, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDepth:
-    preprocess = Preprocess(resize_height=size, crop=(size, size))
-    return PosedDepth(preprocess.apply_depth(depth), T_world_cam, preprocess.apply_intrinsics(K, *depth.shape[-2:]))
 
 
 def _predicted(network: FastDepth, image: Tensor, T_world_cam: Tensor, K: Tensor, size: int) -> PosedDepth:

@@ -12,23 +12,23 @@ import numpy as np
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.eval.bench.frames import FrameSource
 from ufmstar_torch.eval.bench.memory import state_memory
-from ufmstar_torch.eval.bench.step import FrameCounts
+from ufmstar_torch.eval.bench.step import frame_counts
 from ufmstar_torch.eval.bench.timing import TimedCalls
+from ufmstar_torch.spill import Spilled
 
 _MEANS = ("in_view", "segments", "matched", "new")
 
 
 def measure_long_run(
-    source: FrameSource, config: UfMStarConfig, *, size: int, frames: int, early: int = 100, window: int = 100
+    source: FrameSource, config: UfMStarConfig, *, size: int, frames: int, window: int = 100
 ) -> dict[str, Any]:
-    """Run ``frames`` steps; compare those around frame ``early`` with the last ones.
+    """Run ``frames`` steps; compare a window of early ones, around frame ``window``, with the last ones.
 
     Args:
         source: of the frames.
         config: of UfM*.
         size: of the depth maps [px].
         frames: in all.
-        early: the centre of the early window, counted from 1.
         window: frames per window; in the rendered rooms whole turns of the camera, so that both windows contain all of
             a room.
 
@@ -40,19 +40,20 @@ def measure_long_run(
     Raises:
         ValueError: the early and the last window would overlap, or the source has fewer frames.
     """
-    start = max(0, early - window // 2)
+    start = window - window // 2
     if frames < start + 2 * window:
         raise ValueError(f"a long run needs at least {start + 2 * window} frames for two windows, got {frames}")
     if source.available is not None and source.available < frames:
         raise ValueError(f"a long run of {frames} frames was asked for, there are {source.available}")
-    ufm, timed, counts = UfMStar(config), TimedCalls(), FrameCounts("segments", "matched", "new")
-    kept, out, read = [], [], []
+    ufm, timed = UfMStar(config), TimedCalls()
+    counts: list[dict[str, int]] = []
+    kept, out, read = [], [], [0]
     for frame in timed.frames(source.frames(size, frames)):
-        counts.add(timed.call({"step": ufm}, *frame)["step"].statistics, ufm, frame)
-        spilled = ufm.spilled
+        counts.append(frame_counts(timed.call({"step": ufm}, *frame)["step"].statistics, ufm, frame))
+        spilled = ufm.spilled or Spilled(pages=0, components=0, read=0)
         kept.append(int(ufm.mixture.components))
-        out.append(0 if spilled is None else spilled.components)
-        read.append(0 if spilled is None else spilled.read)
+        out.append(spilled.components)
+        read.append(spilled.read)
     wall, cpu = timed.times.wall["step"], timed.times.cpu["step"]
 
     def at(low: int) -> dict[str, Any]:
@@ -63,8 +64,8 @@ def measure_long_run(
             "step_cpu_median_ms": float(np.median(cpu[part])),
             "components": kept[end],
             "out": out[end],
-            "pages_read": read[end] - (read[low - 1] if low else 0),
-            **{f"{name}_mean": float(np.mean(counts[name][part])) for name in _MEANS},
+            "pages_read": read[low + window] - read[low],
+            **{f"{name}_mean": float(np.mean([count[name] for count in counts[part]])) for name in _MEANS},
         }
 
     first, last = at(start), at(frames - window)
@@ -98,7 +99,7 @@ def measure_growth(
         worlds: frames and config by name.
         merge: values of ``UfMStarConfig.merge``.
         limits: values of ``max_components``, the others in a temporary folder; 0 = all in memory.
-        size, frames, window: see :func:`measure_long_run`; the early window is around frame ``window``.
+        size, frames, window: see :func:`measure_long_run`.
         progress: is called with a description of what is measured next.
 
     Returns:
@@ -110,6 +111,6 @@ def measure_growth(
         with TemporaryDirectory() as folder:
             spill = {"max_components": most, "spill": folder} if most else {}
             settings = config.replace(merge=limit, **spill)
-            run = measure_long_run(source, settings, size=size, frames=frames, early=window, window=window)
+            run = measure_long_run(source, settings, size=size, frames=frames, window=window)
         runs.append({"world": world, "merge": limit, "max_components": most or None, **run})
     return runs

@@ -11,25 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import islice
-from statistics import median
 from typing import Any
 
+import numpy as np
 import torch
 
 from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.eval.bench.energy import CPU, GPU, PartEnergy, PowerMeter, Work, repeated, run_windows
+from ufmstar_torch.eval.bench.energy import CPU, GPU, PartEnergy, PowerMeter, repeated, run_windows
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
-from ufmstar_torch.eval.bench.race import (
-    MULTIVIEW,
-    PROCESSOR,
-    WALL,
-    MultiviewStep,
-    Race,
-    inference_of,
-    parts_of,
-    run_race,
-)
+from ufmstar_torch.eval.bench.race import MULTIVIEW, PROCESSOR, WALL, Part, Race, inference_of, run_race
 from ufmstar_torch.eval.bench.timing import pinned_threads
 from ufmstar_torch.eval.engine.clock import paired_ratio, spread, synchronize
 from ufmstar_torch.eval.methods.method import ALONE
@@ -44,7 +35,7 @@ FORMAT = 1
 NETWORK = "network_uncertainty"
 NOT_NEEDED = "the method needs only depth of the network"
 
-Energies = Mapping[tuple[str, str], PartEnergy]
+Energies = Mapping[Part, PartEnergy]
 
 
 @dataclass(frozen=True)
@@ -120,10 +111,13 @@ def measure(
         race = run_race(
             chosen, networks, frames, warm_up=plan.warm_up, device=device, multiview_device=multiview_device
         )
-        units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
-        work = _work(chosen, networks, race, device, multiview_device)
+        work = {}
+        for (owner, part), calls in race.calls.items():
+            where = multiview_device if part == MULTIVIEW else device
+            work[owner, part] = (_unit(where), repeated(calls, partial(synchronize, where)))
         energy = run_windows(meter, work, idle, seconds=plan.seconds, windows=plan.windows)
-    used = [base for base in networks if base in race.given]
+    units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
+    used = [base for base in networks if (base, DEPTH) in race.calls]
     gpu = None if on_gpu is None else torch.cuda.get_device_name(on_gpu)
     return {
         "format": FORMAT,
@@ -222,36 +216,6 @@ def _unit(device: torch.device) -> str:
     return CPU if device.type == "cpu" else GPU
 
 
-def _work(
-    rows: Sequence[Row],
-    networks: Mapping[str, TimedNetwork],
-    race: Race,
-    device: torch.device,
-    multiview_device: torch.device,
-) -> dict[tuple[str, str], tuple[str, Work]]:
-    """What a window repeats, by owner and part, on the very inputs of the race."""
-    work: dict[tuple[str, str], tuple[str, Work]] = {}
-    for base, inputs in race.given.items():
-        for part in parts_of(base, rows):
-            one = partial(networks[base].predict, part)
-            calls = [partial(one, given.x, given.intrinsics, turn=turn) for turn, given in enumerate(inputs)]
-            work[base, part] = (_unit(device), repeated(calls, partial(synchronize, device)))
-    for row in rows:
-        if row.method.fusion != ALONE:
-            step = MultiviewStep(row, multiview_device)
-            steps = [partial(_advance, step, turn == 0, *given) for turn, given in enumerate(race.step_inputs(row))]
-            waited = repeated(steps, partial(synchronize, multiview_device))
-            work[row.label, MULTIVIEW] = (_unit(multiview_device), waited)
-    return work
-
-
-def _advance(step: MultiviewStep, first: bool, *given: Any) -> None:
-    """A step; the first frame of the sequence begins with an empty state, as in the race."""
-    if first:
-        step.module.reset()
-    step(*given)
-
-
 # ---- the lines of the result ----
 
 
@@ -318,8 +282,8 @@ def _energy_overhead(energies: Mapping[str, PartEnergy], missing: Mapping[str, s
     if any(part.reason is not None for part in energies.values()) or (missing is not None and "none" not in missing):
         return None
     overhead: dict[str, float] = {}
-    for kind, field in (("gross", "joules"), ("net", "net")):
-        middle = {key: median(getattr(part, field)) for key, part in energies.items()}
+    for column, kind in enumerate(("gross", "net")):
+        middle = {key: float(np.median(part.windows[:, column])) for key, part in energies.items()}
         depth = middle.pop(DEPTH)
         if depth > 0:
             overhead[kind] = overhead_percent(sum(max(0.0, value) for value in middle.values()), depth)

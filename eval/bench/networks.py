@@ -14,6 +14,8 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.methods.method import BASES
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import OF_NETWORK
+from ufmstar_torch.eval.sequences.frame import Frame
+from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.models.batch_ensemble import BatchEnsembleMember
 from ufmstar_torch.models.dropout import SAMPLES, DecoderDropout, MonteCarloDropout
 from ufmstar_torch.models.ensemble import Ensemble, LazyMember
@@ -84,6 +86,12 @@ class TimedNetwork:
                 return prediction
             every = part == EVERY
             return self._turns.every(x, intrinsics) if every else self._turns.member(x, intrinsics, turn)
+
+    def prepare(self, frame: Frame, device: torch.device) -> tuple[Tensor, Tensor]:
+        """The networks' input of a frame, [1, 3, H, W], and its intrinsics [1, 3, 3] [px], on a device. Raises
+        FrameError where the frame has no image."""
+        K = torch.from_numpy(frame.intrinsics)[None].to(device)
+        return self.preprocess(image_tensor(frame).to(device), K)
 
     def memory(self) -> dict[str, int] | None:
         """Weights and buffers [bytes] of "depth" alone, and of all else as "uncertainty": heads, further members,

@@ -6,7 +6,7 @@ A frame's networks run first, then the multiview steps on their predictions; odd
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -17,39 +17,17 @@ from torch import Tensor
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork
 from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls
-from ufmstar_torch.eval.engine.clock import CallTimes
 from ufmstar_torch.eval.engine.estimators import Gaussians, Pointwise, make_estimator
-from ufmstar_torch.eval.methods.method import ALONE, UFM_STAR
+from ufmstar_torch.eval.methods.method import ALONE
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.eval.sequences.images import image_tensor
 from ufmstar_torch.prediction import DepthPrediction
 
 MULTIVIEW = "multiview"
 # Clocks: what passes, and what this process computes (over all its threads), which other work does not stretch.
 WALL, PROCESSOR = "wall", "processor"
-
-
-@dataclass(frozen=True)
-class NetworkInput:
-    """A frame as a network takes it.
-
-    Attributes:
-        x: [1, 3, H, W] its input, on its device.
-        T_world_cam: [1, 4, 4] float64 camera-to-world [m].
-        intrinsics: [1, 3, 3] float64 of the input [px].
-    """
-
-    x: Tensor
-    T_world_cam: Tensor
-    intrinsics: Tensor
-
-    @classmethod
-    def of(cls, frame: Frame, network: TimedNetwork, device: torch.device) -> NetworkInput:
-        """Raises FrameError where the frame has no image."""
-        K = torch.from_numpy(frame.intrinsics)[None].to(device)
-        x, K = network.preprocess(image_tensor(frame).to(device), K)
-        return cls(x, torch.from_numpy(frame.T_world_cam)[None], K)
+# The owner of a part, a base or a row by its label, and the part.
+Part = tuple[str, str]
 
 
 class MultiviewStep:
@@ -65,16 +43,17 @@ class MultiviewStep:
         self.kept: list[dict[str, float]] = []
         self._estimator = estimator
 
-    def __call__(self, prediction: DepthPrediction, given: NetworkInput) -> Any:
-        """The next frame: its maps to the device, and the step."""
-        return self.module(*self.arguments(prediction, given))
+    def __call__(self, prediction: DepthPrediction, T_world_cam: Tensor, K: Tensor, *, first: bool = False) -> Any:
+        """A frame: its maps to the device, and the step; the ``first`` one begins with an empty state."""
+        if first:
+            self.module.reset()
+        return self.module(*self.arguments(prediction, T_world_cam, K))
 
-    def arguments(self, prediction: DepthPrediction, given: NetworkInput) -> tuple[Tensor | None, ...]:
-        """Depth, pose, intrinsics, A and E as the row uses them, on its device."""
+    def arguments(self, prediction: DepthPrediction, T_world_cam: Tensor, K: Tensor) -> list[Tensor | None]:
+        """Depth, pose [1, 4, 4], intrinsics [1, 3, 3], A and E as the row uses them, on its device."""
         own = (prediction.aleatoric_variance, prediction.epistemic_variance)
-        maps = (prediction.depth, given.T_world_cam, given.intrinsics)
-        used = (*maps, *own) if self.row.method.uses_aleatoric else (*maps, None, None)
-        return tuple(None if value is None else value.to(self.device) for value in used)
+        used = (prediction.depth, T_world_cam, K, *(own if self.row.method.uses_aleatoric else (None, None)))
+        return [None if value is None else value.to(self.device) for value in used]
 
     def note(self) -> None:
         """Record what is kept now."""
@@ -97,32 +76,31 @@ class Race:
 
     Attributes:
         warm_up: frames at the beginning that are not counted.
-        times: by "base/part" or "row/multiview", of the frames after the warm-up.
-        given: by base, the networks' input of every frame.
-        predictions: by base and part ("once" or "every"), the multiview steps' input of every frame.
+        timed: the clocks, after the warm-up.
+        calls: the parts that were run, one call per frame, which can be repeated in this order.
         steps, staged: by row's label, the state after the last frame, and the stages of UfM*.
     """
 
     warm_up: int
-    times: CallTimes = field(default_factory=CallTimes)
-    given: dict[str, list[NetworkInput]] = field(default_factory=dict)
-    predictions: dict[tuple[str, str], list[DepthPrediction]] = field(default_factory=dict)
+    timed: TimedCalls = field(default_factory=TimedCalls)
+    calls: dict[Part, list[Callable[[], Any]]] = field(default_factory=dict)
     steps: dict[str, MultiviewStep] = field(default_factory=dict)
     staged: dict[str, StagedStep] = field(default_factory=dict)
 
     def ms(self, owner: str, part: str, clock: str = WALL) -> list[float]:
         """Times of a part by a clock [ms], one per frame; none if it was not run."""
-        times = self.times.wall if clock == WALL else self.times.cpu
-        return times.get(f"{owner}/{part}", [])
+        times = self.timed.times.wall if clock == WALL else self.timed.times.cpu
+        return times.get((owner, part), [])
 
     def added_ms(self, base: str, part: str, clock: str = WALL) -> list[float]:
         """What a network's inference takes beyond that of depth alone [ms], frame by frame."""
         return [a - b for a, b in zip(self.ms(base, part, clock), self.ms(base, DEPTH, clock), strict=True)]
 
-    def step_inputs(self, row: Row) -> list[tuple[DepthPrediction, NetworkInput]]:
-        """Of a row's multiview step, frame by frame."""
-        base = row.method.base
-        return list(zip(self.predictions[base, inference_of(row)], self.given[base], strict=True))
+    def run(self, calls: Mapping[Part, Callable[[], Any]], device: torch.device) -> dict[Part, Any]:
+        """Time the parts of a frame on a device; what they return."""
+        for part, call in calls.items():
+            self.calls.setdefault(part, []).append(call)
+        return self.timed.call(calls, device=device)
 
 
 def parts_of(base: str, rows: Iterable[Row]) -> tuple[str, ...]:
@@ -155,30 +133,29 @@ def run_race(
     Raises:
         FrameError: a frame has no image.
     """
-    timed, race = TimedCalls(), Race(warm_up)
-    race.times = timed.times
+    race = Race(warm_up)
     parts = {base: parts_of(base, rows) for base in networks if any(row.method.base == base for row in rows)}
-    race.steps = {row.label: MultiviewStep(row, multiview_device) for row in rows if row.method.fusion != ALONE}
-    staged = {row.label: MultiviewStep(row, multiview_device) for row in rows if row.method.fusion == UFM_STAR}
-    for label, step in staged.items():
-        assert isinstance(step.module, UfMStar)
-        race.staged[label] = StagedStep(step.module, multiview_device)
-    for turn, frame in enumerate(timed.frames(frames, warm_up=warm_up)):
-        calls: dict[str, Any] = {}
-        for base, needed in parts.items():
-            given = NetworkInput.of(frame, networks[base], device)
-            race.given.setdefault(base, []).append(given)
-            one = partial(networks[base].predict, x=given.x, intrinsics=given.intrinsics, turn=turn)
-            calls |= {f"{base}/{part}": partial(one, part) for part in needed}
-        predicted = timed.call(calls, device=device)
-        for base, needed in parts.items():
-            for part in needed[1:]:
-                race.predictions.setdefault((base, part), []).append(predicted[f"{base}/{part}"])
-        inputs = {label: race.step_inputs(step.row)[-1] for label, step in race.steps.items()}
-        steps = {f"{label}/{MULTIVIEW}": partial(step, *inputs[label]) for label, step in race.steps.items()}
-        timed.call(steps, device=multiview_device)
-        for step in race.steps.values():
+    for row in rows:
+        if row.method.fusion != ALONE:
+            race.steps[row.label], twin = (MultiviewStep(row, multiview_device) for _ in range(2))
+            if isinstance(twin.module, UfMStar):
+                race.staged[row.label] = StagedStep(twin.module, multiview_device)
+    for turn, frame in enumerate(race.timed.frames(frames, warm_up=warm_up)):
+        given = {base: networks[base].prepare(frame, device) for base in parts}
+        inferences: dict[Part, Callable[[], DepthPrediction]] = {
+            (base, part): partial(networks[base].predict, part, *given[base], turn=turn)
+            for base, needed in parts.items()
+            for part in needed
+        }
+        predicted, T = race.run(inferences, device), torch.from_numpy(frame.T_world_cam)[None]
+        inputs = {}
+        for label, step in race.steps.items():
+            base = step.row.method.base
+            inputs[label] = predicted[base, inference_of(step.row)], T, given[base][1]
+        steps = {(label, MULTIVIEW): partial(race.steps[label], *inputs[label], first=turn == 0) for label in inputs}
+        race.run(steps, multiview_device)
+        for label, step in race.steps.items():
             step.note()
-        for label, step in staged.items():
-            race.staged[label](*step.arguments(*inputs[label]))
+            if label in race.staged:
+                race.staged[label](*step.arguments(*inputs[label]))
     return race

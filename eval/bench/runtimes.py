@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import tempfile
-import time
 import warnings
 from collections.abc import Callable
 from importlib.metadata import version
@@ -15,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ufmstar_torch.eval.bench.timing import TimedCalls
 from ufmstar_torch.models.inference import ONNX, TORCH
 from ufmstar_torch.models.onnx_network import open_session
 from ufmstar_torch.prediction import DepthPrediction
@@ -58,17 +58,14 @@ def fastest(network: nn.Module, side: int, *, runtime: str = "auto") -> tuple[Ca
         calls[TORCH] = _in_torch(network, image)
     if runtime == ONNX or (runtime == "auto" and find_spec("onnx") and find_spec("onnxruntime")):
         calls[ONNX] = _in_onnx_runtime(network, image)
-    least = dict.fromkeys(calls, float("inf"))
-    for number in range(_WARM_UP + _ROUNDS):
-        for name in list(calls)[:: 1 if number % 2 else -1]:
-            started = time.perf_counter()
-            calls[name]()
-            if number >= _WARM_UP:
-                least[name] = min(least[name], 1000 * (time.perf_counter() - started))
+    timed, outputs = TimedCalls(), {}
+    for _ in timed.frames(range(_WARM_UP + _ROUNDS), warm_up=_WARM_UP):
+        outputs = timed.call(calls)
+    least = {name: min(timed.times.wall[name]) for name in calls}
     chosen = min(least, key=lambda name: least[name])
     apart = None
     if len(calls) > 1:
-        one, other = (call() for call in calls.values())
+        one, other = (outputs[name] for name in calls)
         apart = float((one - other).abs().max() / other.abs().max())
         if not apart <= _AGREEMENT:
             raise ValueError(f"the runtimes {', '.join(calls)} differ by {apart:.2g} of the largest output")

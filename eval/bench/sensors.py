@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -36,26 +37,21 @@ def find_sources(gpu: int | None) -> tuple[list[Source], dict[str, str]]:
     if chip is not None:  # a GPU on which nothing runs counts in no column
         rails = tuple(replace(r, part=OTHER) if r.part == GPU and gpu is None else r for r in chip.rails)
         sources.append(replace(chip, rails=rails))
-    known = {rail.part for source in sources for rail in source.rails}
-    others: dict[str, tuple[Callable[[], Source], tuple[str, ...]]] = {CPU: (_packages, (CPU, DRAM))}
+    others: list[tuple[Callable[[], Source], tuple[str, ...]]] = [(_packages, (CPU, DRAM))]
     if gpu is None:
         missing[GPU] = _UNUSED
     else:
-        others[GPU] = (lambda: _graphics(gpu), (GPU,))
-    for part, (open_, parts) in others.items():
-        if part not in known:
+        others.append((partial(_graphics, gpu), (GPU,)))
+    known = {rail.part for source in sources for rail in source.rails}
+    for open_, parts in others:
+        if parts[0] not in known:
             source, reason = _try(open_)
             sources += [] if source is None else [source]
-            missing |= dict.fromkeys(parts, _both(reason, why_no_chip))
+            messages = ", ".join(f'"{text}"' for text in (reason, why_no_chip) if text)
+            missing |= dict.fromkeys(parts, f"there is no counter of it that zeus can read ({messages})")
     if any(rail.part == CPU for source in sources for rail in source.rails):
         missing[DRAM] = "the processor has no counter for its memory"
     return [source for source in sources if source.rails], missing
-
-
-def _both(reason: str | None, chip: str | None) -> str:
-    """The messages of zeus as one reason."""
-    messages = ", ".join(f'"{text}"' for text in (reason, chip) if text)
-    return f"there is no counter of it that zeus can read ({messages})"
 
 
 def _try(open_: Callable[[], Source]) -> tuple[Source | None, str | None]:

@@ -18,7 +18,8 @@ from typing import Any
 import torch
 
 from ufmstar_torch import UfMStar, UfMStarConfig
-from ufmstar_torch.camera import focal_and_centre, relative_pose
+from ufmstar_torch.camera import relative_pose
+from ufmstar_torch.correspond import candidates
 from ufmstar_torch.eval.bench.floors import stage_floors
 from ufmstar_torch.eval.bench.frames import FrameSource, PosedDepth, RenderedRoom
 from ufmstar_torch.eval.bench.memory import state_memory, step_allocations
@@ -27,6 +28,7 @@ from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls, spread_of_co
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
 from ufmstar_torch.models import FastDepth
 from ufmstar_torch.models.fastdepth import MULTIPLE
+from ufmstar_torch.output import FrameStatistics
 
 _RECENT = 20  # frames over which the components in view are averaged
 POINTS = 100_000  # of UfM
@@ -88,26 +90,24 @@ def measure_step(
         warm_up: see ``frames``; three of them at 224 x 224 fill UfM's points.
         rates: of the machine (``machine_rates``), for the floors.
     """
-    start = copy.deepcopy(built)
-    start.config = built.config.replace(backend=backend)
-    whole, staged, average = copy.deepcopy(start), StagedStep(copy.deepcopy(start)), copy.deepcopy(start)
-    pointwise = UfM(UfMConfig(max_points=POINTS))
-    size = frames[0].depth.shape[-1]
+    whole, staging, average = (copy.deepcopy(built) for _ in range(3))
+    for module in (whole, staging, average):
+        module.config = built.config.replace(backend=backend)
+    staged, size = StagedStep(staging), frames[0].depth.shape[-1]
     pixels = min(_PIXELS, size**2)
     calls: dict[str, Callable[..., Any]] = {
         "step": whole,
         "staged": staged,
         "mean_uncertainty": partial(average.mean_uncertainty, pixels=pixels),
-        **({} if backend == "torch" else {"ufm": pointwise}),
+        **({} if backend == "torch" else {"ufm": UfM(UfMConfig(max_points=POINTS))}),
     }
     timed = TimedCalls(before=networks)
-    counts = FrameCounts("components", "segments", "matched", "new")
+    counts: list[dict[str, int]] = []
     for frame in timed.frames(frames, warm_up=warm_up):
-        counts.add(timed.call(calls, *frame)["step"].statistics, whole, frame)
+        counts.append(frame_counts(timed.call(calls, *frame)["step"].statistics, whole, frame))
     times = timed.times
-    pairs = [("step", name) for name in (*networks, *(["ufm"] if "ufm" in calls else []))]
-    pairs.append(("mean_uncertainty", "step"))
-    spreads = {name: spread_of_counts(values[warm_up:]) for name, values in counts.items()}
+    pairs = [*(("step", name) for name in (*networks, "ufm") if name in times.wall), ("mean_uncertainty", "step")]
+    spreads = {name: spread_of_counts([count[name] for count in counts[warm_up:]]) for name in counts[0]}
     return {
         "size": size,
         "backend": backend,
@@ -154,29 +154,19 @@ def first_steps(size: int) -> list[float]:
     return [1e-3 * ms for ms in timed.times.wall["step"]]
 
 
-class FrameCounts(dict[str, list[int]]):
-    """Statistics of the steps by name, and "in_view"."""
-
-    def __init__(self, *names: str) -> None:
-        super().__init__({name: [] for name in (*names, "in_view")})
-
-    def add(self, statistics: Any, ufm: UfMStar, frame: PosedDepth) -> None:
-        """Those of one frame, and the components in view after it."""
-        for name, values in self.items():
-            values.append(components_in_view(ufm, frame) if name == "in_view" else int(getattr(statistics, name)))
+def frame_counts(statistics: FrameStatistics, ufm: UfMStar, frame: PosedDepth) -> dict[str, int]:
+    """Statistics of one step, and "in_view", the components in view after it."""
+    counts = {name: int(getattr(statistics, name)) for name in ("components", "segments", "matched", "new")}
+    return {**counts, "in_view": components_in_view(ufm, frame)}
 
 
 def components_in_view(ufm: UfMStar, frame: PosedDepth) -> int:
     """Components beyond the near plane whose mean projects inside the frame: the candidates for a match."""
-    mixture = ufm.mixture
-    R, t = relative_pose(ufm.T_world_first, frame.T_world_cam[None])
-    mean = mixture.mean.double() @ R.mT + t[:, None]
-    fx, fy, cx, cy = focal_and_centre(frame.intrinsics)
-    x, y, z = mean.unbind(-1)
-    seen = mixture.valid & (z > ufm.config.near_plane)
-    u, v = fx * x / z + cx, fy * y / z + cy
+    pose = relative_pose(ufm.T_world_first, frame.T_world_cam[None])
     height, width = frame.depth.shape[-2:]
-    return int((seen & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)).sum())
+    in_camera = ufm.mixture.to(torch.float64).rigid(*pose)
+    seen, _, _ = candidates(in_camera, frame.intrinsics[None], (height, width), ufm.config.near_plane)
+    return int(seen.sum())
 
 
 def reference_networks(

@@ -2,52 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ufmstar_torch.eval.bench.device import device_text
 from ufmstar_torch.eval.bench.timing import STAGES
 
-_COLUMNS = ("median_ms", "p90_ms", "mean_ms", "min_ms", "cpu_median_ms", "cpu_p90_ms", "cpu_mean_ms", "cpu_min_ms")
+_SPREAD = ("median_ms", "iqr_ms", "min_ms", "cpu_median_ms")
+_FIGURES = ("median_ms", "p90_ms", "mean_ms", "min_ms")
+_CPU = tuple(f"cpu_{name}" for name in _FIGURES)
 
 
 def format_report(report: Mapping[str, Any]) -> str:
     """A table per size and backend, the long run, and the targets."""
-    machine, load = report["hardware"], report["load_average"]
-    versions = ", ".join(f"{name} {value}" for name, value in report["versions"].items() if value)
+    parts = [_machine(report), *map(_result, report["results"]), *map(_long_run, report["growth"])]
+    single = {"anchors": _anchors, "device": device_text, "peer": _peer, "against": _against, "rates": _rates}
+    parts += [lines(report[name]) for name, lines in single.items() if report[name] is not None]
+    if report["device"] is None:
+        parts.append(_targets(report["targets"]))
+    return "\n\n".join(map("\n".join, parts))
+
+
+def _machine(report: Mapping[str, Any]) -> list[str]:
+    machine, load, c = report["hardware"], report["load_average"], report["compilation"]
     lines = [
         f"{machine['cpu']}, {machine['cores']} cores, {report['settings']['threads']} threads, {machine['platform']}",
-        versions,
+        ", ".join(f"{name} {value}" for name, value in report["versions"].items() if value),
         f"load average {_number(load['before'])} before, {_number(load['after'])} after",
     ]
     if load["before"] is not None and load["before"] > machine["cores"] / 2:
         lines.append("the machine was busy: compare ratios, minima and processor times, not medians")
-    if report["compilation"] is not None:
-        c = report["compilation"]
+    if c is not None:
         lines.append(f"first steps of a process: {c['cold_s']:.1f} s compiling, {c['warm_s']:.1f} s with compiled code")
-    for result in report["results"]:
-        lines += ["", *_result(result)]
-    for run in report["growth"]:
-        lines += ["", *_long_run(run)]
-    if report["anchors"] is not None:
-        lines += ["", *_anchors(report["anchors"])]
-    if report.get("device") is not None:
-        return "\n".join([*lines, "", *device_text(report["device"])])
-    if report["peer"] is not None:
-        lines += ["", *_peer(report["peer"])]
-    if report["against"] is not None:
-        lines += ["", *_against(report["against"])]
-    rates = report["rates"]
-    lines += [
-        "",
-        f"floors: memory traffic over {rates['bytes_per_second'] / 1e9:.1f} GB/s of a copy, arithmetic over "
-        f"{rates['flops_per_second'] / 1e9:.0f} Gflop/s of a matrix product",
-    ]
-    lines += ["", f"{'target (for information)':26}{'value':>12}{'target':>12}"]
-    for row in report["targets"]:
-        verdict = {None: "not measured", True: "met", False: "missed"}[row["met"]]
-        lines.append(f"{row['name']:26}{_number(row['value']):>12}{_number(row['target']):>12}  {verdict}")
-    return "\n".join(lines)
+    return lines
 
 
 def _result(result: Mapping[str, Any]) -> list[str]:
@@ -59,7 +46,7 @@ def _result(result: Mapping[str, Any]) -> list[str]:
         f"{counts['segments']['median']:.0f} segments per frame",
         f"  {'[ms]':24}{'median':>9}{'IQR':>9}{'minimum':>9}{'CPU':>9}",
         _row("whole step", result["step"]),
-        *(_row(f"  {name}", result["stages"][name]) + _floor(result, name) for name in STAGES),
+        *(_row(f"  {n}", result["stages"][n]) + f"   floor {result['floors'][n]['ms']:.3f}" for n in STAGES),
         _row("  sum of stages", result["stages_total"]),
         *(_row(f"  kernel {name}", times) for name, times in result["kernels"].items()),
         _row(f"mean of {result['mean_uncertainty']['pixels']} pixels", result["mean_uncertainty"]),
@@ -82,12 +69,6 @@ def _result(result: Mapping[str, Any]) -> list[str]:
         f"moving average {memory['moving_average'] / 1e3:.1f} kB"
     )
     return lines
-
-
-def _floor(result: Mapping[str, Any], stage: str) -> str:
-    """What the stage cannot fall below, where it is known."""
-    floor = result["floors"].get(stage)
-    return "" if floor is None else f"   floor {floor['ms']:.3f}"
 
 
 def _runtime(result: Mapping[str, Any], network: str) -> str:
@@ -150,7 +131,7 @@ def _anchors(measured: Mapping[str, Any]) -> list[str]:
         f"{tracker['refills']:.0%} of {measured['frames']} frames",
         f"  {'[ms]':24}{'median':>9}{'90 %':>9}{'mean':>9}{'minimum':>9}{'CPU:':>6}{'median':>9}{'90 %':>9}{'mean':>9}"
         f"{'minimum':>9}",
-        *(_anchor_row(name, times) for name, times in rows.items()),
+        *(_row(name, times, _FIGURES) + " " * 6 + _cells(times, _CPU) for name, times in rows.items()),
         f"  step of {step['size']} x {step['size']} with {step['anchors']} anchors ({step['used']['mean']:.0f} used) / "
         f"without: {ratio['median']:.2f} ({ratio['q1']:.2f} to {ratio['q3']:.2f}; CPU {ratio['cpu_median']:.2f}); "
         f"{extra['total'] / 1e3:.1f} kB more state ({extra['per_slot']} B a component), "
@@ -158,14 +139,27 @@ def _anchors(measured: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _anchor_row(name: str, times: Mapping[str, Any]) -> str:
-    wall, cpu = ("".join(f"{times[c]:9.2f}" for c in half) for half in (_COLUMNS[:4], _COLUMNS[4:]))
-    return f"  {name:24}{wall}{'':6}{cpu}"
+def _rates(rates: Mapping[str, float]) -> list[str]:
+    return [
+        f"floors: memory traffic over {rates['bytes_per_second'] / 1e9:.1f} GB/s of a copy, arithmetic over "
+        f"{rates['flops_per_second'] / 1e9:.0f} Gflop/s of a matrix product",
+    ]
 
 
-def _row(name: str, times: Mapping[str, Any]) -> str:
-    cpu = f"{times['cpu_median_ms']:9.2f}" if "cpu_median_ms" in times else ""
-    return f"  {name:24}{times['median_ms']:9.2f}{times['iqr_ms']:9.2f}{times['min_ms']:9.2f}{cpu}"
+def _targets(targets: Sequence[Mapping[str, Any]]) -> list[str]:
+    lines = [f"{'target (for information)':26}{'value':>12}{'target':>12}"]
+    for row in targets:
+        verdict = {None: "not measured", True: "met", False: "missed"}[row["met"]]
+        lines.append(f"{row['name']:26}{_number(row['value']):>12}{_number(row['target']):>12}  {verdict}")
+    return lines
+
+
+def _row(name: str, times: Mapping[str, Any], columns: Sequence[str] = _SPREAD) -> str:
+    return f"  {name:24}" + _cells(times, columns)
+
+
+def _cells(times: Mapping[str, Any], columns: Sequence[str]) -> str:
+    return "".join(f"{times[column]:9.2f}" for column in columns if column in times)
 
 
 def _number(value: float | None) -> str:

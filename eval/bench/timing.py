@@ -7,10 +7,9 @@ threads (threads that wait by spinning included), without what other processes t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
-from importlib.util import find_spec
 from itertools import cycle
 from typing import Any, TypeVar
 
@@ -22,6 +21,7 @@ from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synch
 from ufmstar_torch.eval.results.machine import available_cores
 
 F = TypeVar("F")
+Name = TypeVar("Name", bound=Hashable)
 
 # Every moment of a step belongs to one of these; see ``ufmstar_torch.step.StepObserver``.
 STAGES = ("check", "segment", "correspond", "fuse", "append", "regress", "average")
@@ -31,7 +31,7 @@ _CPU = torch.device("cpu")
 
 @contextmanager
 def pinned_threads(count: int, *, opencv: bool = False) -> Iterator[None]:
-    """Set the number of threads of torch and numba (where it is installed); restore the previous numbers afterwards.
+    """Set the number of threads of torch and numba; restore the previous numbers afterwards.
 
     Args:
         count: threads of each.
@@ -43,13 +43,14 @@ def pinned_threads(count: int, *, opencv: bool = False) -> Iterator[None]:
     """
     if count < 1:
         raise ValueError(f"threads must be at least 1, got {count}")
+    numba: Any = import_module("numba")
+    if count > numba.config.NUMBA_NUM_THREADS:
+        raise ValueError(f"threads must be at most numba's {numba.config.NUMBA_NUM_THREADS}, got {count}")
     # torch last: where numba's loops run on OpenMP, setting its number sets torch's as well.
-    libraries: list[tuple[Callable[[], int], Callable[[int], Any]]] = [(torch.get_num_threads, torch.set_num_threads)]
-    if find_spec("numba") is not None:
-        numba: Any = import_module("numba")
-        if count > numba.config.NUMBA_NUM_THREADS:
-            raise ValueError(f"threads must be at most numba's {numba.config.NUMBA_NUM_THREADS}, got {count}")
-        libraries.append((numba.get_num_threads, numba.set_num_threads))
+    libraries: list[tuple[Callable[[], int], Callable[[int], Any]]] = [
+        (torch.get_num_threads, torch.set_num_threads),
+        (numba.get_num_threads, numba.set_num_threads),
+    ]
     if opencv:
         cv2: Any = import_module("cv2")
         libraries.append((cv2.getNumThreads, cv2.setNumThreads))
@@ -65,8 +66,7 @@ def pinned_threads(count: int, *, opencv: bool = False) -> Iterator[None]:
 
 def most_threads() -> int:
     """The cores of this process, or fewer where numba may start fewer threads (``NUMBA_NUM_THREADS``)."""
-    cores = available_cores()
-    return cores if find_spec("numba") is None else min(cores, import_module("numba").config.NUMBA_NUM_THREADS)
+    return min(available_cores(), import_module("numba").config.NUMBA_NUM_THREADS)
 
 
 class TimedCalls:
@@ -92,7 +92,9 @@ class TimedCalls:
             yield frame
         self.times.drop(warm_up)
 
-    def call(self, calls: Mapping[str, Callable[..., Any]], *args: Any, device: torch.device = _CPU) -> dict[str, Any]:
+    def call(
+        self, calls: Mapping[Name, Callable[..., Any]], *args: Any, device: torch.device = _CPU
+    ) -> dict[Name, Any]:
         """Make every call on the current frame; the results by name.
 
         Args:
@@ -106,11 +108,9 @@ class TimedCalls:
             synchronize(device)
             return result
 
-        untimed = set(self._before)
+        untimed, order = set(self._before), list(calls)[:: -1 if self._number % 2 else 1]
         results = {}
-        for name, previous in zip(
-            list(calls)[:: -1 if self._number % 2 else 1], cycle(self._before or [""]), strict=False
-        ):
+        for name, previous in zip(order, cycle(self._before or [""]), strict=False):
             if previous in untimed:
                 self.times.time(previous, finished, self._before[previous])
                 untimed.discard(previous)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from ufmstar_torch.eval.bench.benchmark import BenchSettings
+from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.eval.commands.options import UsageError, parse
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -56,10 +56,10 @@ def synchronize(device: torch.device) -> None:
 class CallTimes:
     """Wall-clock and processor times of calls by name [ms]."""
 
-    wall: dict[str, list[float]] = field(default_factory=dict)
-    cpu: dict[str, list[float]] = field(default_factory=dict)
+    wall: dict[Hashable, list[float]] = field(default_factory=dict)
+    cpu: dict[Hashable, list[float]] = field(default_factory=dict)
 
-    def time(self, name: str, function: Callable[..., Any], *args: Any) -> Any:
+    def time(self, name: Hashable, function: Callable[..., Any], *args: Any) -> Any:
         """Call ``function(*args)``, keep its times under ``name``, and return what it returned."""
         cpu, wall = time.process_time(), time.perf_counter()
         result = function(*args)

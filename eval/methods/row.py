@@ -23,10 +23,8 @@ class Row:
 
     def __post_init__(self) -> None:
         method, setting = self.method, self.setting
-        of_ufm_star = {", ".join(setting.of_ufm_star): setting.of_ufm_star, "anchors": setting.anchors}
-        for names, given in (of_ufm_star | {"recalibration": setting.recalibration}).items():
-            if given and method.fusion != UFM_STAR:
-                raise ValueError(f"row {method.name}: only UfM* has {names}")
+        if setting.of_ufm_star and method.fusion != UFM_STAR:
+            raise ValueError(f"row {method.name}: only UfM* has {', '.join(setting.of_ufm_star)}")
         if setting.aleatoric_in_h and not method.uses_aleatoric:
             raise ValueError(f"row {method.name}: aleatoric_in_h needs a network that predicts an aleatoric variance")
         try:

@@ -8,14 +8,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
+from functools import reduce
+from operator import getitem
 from types import MappingProxyType
 from typing import Any
 
 from ufmstar_torch.anchors.landmarks import DENSE, FILE_TYPES
 from ufmstar_torch.checked import Checked, choice, number
 from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.stateful import flat
 
 TRACKED, TRUTH = "tracked", "truth"
 DEFAULTS, PAPER = "default", "paper"
@@ -119,8 +122,8 @@ class Setting(Checked):
     @property
     def of_ufm_star(self) -> tuple[str, ...]:
         """Names of what is changed of UfM*, which other methods do without."""
-        own = ("ufm_preset",) if self.ufm_preset != DEFAULTS else ()
-        return (*self.overrides, *own, *(("aleatoric_in_h",) if self.aleatoric_in_h else ()))
+        own = ("ufm_preset", "aleatoric_in_h", "anchors", "recalibration")
+        return (*self.overrides, *(name for name in own if getattr(self, name) != getattr(DEFAULT, name)))
 
     @property
     def draws(self) -> bool:
@@ -164,12 +167,6 @@ def setting_from(values: Mapping[str, Any]) -> Setting:
     return setting
 
 
-def value_of(setting: Mapping[str, Any], name: str) -> Any:
-    """The value that a setting (``Setting.to_dict``, as in a record) gives a name, UfM*'s own if it has none. Raises
-    ValueError: an unknown name."""
-    return setting[name] if name in setting else default_of(name, setting.get("ufm_preset", DEFAULTS))
-
-
 def default_of(name: str, preset: str = DEFAULTS) -> Any:
     """The value that a row has where nothing is changed.
 
@@ -182,34 +179,27 @@ def default_of(name: str, preset: str = DEFAULTS) -> Any:
     """
     if name in _OWN:
         return getattr(DEFAULT, name)
-    value: Any = _start(preset)
-    for part in name.split("."):
-        if not is_dataclass(value) or part not in {f.name for f in fields(value)}:
-            known = [own for own in _OWN if own != "seed"]
-            near = get_close_matches(name, [*known, *_names(_start(preset))], n=1)
-            meant = f"; did you mean {near[0]}?" if near else ""
-            raise ValueError(
-                f"no setting is called {name!r}: expected {', '.join(known)}, or UfM*'s own, as ema_alpha{meant}"
-            )
-        value = getattr(value, part)
-    if is_dataclass(value):
+    values = flat(_start(preset).to_dict())
+    if name in values:
+        return values[name]
+    if any(other.startswith(f"{name}.") for other in values):
         raise ValueError(f"setting {name!r} is a group: name one of its values, as {name}.min_pixels")
-    return value
+    known = [own for own in _OWN if own != "seed"]
+    near = get_close_matches(name, [*known, *values], n=1)
+    meant = f"; did you mean {near[0]}?" if near else ""
+    raise ValueError(f"no setting is called {name!r}: expected {', '.join(known)}, or UfM*'s own, as ema_alpha{meant}")
 
 
 def configured(setting: Setting) -> UfMStarConfig:
     """UfM*'s configuration under a setting. Raises ValueError: an unknown name, or a value that it does not take."""
-    nested: dict[str, Any] = {}
+    values = _start(setting.ufm_preset).to_dict() | {"anchored": bool(setting.anchors), "posterior": setting.posterior}
+    if setting.aleatoric_in_h:
+        values |= {"features": 2, "add_aleatoric": False}
     for name, value in setting.overrides.items():
         default_of(name)
-        group, _, field = name.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[field] = value
-    config = _start(setting.ufm_preset).replace(anchored=bool(setting.anchors), posterior=setting.posterior)
-    if setting.aleatoric_in_h:
-        config = config.replace(features=2, add_aleatoric=False)
-    groups = {name: value for name, value in nested.items() if isinstance(value, dict)}
-    changed = {group: replace(getattr(config, group), **values) for group, values in groups.items()}
-    return config.replace(**nested | changed)
+        *groups, own = name.split(".")
+        reduce(getitem, groups, values)[own] = value
+    return UfMStarConfig.from_dict(values)
 
 
 def _start(preset: str) -> UfMStarConfig:
@@ -217,12 +207,3 @@ def _start(preset: str) -> UfMStarConfig:
     if preset not in (DEFAULTS, PAPER):
         raise ValueError(f"ufm_preset must be {DEFAULTS} or {PAPER}, got {preset!r}")
     return UfMStarConfig.paper() if preset == PAPER else UfMStarConfig()
-
-
-def _names(config: Any, prefix: str = "") -> list[str]:
-    """The dotted names of all fields of a settings class that hold a value."""
-    names: list[str] = []
-    for f in fields(config):
-        value = getattr(config, f.name)
-        names += _names(value, f"{prefix}{f.name}.") if is_dataclass(value) else [f"{prefix}{f.name}"]
-    return names

@@ -41,18 +41,11 @@ from ufmstar_torch.eval.methods.setting import DEFAULTS, default_of, setting_fro
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _SHIPPED = files("ufmstar_torch.eval.methods") / "suites"
 _HINTS = ("datasets", "sequences", "network", "size", "efficiency")
-_KEYS: dict[str, type] = {
-    "name": str,
-    "title": str,
-    "base": str,
-    "bases": list,
-    "include": list,
-    "sweep": list,
-    "rows": list,
-}
-_KEYS |= {"datasets": list, "sequences": int, "network": str, "size": list, "efficiency": bool}
-_ROW_KEYS: dict[str, type] = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict}
-_ROW_KEYS |= {"label": str}
+_KEYS = {
+    "name": str, "title": str, "base": str, "bases": list, "include": list, "sweep": list, "rows": list,
+    "datasets": list, "sequences": int, "network": str, "size": list, "efficiency": bool,
+}  # fmt: skip
+_ROW_KEYS = {"methods": list, "bases": list, "setting": dict, "each": dict, "multiples": dict, "label": str}
 
 
 @dataclass(frozen=True)
@@ -131,8 +124,8 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
             TOML, an unknown key, a value of the wrong kind, or an impossible row; the message names the file.
     """
     _file(name)
-    if base is not None and base not in BASES:
-        raise ValueError(f"--base must be one of {', '.join(BASES)}, got {base!r}")
+    if base is not None:
+        _require_base(base, "--base")
     try:
         values = _read(name)
         if base is not None and "base" not in values:
@@ -141,10 +134,10 @@ def suite_named(name: str, base: str | None = None, preset: str | None = None) -
         own = Path(name).stem
         if base is not None and not rows:
             raise ValueError(f"the suite has no rows of {base}")
-        named: dict[str, Any] = {"name": values.get("name", own), "title": values.get("title", own), "rows": rows}
-        hints: dict[str, Any] = {key: values[key] for key in _HINTS if key in values}
-        hints |= {key: tuple(value) for key, value in hints.items() if isinstance(value, list)}
-        return Suite(**named, sweep=tuple(dict.fromkeys(_sweep(values))), **hints)
+        given = {key: value for key, value in values.items() if key in _HINTS}
+        hints: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in given.items()}
+        sweep = tuple(dict.fromkeys(_sweep(values)))
+        return Suite(values.get("name", own), values.get("title", own), rows, sweep, **hints)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{name}: {error}") from error
 
@@ -165,8 +158,7 @@ def _read(name: str) -> dict[str, Any]:
     for key in ("bases", "include", "sweep", "datasets"):
         _words(values, key)
     for base in (*values.get("bases", []), values.get("base", "ensemble")):
-        if base not in BASES:
-            raise ValueError(f"base must be one of {', '.join(BASES)}, got {base!r}")
+        _require_base(base)
     return values
 
 
@@ -214,6 +206,11 @@ def _expanded(part: Any, base: str | None, preset: str | None) -> Iterator[Row]:
         for method in map(Method.parse, methods):
             started = {"ufm_preset": preset} if preset is not None and method.fusion == UFM_STAR else {}
             yield Row(method, setting_from(setting | started), label.replace("{method}", method.name))
+
+
+def _require_base(base: str, name: str = "base") -> None:
+    if base not in BASES:
+        raise ValueError(f"{name} must be one of {', '.join(BASES)}, got {base!r}")
 
 
 def _check(values: Any, kinds: Mapping[str, type], where: str) -> None:

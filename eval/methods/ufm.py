@@ -7,7 +7,7 @@ hundred Gaussians, UfM keeps every pixel it has ever seen as a point: 40 bytes e
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ufmstar_torch.camera import relative_pose, rotation_deviation
 from ufmstar_torch.checked import Checked, choice, number
-from ufmstar_torch.eval.methods.ufm_cloud import MOMENTS, Cloud, Taken, View, take_in
+from ufmstar_torch.eval.methods.ufm_cloud import MOMENTS, Cloud, View, take_in
 from ufmstar_torch.frame import FrameInput, check_frame, raise_faults
 from ufmstar_torch.stateful import StatefulModule, full_precision, outliving
 
@@ -224,7 +224,17 @@ class UfM(StatefulModule):
             self._store(kept)
 
     def _require_state(self, state: Mapping[str, Tensor]) -> None:
-        require_state(state, self.config.max_points)
+        """Also that no stream has more points than ``max_points``, and every covariance is one that points can have."""
+        n, b = len(state["moments"]) if state["moments"].dim() else 0, state["points"].numel()
+        shapes = {
+            "moments": (n, MOMENTS), "count": (n,), "points": (b,), "T_world_first": (b, 4, 4), "started": (b,),
+            "frames": (b,), "skipped": (b,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            if (given := tuple(state[name].shape)) != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {given}")
+        if state["moments"].device.type != "meta":
+            _require_values(state, self.config.max_points)
 
     def _advance(self, frame: FrameInput) -> tuple[Tensor, UfMStatistics]:
         """One frame, whose state is stored when all streams are through; variance [B, H, W]."""
@@ -233,35 +243,42 @@ class UfM(StatefulModule):
         first = torch.where((fine & ~state["started"])[:, None, None], frame.T_world_cam, state["T_world_first"])
         R, t = relative_pose(frame.T_world_cam, first)
         s2 = self._observation_variance(frame)
-        taken = []
-        for b, (cloud, used) in enumerate(zip(clouds, fine.tolist(), strict=True)):
-            if used:
-                view = View(frame.depth[b], s2[b], frame.valid[b], frame.intrinsics[b], R[b], t[b])
-                taken.append(take_in(cloud, view, self.config.max_points))
-            else:
-                none = torch.zeros((), dtype=torch.int64, device=s2.device)
-                taken.append(Taken(cloud, torch.full_like(s2[b], torch.nan), none, none, none))
-        updated = _joined([one.cloud for one in taken])
-        statistics = _statistics(taken, updated["points"], frame)
+        # Of a stream at fault no pixel is valid: nothing is taken in.
+        given = zip(clouds, frame.depth, s2, frame.valid, frame.intrinsics, R, t, strict=True)
+        taken = [take_in(cloud, View(*view), self.config.max_points) for cloud, *view in given]
+
+        def each(values: Iterable[int]) -> Tensor:
+            return torch.tensor(list(values), device=s2.device)
+
+        points = each(len(one.cloud.count) for one in taken)
         self._store(
             {
-                **updated,
+                "moments": _joined([one.cloud.moments for one in taken]),
+                "count": _joined([one.cloud.count for one in taken]),
+                "points": points,
                 "T_world_first": first,
                 "started": state["started"] | fine,
                 "frames": state["frames"] + fine,
                 "skipped": state["skipped"] + ~fine,
             }
         )
+        statistics = UfMStatistics(
+            points=points,
+            memory=points * taken[0].cloud.bytes_per_point,
+            fused=each(one.fused for one in taken),
+            new=each(one.new for one in taken),
+            dropped=each(one.dropped for one in taken),
+            valid_pixels=frame.valid.sum((1, 2)),
+            fault=frame.fault,
+            rotation_deviation=frame.rotation_deviation,
+        )
         return torch.stack([one.variance for one in taken]), statistics
 
     def _observation_variance(self, frame: FrameInput) -> Tensor:
         """[B, H, W] s^2 of one observation [m^2]: what the network states, 0 if it states nothing."""
-        s2 = torch.zeros_like(frame.depth)
-        if frame.aleatoric is not None and self.config.add_aleatoric:
-            s2 = s2 + frame.aleatoric.detach()
-        if frame.epistemic is not None and self.config.add_epistemic:
-            s2 = s2 + frame.epistemic.detach()
-        return s2
+        both = [(frame.aleatoric, self.config.add_aleatoric), (frame.epistemic, self.config.add_epistemic)]
+        counted = [value.detach() for value, counts in both if value is not None and counts]
+        return sum(counted, start=torch.zeros_like(frame.depth))
 
     def _streams(self, frame: FrameInput) -> tuple[list[Cloud], dict[str, Tensor]]:
         """The clouds and the rest of the state, fresh at the start. Raises ValueError: the frame has another number of
@@ -281,32 +298,16 @@ class UfM(StatefulModule):
         return f"streams={len(self.points)}, points={self.points.tolist()}, max_points={self.config.max_points}"
 
 
-def require_state(state: Mapping[str, Tensor], max_points: int | None) -> None:
-    """Check tensors that come from elsewhere, a checkpoint say, before they become the state of UfM.
-
-    Raises:
-        ValueError: shapes that do not fit each other; values that are not finite or out of their range; covariances
-            that no points have; more points of a stream than ``max_points``.
-    """
-    if state["moments"].dim() != 2 or state["points"].dim() != 1:
-        raise ValueError(f"moments must be [N, {MOMENTS}] and points [B]")
-    n, b = len(state["moments"]), len(state["points"])
-    shapes = {
-        "moments": (n, MOMENTS), "count": (n,), "points": (b,), "T_world_first": (b, 4, 4), "started": (b,),
-        "frames": (b,), "skipped": (b,),
-    }  # fmt: skip
-    for name, shape in shapes.items():
-        if (given := tuple(state[name].shape)) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {given}")
-    if state["moments"].device.type == "meta":
-        return
+def _require_values(state: Mapping[str, Tensor], max_points: int | None) -> None:
+    """Raise ValueError for values of a state that are not finite or out of their range."""
+    n, largest = len(state["moments"]), max(state["points"].tolist(), default=0)
     for name in ("points", "frames", "skipped"):
         if bool((state[name] < 0).any()):
             raise ValueError(f"{name} holds negative values")
     if int(state["points"].sum()) != n:
         raise ValueError(f"points must add up to the {n} rows of moments, got {int(state['points'].sum())}")
-    if max_points is not None and b and int(state["points"].max()) > max_points:
-        raise ValueError(f"points: {int(state['points'].max())} exceed max_points = {max_points}")
+    if max_points is not None and largest > max_points:
+        raise ValueError(f"points: {largest} exceed max_points = {max_points}")
     if bool((state["count"] < 1).any()):
         raise ValueError("count must be at least 1")
     for name in ("moments", "T_world_first"):
@@ -318,8 +319,7 @@ def require_state(state: Mapping[str, Tensor], max_points: int | None) -> None:
     bound = (1 + _ROUNDING) * (variance[:, :, None] * variance[:, None, :]).sqrt()
     if bool((variance < 0).any()) or bool((covariance.abs() > bound + torch.finfo(torch.float32).tiny).any()):
         raise ValueError("moments hold covariances that are none")
-    R = state["T_world_first"][:, :3, :3]
-    if b and float(rotation_deviation(R).max()) > 1e-6:
+    if bool((rotation_deviation(state["T_world_first"][:, :3, :3]) > 1e-6).any()):
         raise ValueError("T_world_first holds matrices that are not rigid")
 
 
@@ -337,24 +337,6 @@ def _empty(streams: int, dtype: torch.dtype, device: torch.device) -> dict[str, 
     }
 
 
-def _joined(clouds: Sequence[Cloud]) -> dict[str, Tensor]:
-    """Clouds as buffers: all points behind each other, and how many each stream has."""
-    device = clouds[0].count.device
-    return {
-        "moments": torch.cat([cloud.moments for cloud in clouds]) if len(clouds) > 1 else clouds[0].moments,
-        "count": torch.cat([cloud.count for cloud in clouds]) if len(clouds) > 1 else clouds[0].count,
-        "points": torch.tensor([len(cloud.count) for cloud in clouds], device=device),
-    }
-
-
-def _statistics(taken: Sequence[Taken], points: Tensor, frame: FrameInput) -> UfMStatistics:
-    return UfMStatistics(
-        points=points,
-        memory=points * taken[0].cloud.bytes_per_point,
-        fused=torch.stack([one.fused for one in taken]),
-        new=torch.stack([one.new for one in taken]),
-        dropped=torch.stack([one.dropped for one in taken]),
-        valid_pixels=frame.valid.sum((1, 2)),
-        fault=frame.fault,
-        rotation_deviation=frame.rotation_deviation,
-    )
+def _joined(parts: list[Tensor]) -> Tensor:
+    """The points of all streams behind each other; of a single one without a copy."""
+    return torch.cat(parts) if len(parts) > 1 else parts[0]

@@ -65,9 +65,9 @@ class Taken:
 
     cloud: Cloud  # afterwards
     variance: Tensor  # [H, W] [m^2], NaN where not valid
-    fused: Tensor  # [] points that met a valid pixel
-    new: Tensor  # [] pixels appended
-    dropped: Tensor  # [] points pruned
+    fused: int  # points that met a valid pixel
+    new: int  # pixels appended
+    dropped: int  # points pruned
 
 
 def take_in(cloud: Cloud, view: View, max_points: int | None) -> Taken:
@@ -96,9 +96,7 @@ def take_in(cloud: Cloud, view: View, max_points: int | None) -> Taken:
     keep = _kept(torch.cat([seen, torch.ones_like(fresh, dtype=torch.bool)]), max_points)
     if keep is not None:
         cloud = Cloud(cloud.moments.index_select(0, keep), cloud.count.index_select(0, keep))
-    before = len(seen) + len(fresh)
-    counts = (torch.tensor(n, device=pixel.device) for n in (len(met), len(fresh), before - len(cloud.count)))
-    return Taken(cloud, variance, *counts)
+    return Taken(cloud, variance, len(met), len(fresh), len(seen) + len(fresh) - len(cloud.count))
 
 
 def _landing(cloud: Cloud, view: View) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixels import Pixels, require_variance, select_pixels
+from ufmstar_torch.eval.metrics.pixels import Pixels
 
 
 def interval_confidence(depth: Tensor, variance: Tensor, delta: float) -> Tensor:
@@ -22,20 +22,6 @@ def interval_confidence(depth: Tensor, variance: Tensor, delta: float) -> Tensor
     sigma = torch.where(positive, variance, torch.ones_like(variance)).sqrt()
     mass = torch.erf(delta * depth.abs() / (math.sqrt(2) * sigma))
     return torch.where(positive, mass, torch.ones_like(mass))
-
-
-def _ece_delta_update(p: Pixels, delta: float, bins: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Per confidence bin [B]: sum of the confidence, accurate pixels, pixels."""
-    confidence = interval_confidence(p.depth, p.variance, delta)
-    accurate = (p.target - p.depth).abs() <= delta * p.depth.abs()
-    # Bin b is [b/B, (b+1)/B); a confidence of exactly 1 belongs to the last.
-    index = (confidence * bins).long().clamp(max=bins - 1)
-    pixels = torch.bincount(index, minlength=bins)
-    return (
-        torch.bincount(index, weights=confidence, minlength=bins),
-        torch.bincount(index[accurate], minlength=bins),
-        pixels,
-    )
 
 
 class ECEDelta(SumMetric):
@@ -56,23 +42,26 @@ class ECEDelta(SumMetric):
         bins: B; the paper names none, 10 here; the authors' 100.
     """
 
-    confidence: Tensor
-    accurate: Tensor
-    pixels: Tensor
+    OF_VARIANCE = "ECE_delta"
 
     def __init__(self, delta: float = 0.25, bins: int = 10, **kwargs: Any) -> None:
         if not 0 < delta < 1 or bins < 1:
             raise ValueError(f"delta must lie in (0, 1) and bins be >= 1, got delta={delta}, bins={bins}")
         super().__init__({"delta": delta, "bins": bins}, **kwargs)
         self.delta, self.bins = delta, bins
-        self.add_sum("confidence", bins)
-        self.add_count("accurate", bins)
-        self.add_count("pixels", bins)
+        self.add_sums("confidence", shape=(bins,))
+        self.add_counts("accurate", "pixels", shape=(bins,))
 
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        p = select_pixels(depth, require_variance(variance, "ECE_delta"), target, valid)
-        confidence, accurate, pixels = _ece_delta_update(p, self.delta, self.bins)
-        self.add(confidence=confidence, accurate=accurate, pixels=pixels)
+    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
+        confidence = interval_confidence(p.depth, p.variance, self.delta)
+        accurate = (p.target - p.depth).abs() <= self.delta * p.depth.abs()
+        # Bin b is [b/B, (b+1)/B); a confidence of exactly 1 belongs to the last.
+        index = (confidence * self.bins).long().clamp(max=self.bins - 1)
+        return {
+            "confidence": torch.bincount(index, weights=confidence, minlength=self.bins),
+            "accurate": torch.bincount(index[accurate], minlength=self.bins),
+            "pixels": torch.bincount(index, minlength=self.bins),
+        }
 
     def compute(self) -> dict[str, Tensor]:
         total = self.pixels.sum()
@@ -91,19 +80,6 @@ def quantile_levels(bins: int) -> Tensor:
     return (torch.arange(bins, dtype=torch.float64) + 0.5) / bins
 
 
-def _ece_quantile_update(p: Pixels, thresholds: Tensor) -> Tensor:
-    """[B] pixels with g at or below d + sqrt(v) thresholds[b], thresholds rising."""
-    positive = p.variance > 0
-    sigma = torch.where(positive, p.variance, torch.ones_like(p.variance)).sqrt()
-    residual = p.target - p.depth
-    # v = 0: every quantile is d itself, so g is below all of them or above all.
-    side = torch.where(residual <= 0, -math.inf, math.inf).to(residual)
-    z = torch.where(positive, residual / sigma, side)
-    # right=False finds the first b with z <= thresholds[b]: from there on g is at or below.
-    first = torch.bucketize(z, thresholds, right=False)
-    return torch.bincount(first, minlength=thresholds.numel() + 1).cumsum(0)[:-1]
-
-
 class ECEQuantile(SumMetric):
     """ECE_q = 1/B sum_b |obs(q_b) - q_b| and the quantile calibration curve.
 
@@ -116,8 +92,7 @@ class ECEQuantile(SumMetric):
             authors' 0, .01, ..., 1, of which the ends are right by definition.
     """
 
-    at_or_below: Tensor
-    pixels: Tensor
+    OF_VARIANCE = "ECE_q"
 
     def __init__(self, levels: Sequence[float] | None = None, **kwargs: Any) -> None:
         q = quantile_levels(10) if levels is None else torch.tensor(list(levels), dtype=torch.float64)
@@ -125,13 +100,20 @@ class ECEQuantile(SumMetric):
             raise ValueError(f"levels must rise within [0, 1], got {levels}")
         super().__init__({"levels": q.tolist()}, **kwargs)
         self.levels, self.thresholds = q, torch.special.ndtri(q)
-        self.add_count("at_or_below", q.numel())
-        self.add_count("pixels")
+        self.add_counts("at_or_below", shape=(q.numel(),))
+        self.add_counts("pixels")
 
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        p = select_pixels(depth, require_variance(variance, "ECE_q"), target, valid)
-        counts = _ece_quantile_update(p, self.thresholds.to(p.depth.device))
-        self.add(at_or_below=counts, pixels=torch.tensor(p.depth.numel()))
+    def sums_of(self, p: Pixels) -> dict[str, Tensor | float]:
+        positive = p.variance > 0
+        sigma = torch.where(positive, p.variance, torch.ones_like(p.variance)).sqrt()
+        residual = p.target - p.depth
+        # v = 0: every quantile is d itself, so g is below all of them or above all.
+        side = torch.where(residual <= 0, -math.inf, math.inf).to(residual)
+        z = torch.where(positive, residual / sigma, side)
+        # right=False: the first b with z <= thresholds[b]; from there on g is at or below d + sqrt(v) thresholds[b].
+        first = torch.bucketize(z, self.thresholds.to(z.device), right=False)
+        at_or_below = torch.bincount(first, minlength=self.thresholds.numel() + 1).cumsum(0)[:-1]
+        return {"at_or_below": at_or_below, "pixels": len(z)}
 
     def compute(self) -> dict[str, Tensor]:
         levels = self.levels.to(self.pixels.device)

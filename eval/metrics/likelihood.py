@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric, share
-from ufmstar_torch.eval.metrics.pixels import Pixels, check_maps, require_variance, select_pixels
+from ufmstar_torch.eval.metrics.pixels import Pixels, check_maps
 
 
 def gaussian_nll(depth: Tensor, variance: Tensor, target: Tensor) -> Tensor:
@@ -22,13 +22,6 @@ def gaussian_entropy(variance: Tensor) -> Tensor:
     return 0.5 * (2 * math.pi * math.e * variance).log()
 
 
-def _nll_update(p: Pixels) -> tuple[Tensor, Tensor]:
-    """[] sum of the NLL over v > 0, and [] how many these are."""
-    positive = p.variance > 0
-    nll = gaussian_nll(p.depth[positive], p.variance[positive], p.target[positive])
-    return nll.sum(), positive.sum()
-
-
 class NLL(SumMetric):
     """Mean negative log-likelihood over the pixels with valid ground truth and v > 0.
 
@@ -37,31 +30,21 @@ class NLL(SumMetric):
     beside the NLL, since a method may leave out its worst pixels.
     """
 
-    total: Tensor
-    pixels: Tensor
-    with_truth: Tensor
+    OF_VARIANCE = "NLL"
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.add_sum("total")
-        self.add_count("pixels")
-        self.add_count("with_truth")
+        self.add_sums("total")
+        self.add_counts("pixels", "with_truth")
 
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        p = select_pixels(depth, require_variance(variance, "NLL"), target, valid)
-        total, pixels = _nll_update(p)
-        self.add(total=total, pixels=pixels, with_truth=p.with_truth)
+    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
+        positive = p.variance > 0
+        nll = gaussian_nll(p.depth[positive], p.variance[positive], p.target[positive])
+        return {"total": nll.sum(), "pixels": positive.sum(), "with_truth": p.with_truth}
 
     def compute(self) -> dict[str, Tensor]:
         left_out = share(self.with_truth - self.pixels, self.with_truth)
         return {"nll": share(self.total, self.pixels), "nll_left_out_share": left_out}
-
-
-def _entropy_update(variance: Tensor, edges: Tensor) -> Tensor:
-    """[bins + 2] counts of the entropy: below edges[0], in [edges[i], edges[i+1]), at or above edges[-1]."""
-    # v = 0 has the entropy -inf, which falls below the range by itself.
-    index = torch.bucketize(gaussian_entropy(variance), edges, right=True)
-    return torch.bincount(index, minlength=edges.numel() + 1)
 
 
 class EntropyHistogram(SumMetric):
@@ -76,28 +59,28 @@ class EntropyHistogram(SumMetric):
         high: [nats].
     """
 
-    counts: Tensor
-    total: Tensor
-    pixels: Tensor
+    OF_VARIANCE = "the entropy"
 
     def __init__(self, bins: int = 64, low: float = -8.0, high: float = 8.0, **kwargs: Any) -> None:
         if bins < 1 or not low < high:
             raise ValueError(f"bins must be >= 1 and low < high, got bins={bins}, low={low}, high={high}")
         super().__init__({"bins": bins, "low": low, "high": high}, **kwargs)
         self.edges = torch.linspace(low, high, bins + 1, dtype=torch.float64)
-        self.add_count("counts", bins + 2)
-        self.add_sum("total")
-        self.add_count("pixels")
+        self.add_counts("counts", shape=(bins + 2,))
+        self.add_sums("total")
+        self.add_counts("pixels")
 
     def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        variance = require_variance(variance, "the entropy")
+        """See :meth:`SumMetric.update`; pixels without ground truth count too."""
         check_maps(depth, variance, target, valid)
-        predicted = torch.isfinite(depth) & torch.isfinite(variance) & (variance >= 0)
-        v = variance.detach()[predicted if valid is None else predicted & valid].double()
-        positive = v[v > 0]
-        counts = _entropy_update(v, self.edges.to(v.device))
-        total = gaussian_entropy(positive).sum()
-        self.add(counts=counts, total=total, pixels=torch.tensor(positive.numel()))
+        super().update(depth, variance, torch.ones_like(depth), valid)
+
+    def sums_of(self, p: Pixels) -> dict[str, Tensor | float]:
+        positive = p.variance[p.variance > 0]
+        # Bin b is [edges[b - 1], edges[b]); v = 0 has the entropy -inf, which falls below the range by itself.
+        index = torch.bucketize(gaussian_entropy(p.variance), self.edges.to(p.variance.device), right=True)
+        counts = torch.bincount(index, minlength=self.edges.numel() + 1)
+        return {"counts": counts, "total": gaussian_entropy(positive).sum(), "pixels": len(positive)}
 
     def compute(self) -> dict[str, Tensor]:
         return {

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,35 +48,29 @@ def add_in_one_pass(
         return
     v = flat(require_variance(variance, "the negative log-likelihood"))
     interval, quantile, entropy = metrics["ECEDelta"], metrics["ECEQuantile"], metrics["EntropyHistogram"]
-    sums = [_copies(interval, "confidence", "accurate", "pixels"), _copies(quantile, "at_or_below")]
-    sums.append(_copies(entropy, "counts"))
-    thresholds, edges = quantile.thresholds.numpy(), entropy.edges.numpy()
     judged, nll, likely, total, spread = uncertainty_sums(
-        d, v, g, use, interval.delta, thresholds, edges, tuple(sums[0].values()), *sums[1].values(), *sums[2].values()
-    )
+        d, v, g, use, interval.delta, quantile.thresholds.numpy(), entropy.edges.numpy(),
+        _exchanged(interval, "confidence", "accurate", "pixels"), *_exchanged(quantile, "at_or_below"),
+        *_exchanged(entropy, "counts"),
+    )  # fmt: skip
     metrics["NLL"].add(total=nll, pixels=likely, with_truth=with_truth)
     quantile.add(pixels=judged)
     entropy.add(total=total, pixels=spread)
-    for metric, changed in zip((interval, quantile, entropy), sums, strict=True):
-        _exchange(metric, changed)
     if "Sparsification" not in metrics:
         return
-    sparse, spearman = metrics["Sparsification"], metrics["SpearmanCorrelation"]
-    by = [_copies(sparse, "count", "squared", "relative"), _copies(sparse, "count_squared", "sum_squared")]
-    by += [_copies(sparse, "count_relative", "sum_relative"), _copies(spearman, "joint")]
-    ranking_sums(d, v, g, use, *(tuple(names.values()) for names in by[:3]), by[3]["joint"])
-    for metric, changed in zip((sparse, sparse, sparse, spearman), by, strict=True):
-        _exchange(metric, changed)
+    by = partial(_exchanged, metrics["Sparsification"])
+    ranking_sums(
+        d, v, g, use, by("count", "squared", "relative"), by("count_squared", "sum_squared"),
+        by("count_relative", "sum_relative"), *_exchanged(metrics["SpearmanCorrelation"], "joint"),
+    )  # fmt: skip
 
 
-def _copies(metric: Any, *names: str) -> dict[str, NDArray[Any]]:
-    """States to add to: a metric's own are exchanged, never changed in place."""
-    return {name: getattr(metric, name).numpy().copy() for name in names}
-
-
-def _exchange(metric: Any, states: Mapping[str, NDArray[Any]]) -> None:
-    for name, value in states.items():
-        setattr(metric, name, torch.from_numpy(value))
+def _exchanged(metric: Any, *names: str) -> tuple[NDArray[Any], ...]:
+    """States to add to: copies that are the metric's own from now on. Others may hold the previous ones."""
+    copies = {name: getattr(metric, name).clone() for name in names}
+    for name, value in copies.items():
+        setattr(metric, name, value)
+    return tuple(value.numpy() for value in copies.values())
 
 
 @kernel

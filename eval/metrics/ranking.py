@@ -8,6 +8,7 @@ of one bin count as ties. What that can change is bounded: see each class.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from ufmstar_torch.eval.metrics.base import SumMetric
 from ufmstar_torch.eval.metrics.likelihood import gaussian_nll
-from ufmstar_torch.eval.metrics.pixels import require_variance, select_pixels
+from ufmstar_torch.eval.metrics.pixels import Pixels
 
 # Variances and squared errors [m^2] between (0.1 mm)^2 and (100 m)^2 are distinguished; 0 and what is
 # smaller share the bin below, what is larger the bin above. Relative errors use the same bins.
@@ -27,11 +28,6 @@ def log_bin(value: Tensor, bins: int) -> Tensor:
     position = (value.clamp(min=LOW) / LOW).log() * (bins / math.log(HIGH / LOW))
     index = position.floor().clamp(max=bins).long() + 1
     return torch.where(value < LOW, torch.zeros_like(index), index)
-
-
-def _sorted_sums(index: Tensor, weights: Tensor | None, bins: int) -> Tensor:
-    """[bins + 2] count, or sum of the weights, in each bin."""
-    return torch.bincount(index, weights=weights, minlength=bins + 2)
 
 
 def kept_mean(count: Tensor, total: Tensor, kept: Tensor) -> Tensor:
@@ -65,38 +61,30 @@ class Sparsification(SumMetric):
         bins: of the logarithm of the variance.
     """
 
-    count: Tensor
-    squared: Tensor
-    relative: Tensor
-    count_squared: Tensor
-    sum_squared: Tensor
-    count_relative: Tensor
-    sum_relative: Tensor
+    OF_VARIANCE = "AUSE"
 
     def __init__(self, bins: int = 4096, **kwargs: Any) -> None:
         if bins < 1:
             raise ValueError(f"bins must be >= 1, got {bins}")
         super().__init__({"bins": bins}, **kwargs)
         self.bins = bins
-        for name in ("count", "count_squared", "count_relative"):
-            self.add_count(name, bins + 2)
-        for name in ("squared", "relative", "sum_squared", "sum_relative"):
-            self.add_sum(name, bins + 2)
+        self.add_counts("count", "count_squared", "count_relative", shape=(bins + 2,))
+        self.add_sums("squared", "relative", "sum_squared", "sum_relative", shape=(bins + 2,))
 
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        p = select_pixels(depth, require_variance(variance, "AUSE"), target, valid)
+    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
         squared = (p.depth - p.target).square()
         relative = (p.depth - p.target).abs() / p.target
         by_v, by_s, by_r = (log_bin(x, self.bins) for x in (p.variance, squared, relative))
-        self.add(
-            count=_sorted_sums(by_v, None, self.bins),
-            squared=_sorted_sums(by_v, squared, self.bins),
-            relative=_sorted_sums(by_v, relative, self.bins),
-            count_squared=_sorted_sums(by_s, None, self.bins),
-            sum_squared=_sorted_sums(by_s, squared, self.bins),
-            count_relative=_sorted_sums(by_r, None, self.bins),
-            sum_relative=_sorted_sums(by_r, relative, self.bins),
-        )
+        in_bins = partial(torch.bincount, minlength=self.bins + 2)
+        return {
+            "count": in_bins(by_v),
+            "squared": in_bins(by_v, squared),
+            "relative": in_bins(by_v, relative),
+            "count_squared": in_bins(by_s),
+            "sum_squared": in_bins(by_s, squared),
+            "count_relative": in_bins(by_r),
+            "sum_relative": in_bins(by_r, relative),
+        }
 
     def compute(self) -> dict[str, Tensor]:
         kept = 1 - torch.arange(50, dtype=torch.float64, device=self.count.device) / 50
@@ -133,21 +121,19 @@ class SpearmanCorrelation(SumMetric):
         bins: per axis; 512 make bins of 5.5 % in variance (2.7 % of sigma) and 2 MB of counts.
     """
 
-    joint: Tensor
+    OF_VARIANCE = "Spearman's correlation"
 
     def __init__(self, bins: int = 512, **kwargs: Any) -> None:
         if bins < 1:
             raise ValueError(f"bins must be >= 1, got {bins}")
         super().__init__({"bins": bins}, **kwargs)
         self.bins = bins
-        self.add_count("joint", bins + 2, bins + 2)
+        self.add_counts("joint", shape=(bins + 2, bins + 2))
 
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        p = select_pixels(depth, require_variance(variance, "Spearman's correlation"), target, valid)
+    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
         side = self.bins + 2
-        index = log_bin(p.variance, self.bins) * side
-        index = index + log_bin((p.depth - p.target).square(), self.bins)
-        self.add(joint=torch.bincount(index, minlength=side * side).reshape(side, side))
+        index = log_bin(p.variance, self.bins) * side + log_bin((p.depth - p.target).square(), self.bins)
+        return {"joint": torch.bincount(index, minlength=side * side).reshape(side, side)}
 
     def compute(self) -> dict[str, Tensor]:
         joint = self.joint.double()
@@ -182,29 +168,21 @@ class NLLByError(SumMetric):
         bins: of the logarithm of the squared error.
     """
 
-    count: Tensor
-    nll: Tensor
-    error: Tensor
+    OF_VARIANCE = "NLL by error"
 
     def __init__(self, percentiles: int = 10, bins: int = 4096, **kwargs: Any) -> None:
         if percentiles < 1 or bins < 1:
             raise ValueError(f"percentiles and bins must be >= 1, got {percentiles} and {bins}")
         super().__init__({"percentiles": percentiles, "bins": bins}, **kwargs)
         self.percentiles, self.bins = percentiles, bins
-        self.add_count("count", bins + 2)
-        self.add_sum("nll", bins + 2)
-        self.add_sum("error", bins + 2)
+        self.add_counts("count", shape=(bins + 2,))
+        self.add_sums("nll", "error", shape=(bins + 2,))
 
-    def update(self, depth: Tensor, variance: Tensor | None, target: Tensor, valid: Tensor | None = None) -> None:
-        p = select_pixels(depth, require_variance(variance, "NLL by error"), target, valid)
+    def sums_of(self, p: Pixels) -> dict[str, Tensor]:
         positive = p.variance > 0
         d, v, g = p.depth[positive], p.variance[positive], p.target[positive]
-        index = log_bin((d - g).square(), self.bins)
-        self.add(
-            count=_sorted_sums(index, None, self.bins),
-            nll=_sorted_sums(index, gaussian_nll(d, v, g), self.bins),
-            error=_sorted_sums(index, (d - g).abs(), self.bins),
-        )
+        in_bins = partial(torch.bincount, log_bin((d - g).square(), self.bins), minlength=self.bins + 2)
+        return {"count": in_bins(), "nll": in_bins(gaussian_nll(d, v, g)), "error": in_bins((d - g).abs())}
 
     def compute(self) -> dict[str, Tensor]:
         steps = torch.arange(1, self.percentiles + 1, dtype=torch.float64, device=self.count.device)

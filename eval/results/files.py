@@ -37,20 +37,23 @@ def write_atomic(path: Path, write: Callable[[BinaryIO], object], *, durable: bo
 def write_together(files: Mapping[Path, Callable[[BinaryIO], object]], *, durable: bool = False) -> None:
     """``write_atomic`` for files that belong together: none takes its place before all are written.
 
-    They do so in the order given: where the last one exists, all do.
+    They do so in the order given: where the last one exists, all do. A link stays, the file it leads to is replaced. A
+    pipe or device, such as /dev/null, is written to.
     """
+    targets = {Path(os.path.realpath(path)): write for path, write in files.items()}
+    special = {path for path in targets if path.exists() and not path.is_file() and not path.is_dir()}
     # Hidden, and in the same file system, as os.replace needs.
     # Named at random: processes on several nodes may share both a folder and an id.
-    temporary = {path: path.with_name(f".{path.name}.{uuid4().hex[:12]}.tmp") for path in files}
+    temporary = {p: p.with_name(f".{p.name}.{uuid4().hex[:12]}.tmp") for p in targets if p not in special}
     try:
-        for path, write in files.items():
-            with open(temporary[path], "wb") as file:
+        for path, write in targets.items():
+            with open(temporary.get(path, path), "wb") as file:
                 write(file)
-                if durable:
+                if durable and path not in special:
                     file.flush()
                     os.fsync(file.fileno())
-        for path in files:
-            os.replace(temporary[path], path)
+        for path, written in temporary.items():
+            os.replace(written, path)
     finally:
         for left in temporary.values():
             left.unlink(missing_ok=True)

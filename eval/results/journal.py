@@ -1,4 +1,4 @@
-"""What a run keeps of its frames: the sinks that write their maps, their lines of frames.jsonl and the checkpoint."""
+"""What a run keeps of its frames: the sink that writes their maps, lines of frames.jsonl, checkpoint and summary."""
 
 from __future__ import annotations
 

@@ -259,11 +259,15 @@ def _distribute(index, predicted, chosen, rows, K, width, slots, view, sums):
         box = _box(points, order, start[cell], start[cell + 1])
         count = cull(packed, visible.size, settings[4], box, settings, work, kept)
         n = padded(count)
-        for i in range(n):
+        for i in range(count):
             for field in range(FIELDS):
-                near[field, i] = fields[kept[i], field] if i < count else 0.0
-            near[FIELDS - 1, i] = near[FIELDS - 1, i] if i < count else -np.inf
-            for axis in range(3):
+                near[field, i] = fields[kept[i], field]
+        for i in range(count, n):  # nowhere
+            for field in range(FIELDS - 1):
+                near[field, i] = 0.0
+            near[FIELDS - 1, i] = -np.inf
+        for axis in range(3):
+            for i in range(n):
                 added[axis, i] = 0.0
         for place in range(start[cell], start[cell + 1]):
             p = order[place]

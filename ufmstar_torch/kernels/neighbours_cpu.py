@@ -74,7 +74,7 @@ def supported(pixel, predicted, depth, variance, valid, out):
         a = order[i]
         u[i], v[i], tie[i] = pixel[a, 0], pixel[a, 1], TIE * a
         ratio[i], noise[i] = math.log(depth[a] / predicted[a]), variance[a] / (depth[a] * depth[a])
-    neighbour, differ = np.empty((n, most), np.int64), np.empty(n * most)
+    neighbour, differ = np.empty((n, most + 1), np.int64), np.empty(n * most)
     distance, place, work = np.empty(room), np.empty(n, np.int64), np.empty(4)
     for i in range(n):
         _nearest(cells, u, v, tie, i, distance, place, work, neighbour[i])
@@ -118,12 +118,13 @@ def _lower_quartile(values, n):
 
 @leaf
 def _nearest(cells, u, v, tie, i, distance, place, work, neighbour):
-    """Write the anchors nearest to anchor i to ``neighbour`` [most], of more than so many in the order of the grid.
+    """Write the anchors nearest to anchor i to ``neighbour`` [most + 1], whose last entry is scratch, of more than
+    ``most`` in the order of the grid.
 
     They are among those in rings of cells around its own if so many lie within the circle that the rings contain.
     """
     low, side, columns, rows = cells[:4]
-    work[0], work[1], most = u[i], v[i], neighbour.size
+    work[0], work[1], most = u[i], v[i], neighbour.size - 1
     x, y = (u[i] - low[0]) / side, (v[i] - low[1]) / side
     column, row = min(int(x), columns - 1), min(int(y), rows - 1)
     # [cells] From the anchor to the border of its cell; a billionth less for rounding.
@@ -149,10 +150,9 @@ def _nearest(cells, u, v, tie, i, distance, place, work, neighbour):
         else:
             limit, within = middle, count
     count = 0
-    for j in range(n):
-        if distance[j] < limit and count < most:
-            neighbour[count] = place[j]
-            count += 1
+    for j in range(n):  # without a branch, which would be mispredicted
+        neighbour[count] = place[j]
+        count = min(count + (distance[j] < limit), most)
 
 
 @leaf

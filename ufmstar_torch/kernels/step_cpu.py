@@ -91,7 +91,8 @@ def step(
         joined = _join(state, frame, segments, cameras[0], pairs, config)
     stage("fuse")
 
-    learnt, views = None, None
+    learnt: Learnt | None = None
+    views: list[View] | None = None
     if config.anchored:
         learnt, views = _learn(state, joined, frame, anchors, config)
     stage("append")
@@ -264,9 +265,8 @@ def _counts(
             pair.found - pair.matched - new,  # without a slot, or too near
             *tally(valid[b].reshape(-1), shares[b].reshape(-1), unmeasured.HALF),
         )
-    counts = dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))
     if anchors is not None:
-        counts["anchors"].copy_(anchors.valid.sum(1))
+        totals[-2] = array(anchors.valid).sum(1)
     if used is not None:
-        counts["anchors_used"].copy_(used)
-    return counts
+        totals[-1] = array(used)
+    return dict(zip(_COUNTS, map(torch.from_numpy, totals), strict=True))
