@@ -43,9 +43,9 @@ def test_frames_and_that_they_have_no_poses(written):
 def test_training_reads_the_same(written):
     root, _ = written
     frame, sample = open_sequence(root)[2], NyuFrames(root, "val").load(2)
-    np.testing.assert_array_equal(frame.image.transpose(2, 0, 1), sample.image.numpy())
-    np.testing.assert_array_equal(frame.depth, sample.depth.numpy())
-    np.testing.assert_allclose(frame.intrinsics, sample.intrinsics.numpy())
+    np.testing.assert_array_equal(frame.image.transpose(2, 0, 1), sample.image)
+    np.testing.assert_array_equal(frame.depth, sample.depth)
+    np.testing.assert_allclose(frame.intrinsics, sample.intrinsics)
 
 
 def test_every_other_sequence_has_poses(tmp_path):
