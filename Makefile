@@ -18,15 +18,15 @@ lint:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-# Type checkers cannot follow setuptools' package-dir map: check a flat copy.
+# Type checkers cannot follow setuptools' package-dir map: check a flat copy. setuptools never removes modules from build/lib.
 types:
-	rm -rf build/flat
+	rm -rf build/flat build/lib
 	$(BIN)/pip install --quiet --no-deps --target build/flat .
 	$(BIN)/mypy build/flat/ufmstar_torch
 
 # The wheel and the sdist, each installed over the editable package, imported from elsewhere, and taken back.
 package:
-	rm -rf dist
+	rm -rf dist build/lib
 	$(BIN)/python -m build --outdir dist .
 	for archive in dist/*.whl dist/*.tar.gz; do \
 		$(BIN)/pip install --quiet --no-deps --force-reinstall $$archive && $(BIN)/python -P tests/installed.py || exit 1; \
