@@ -19,7 +19,7 @@ _BITS = 3  # eight children along each axis
 _LEVELS = 3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Page:
     """Components that were written out together.
 
