@@ -26,7 +26,7 @@ from ufmstar_torch.eval.bench.memory import state_memory, step_allocations
 from ufmstar_torch.eval.bench.runtimes import fastest
 from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls, spread_of_counts
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
-from ufmstar_torch.models import FastDepth
+from ufmstar_torch.models import FastDepth, MonodepthResNet
 from ufmstar_torch.models.fastdepth import MULTIPLE
 from ufmstar_torch.output import FrameStatistics
 
@@ -175,17 +175,14 @@ def reference_networks(
     """Forward passes on images of ``size`` [px] to compare with, each in the runtime that is fastest here (see
     ``fastest``), and what they are.
 
-    FastDepth with its batch norms folded, at the nearest size it takes (multiples of 32); torchvision's
-    ResNet50 up to and including layer4, with random weights, where torchvision is installed.
+    FastDepth with its batch norms folded, and "resnet50", ResNet50-Monodepth2 with random weights, where torchvision is
+    installed; both at the nearest size that they take (multiples of 32, Monodepth2 from 64 on).
     """
-    networks: dict[str, tuple[torch.nn.Module, int]] = {
-        "fastdepth": (fastdepth.folded(), max(MULTIPLE, MULTIPLE * round(size / MULTIPLE)))
-    }
+    side = max(MULTIPLE, MULTIPLE * round(size / MULTIPLE))
+    networks: dict[str, tuple[torch.nn.Module, int]] = {"fastdepth": (fastdepth.folded(), side)}
     about: dict[str, Any] = {"resnet50": None}
     if find_spec("torchvision") is not None:
-        from torchvision.models import resnet50
-
-        networks["resnet50"] = (torch.nn.Sequential(*list(resnet50(weights=None).children())[:-2]).eval(), size)
+        networks["resnet50"] = (MonodepthResNet().eval(), max(2 * MULTIPLE, side))
     calls = {}
     for name, (network, side) in networks.items():
         calls[name], facts = fastest(network, side, runtime=runtime)
