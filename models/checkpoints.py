@@ -102,7 +102,8 @@ def read_safetensors(path: str | Path, prefix: str | None = "") -> tuple[dict[st
     safetensors = _safetensors("safetensors")
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            keys = [] if prefix is None else [name for name in file.keys() if name.startswith(prefix)]  # noqa: SIM118
+            names = file.keys()  # no mapping: it cannot be iterated over itself
+            keys = [] if prefix is None else [name for name in names if name.startswith(prefix)]
             tensors = {key[len(prefix or "") :]: file.get_tensor(key) for key in keys}
             return tensors, json.loads((file.metadata() or {}).get("metadata", "null"))
     except (safetensors.SafetensorError, json.JSONDecodeError) as error:
