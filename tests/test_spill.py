@@ -146,6 +146,17 @@ def test_files_are_named_by_their_content_and_the_journal_keeps_what_changed(tmp
     assert ufm.spilled.components + int(ufm.mixture.components) == len(rows(ufm))
 
 
+def test_a_page_holds_at_most_sixteen_neighbours(tmp_path):
+    walk(UfMStarConfig(max_components=LIMIT, spill=str(tmp_path)), 0, 24)
+    divided = [change["out"] for change in changes_of(tmp_path) if len(change["out"]) > 1]
+    shares = []
+    for pages in divided:
+        assert all(8 <= page["count"] <= 16 for page in pages)
+        low, high = np.moveaxis(np.array([page["boxes"] for page in pages])[:, 1], 1, 0)  # reach of their components
+        shares.extend(np.prod(high - low, axis=1) / np.prod(high.max(0) - low.min(0)))
+    assert np.mean(shares) < 0.5, "of the space that all pages of a frame reach"
+
+
 def test_what_a_killed_process_left_of_a_line_does_not_count(tmp_path):
     config = UfMStarConfig(max_components=LIMIT, spill=str(tmp_path))
     ufm, _, _ = walk(config, 0, 24)
