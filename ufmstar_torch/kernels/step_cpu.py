@@ -214,8 +214,9 @@ def _join(
 def _learn(
     state: UfMStarState, joined: _Joined, frame: FrameInput, anchors: AnchorInput | None, config: UfMStarConfig
 ) -> tuple[Learnt, list[View] | None]:
-    """What anchors teach, and what is in view where the exact sum asks; what each component's error is beyond the
-    stream's goes to the features, before the share that was measured, as ``hook.before_regression`` has them."""
+    """What anchors teach, and what is in view (None unless the regression is the exact sum). By how much each
+    component's error exceeds the stream's is written to the features before the last, in the order of
+    ``hook.before_regression``."""
     evidence, capacity = Evidence(state.evidence, state.overall_evidence), joined.mixture["weight"].shape[1]
     if config.regression == "exact":
         views = look(joined.seen, frame.depth, frame.intrinsics, config, evidence.overall.dtype)
