@@ -259,7 +259,9 @@ def read_checkpoint(name_or_dir: str | Path, revision: str | None = None, local_
     read: dict[str, dict[str, Any]] = {}
     for file, reader in readers.items():
         try:
-            read[file] = dict(reader(name, **options)[0])
+            read[file] = reader(name, **options)[0]
+            if not isinstance(read[file], dict):
+                raise TypeError("it must hold a JSON object")
         except (OSError, ValueError, TypeError, AttributeError) as error:
             if not local and file == "config.json":
                 raise OSError(

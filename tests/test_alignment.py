@@ -15,7 +15,6 @@ from scenes import look, render
 from ufmstar_torch import UfMStar, UncertainDepth
 from ufmstar_torch.models import AlignedNetwork, Alignment, fit_affine_depth, fit_inverse_depth
 
-
 SIZE = (24, 32)
 FITS = {"inverse": fit_inverse_depth, "affine": fit_affine_depth}
 
