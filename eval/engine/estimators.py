@@ -85,7 +85,7 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
         row: which.
         device: where it runs.
         max_depth: [m] the largest depth that the row's networks can predict, None where it is not known.
-        streams: of UfM* (:meth:`Gaussians.stream`); with ``config.spill``, whose folder is one sequence's, one.
+        streams: of UfM* (:meth:`Gaussians.stream`).
 
     Raises:
         ValueError: a recalibration that was fitted under other settings.
@@ -102,7 +102,7 @@ def make_estimator(row: Row, device: torch.device, max_depth: float | None = Non
     return Gaussians(
         config,
         device,
-        streams=streams if config.spill is None else 1,
+        streams=streams,
         uses_variances=method.uses_aleatoric,
         corrected=setting.corrected,
         posterior=setting.posterior,
@@ -275,7 +275,7 @@ class Gaussians(Estimator):
             "count": count,
             "smoothing_bytes": kept_of("smoothed").nbytes,
         }
-        if self.ufm.config.anchored:
+        if self.ufm.config.anchors is not None:
             kept["bytes"] += (count + 1) * kept_of("overall_evidence").nbytes + kept_of("posterior").nbytes
             kept["anchors"] = self._anchors
         return kept
