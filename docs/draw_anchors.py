@@ -26,11 +26,11 @@ from scipy.stats import spearmanr
 
 from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import LandmarkTracker
-from ufmstar_torch.eval.report.outputs import field_of_view
+from ufmstar_torch.eval.run.pictures import field_of_view
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 

@@ -27,7 +27,7 @@ from ufmstar_torch.eval.bench.growth import measure_growth
 from ufmstar_torch.eval.bench.settings import CORNERS, BenchSettings
 from ufmstar_torch.eval.bench.step import build_up, measure_compilation, measure_step, reference_networks
 from ufmstar_torch.eval.bench.timing import most_threads, pinned_threads
-from ufmstar_torch.eval.results import machine
+from ufmstar_torch.eval.run import machine
 from ufmstar_torch.models import FastDepth, FastDepthWidths, load_network
 
 # Milliseconds and ratios at 224 x 224, bytes and ratios for one room; the tracker's mean processor time for 300 corners
