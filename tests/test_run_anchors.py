@@ -20,7 +20,7 @@ from ufmstar_torch.eval.report.panels import map_columns
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.run.journal import why_none
+from ufmstar_torch.eval.run.recorder import why_none
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models import Preprocess

@@ -28,9 +28,9 @@ from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
 from ufmstar_torch.eval.run.files import write_json_atomic
-from ufmstar_torch.eval.run.journal import Journal
+from ufmstar_torch.eval.run.job import RunJob
+from ufmstar_torch.eval.run.recorder import FrameRecorder
 from ufmstar_torch.eval.run.run_folder import RunFolder
-from ufmstar_torch.eval.run.run_job import RunJob
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
@@ -98,7 +98,7 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
     row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
-    with Behind([metrics, Journal(job, folder, metrics)]) as behind:
+    with Behind([metrics, FrameRecorder(job, folder, metrics)]) as behind:
         stream.drive([behind, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
