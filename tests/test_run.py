@@ -16,12 +16,12 @@ from layouts import truncate, write_depth_png, write_generic
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
 from ufmstar_torch import UfMStar, UncertainDepth, cli
-from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.run import run_folder, writers
 from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
@@ -418,7 +418,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from runs import Brightness, network_job
-from ufmstar_torch.eval.commands.run import run
+from ufmstar_torch.eval.run.run import run
 
 def kill():
     os.kill(os.getpid(), signal.SIGKILL)
