@@ -15,7 +15,7 @@ from typing import Any
 OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 # Name, module, and what it is for.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("eval.commands.demo_command", "the main job on rendered rooms, with nothing but this package"),
+    "demo": ("eval.commands.demo", "the main job on rendered rooms, with nothing but this package"),
     "run": ("eval.commands.run", "depth and variance of a sequence of posed images, onto disk"),
     "eval": ("eval.commands.eval_command", "the rows of a table or figure of the paper, on your own sequences"),
     "report": ("eval.commands.report_command", "tables, figures and a page from the results of eval"),

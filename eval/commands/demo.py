@@ -6,7 +6,7 @@ last room has other sizes and textures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +20,6 @@ from ufmstar_torch.eval.commands.options import UsageError, as_dict, parse
 if TYPE_CHECKING:
     from ufmstar_torch.eval.engine.evaluate import RowResult
     from ufmstar_torch.eval.engine.progress import Progress
-    from ufmstar_torch.eval.report.demo import RoomKinds
     from ufmstar_torch.eval.sequences.frame import FrameSequence
 
 _WEIGHTS = ("weights", "demo.safetensors")
@@ -78,3 +77,148 @@ def main(options: DemoOptions) -> int:
         raise UsageError(error) from error
     print(demo_table(summary), demo_explanation(summary), sep="\n\n")
     return 0
+
+
+def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda _: None) -> dict[str, Any]:
+    """Evaluate the suite on the tour and leave pictures, mixture and summary in a folder; the content of summary.json.
+    ``progress`` is called at the start of each stage and after every step of it.
+
+    Raises:
+        FolderError: the folder contains other files, or an earlier demo and ``overwrite`` is off.
+        FileNotFoundError, CheckpointError: the networks cannot be loaded.
+        ValueError: the networks predict no variance.
+        OSError: the results cannot be written.
+    """
+    import torch
+
+    from ufmstar_torch.eval.engine.evaluate import Judge, evaluate_sequence
+    from ufmstar_torch.eval.engine.load import sha256
+    from ufmstar_torch.eval.engine.networks import NetworkSource
+    from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
+    from ufmstar_torch.eval.methods.suite import suite_named
+    from ufmstar_torch.eval.report.demo import DEMO_FILES, ROWS, DemoFrames, surface_kinds, write_pictures
+    from ufmstar_torch.eval.report.text import demo_names
+    from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+    from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
+    from ufmstar_torch.eval.run.summary import versions
+    from ufmstar_torch.eval.tour import make_tour, tour_sequence
+    from ufmstar_torch.models.trained import load_trained, read_info
+    from ufmstar_torch.pipeline import NetworksInTurn
+
+    started = perf_counter()
+    device = torch.zeros((), device=options.device).device
+    with _weights(options.weights) as file:
+        info, members, digest = read_info(file), load_trained(file), sha256(file)
+    kind = FolderKind(program="ufmstar demo", noun="demo", manifest="summary.json", clear=remover(*DEMO_FILES))
+    OutputFolder.open(options.out, kind, {}, overwrite=options.overwrite).close()
+    tour = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": info.spec.size}
+    sequence = _rendered(tour_sequence(**tour, device=device), device, progress)
+    networks = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {}, seeding=None)
+    suite = suite_named("demo")
+    names = {row.slug: name for row, name in zip(suite.rows[: 5 if len(members) > 1 else 4], ROWS, strict=False)}
+    rooms = make_tour(options.seed, "mixed")
+    frames = DemoFrames(names, [surface_kinds(rooms, frame) for frame in sequence])
+    results = evaluate_sequence(
+        sequence,
+        [row for row in suite.rows if row.slug in names],
+        Judge(dict.fromkeys(suite.bases, networks), device),
+        sinks=[frames],
+        progress=progress,
+    )
+    shown = demo_names(len(members))
+    progress(Progress("pictures", 0, 1))
+    curves = {shown[names[one.row.slug]].strip(): _own_curves(one) for one in results}
+    title = f"ufmstar demo: {options.frames} frames, seed {options.seed}"
+    summary = {
+        "program": kind.program,
+        "out": str(options.out),
+        "settings": {name: value for name, value in as_dict(options).items() if name not in ("threads", "debug")},
+        "tour": tour,
+        "network": {
+            "file": info.path.name,
+            "sha256": digest,
+            "members": len(members),
+            "spec": info.spec.to_dict(),
+            "training": info.info,
+        },
+        "methods": {names[one.row.slug]: _figures(one, frames.state_bytes(names[one.row.slug])) for one in results},
+        "surfaces": frames.by_kind(),
+        "components": frames.count(UFM_STAR),
+        "points": frames.count(UFM),
+        "versions": versions(),
+        "outputs": write_pictures(options.out, frames.panels, curves, frames.ufm_star, title),
+        "seconds": perf_counter() - started,
+    }
+    write_json_atomic(options.out / "summary.json", summary)
+    progress(Progress("pictures", 1, 1))
+    plain: dict[str, Any] = to_json(summary)
+    return plain
+
+
+def _figures(result: RowResult, state_bytes: int) -> dict[str, Any]:
+    """A row of the table: figures, median times [ms] and the bytes of its state."""
+    ms = result.ms
+    own = ms.get("anchors", 0.0) + ms["uncertainty"] if result.state else None
+    return {
+        "figures": result.figures,
+        "network_ms": ms["network"],
+        "uncertainty_ms": own,
+        "state_bytes": state_bytes,
+    }
+
+
+def _own_curves(result: RowResult) -> dict[str, Any]:
+    """The curves of a row but for those that depend on other rows (``RowMetrics.curves``)."""
+    return {name: values for name, values in result.curves.items() if ":" not in name}
+
+
+def _rendered(sequence: FrameSequence, device: Any, progress: Callable[[Progress], None]) -> FrameSequence:
+    """All frames in memory. Meanwhile UfM*'s kernels are compiled, which takes some twenty seconds on the first run."""
+    from concurrent.futures import ThreadPoolExecutor
+    from threading import Event
+
+    import numpy as np
+
+    from ufmstar_torch.config import UfMStarConfig
+    from ufmstar_torch.eval.engine.progress import Progress
+    from ufmstar_torch.eval.engine.warm_up import warm_up_command
+
+    frames, rendered = [], Event()
+
+    def compiling(done: int, total: int) -> None:
+        if rendered.is_set():
+            progress(Progress("kernels", done, total))
+
+    progress(Progress("rooms", 0, len(sequence)))
+    with ThreadPoolExecutor(1) as thread:
+        config = UfMStarConfig(anchored=True, posterior=True)
+        compiled = thread.submit(warm_up_command, config, device, compiling, dense=True)
+        for index in range(len(sequence)):
+            frames.append(sequence[index])
+            progress(Progress("rooms", index + 1, len(sequence)))
+        progress(Progress("kernels", 0, 1))
+        rendered.set()
+        compiled.result()
+    progress(Progress("kernels", 1, 1))
+    entries = [
+        replace(entry, load_image=partial(np.asarray, frame.image), load_depth=partial(np.asarray, frame.depth))
+        for entry, frame in zip(sequence.entries, frames, strict=True)
+    ]
+    return replace(sequence, entries=tuple(entries))
+
+
+@contextmanager
+def _weights(path: Path | None) -> Iterator[Path]:
+    """The file with the networks: the user's, or the package's own wherever that is installed. Raises
+    FileNotFoundError: it is not there."""
+    if path is not None:
+        if not path.is_file():
+            raise FileNotFoundError(f"--weights: no such file: {path}")
+        yield path
+        return
+    own = files("ufmstar_torch.models").joinpath(*_WEIGHTS)
+    if not own.is_file():
+        raise FileNotFoundError(f"the package was installed without {'/'.join(_WEIGHTS)}; --weights FILE names another")
+    with as_file(own) as file:
+        yield file

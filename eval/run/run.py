@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from ufmstar_torch.anchors.dense import DenseEvidence
-from ufmstar_torch.eval.engine.behind import Behind
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
+from ufmstar_torch.eval.engine.writer_thread import WriterThread
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.job import RunJob
 from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video, mixture_writers
@@ -82,8 +82,8 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
     row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
-    with Behind([metrics, FrameRecorder(job, folder, metrics)]) as behind:
-        stream.drive([behind, ProgressSink(progress, _skipped(folder))], stop=stop)
+    with WriterThread([metrics, FrameRecorder(job, folder, metrics)]) as writer:
+        stream.drive([writer, ProgressSink(progress, _skipped(folder))], stop=stop)
 
 
 def _ending(job: RunJob, folder: RunFolder) -> tuple[str, str]:
