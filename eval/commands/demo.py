@@ -113,7 +113,7 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     kind = FolderKind(program="ufmstar demo", noun="demo", manifest="summary.json", clear=remover(*DEMO_FILES))
     OutputFolder.open(options.out, kind, {}, overwrite=options.overwrite).close()
     tour = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": info.spec.size}
-    sequence = _rendered(tour_sequence(**tour, device=device), device, progress)
+    sequence = _rendered(tour_sequence(**tour), device, progress)
     networks = NetworkSource(NetworksInTurn(members, preprocess=members[0].preprocess), device, {}, seeding=None)
     suite = suite_named("demo")
     names = {row.slug: name for row, name in zip(suite.rows[: 5 if len(members) > 1 else 4], ROWS, strict=False)}
