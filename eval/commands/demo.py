@@ -180,7 +180,7 @@ def _rendered(sequence: FrameSequence, device: Any, progress: Callable[[Progress
 
     import numpy as np
 
-    from ufmstar_torch.config import UfMStarConfig
+    from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
     from ufmstar_torch.eval.engine.progress import Progress
     from ufmstar_torch.eval.engine.warm_up import warm_up_command
 
@@ -192,7 +192,7 @@ def _rendered(sequence: FrameSequence, device: Any, progress: Callable[[Progress
 
     progress(Progress("rooms", 0, len(sequence)))
     with ThreadPoolExecutor(1) as thread:
-        config = UfMStarConfig(anchored=True, posterior=True)
+        config = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
         compiled = thread.submit(warm_up_command, config, device, compiling, dense=True)
         for index in range(len(sequence)):
             frames.append(sequence[index])

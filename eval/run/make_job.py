@@ -40,7 +40,7 @@ def make_job(options: Mapping[str, Any], config: UfMStarConfig, sequence: FrameS
     """
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
-    landmarks = _landmarks(options["anchors"] or DENSE, sequence) if config.anchored else LandmarkTracker
+    landmarks = _landmarks(options["anchors"] or DENSE, sequence) if config.anchors else LandmarkTracker
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")

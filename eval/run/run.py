@@ -78,7 +78,7 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     def compiling(done: int, total: int) -> None:
         progress(Progress("kernels", done, total))
 
-    dense = job.config.anchored and isinstance(job.landmarks(), DenseEvidence)
+    dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
     warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
     row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
