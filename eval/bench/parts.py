@@ -1,4 +1,4 @@
-"""The clocks: every part of every row on every frame, in turn, so that a busy machine slows all of them down.
+"""The parts of every row of table 2 on every frame, in turn, so that a busy machine slows all of them alike.
 
 A frame's networks run first, then the multiview steps on their predictions; odd frames in the reverse order
 (``TimedCalls``). What uncertainty adds to a network is the difference of two calls on one frame.
@@ -6,7 +6,7 @@ A frame's networks run first, then the multiview steps on their predictions; odd
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -24,24 +24,17 @@ from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.prediction import DepthPrediction
 
 MULTIVIEW = "multiview"
-# Clocks: what passes, and what this process computes (over all its threads), which other work does not stretch.
-WALL, PROCESSOR = "wall", "processor"
-# The owner of a part, a base or a row by its label, and the part.
-Part = tuple[str, str]
+Part = tuple[str, str]  # the owner of a part, a base or a row by its label, and the part
 
 
 class MultiviewStep:
-    """UfM or UfM* of a row on a device, as the evaluation builds it, with a state of its own.
-
-    ``kept`` is what the estimator holds after every noted frame (``Estimator.memory``).
-    """
+    """UfM or UfM* of a row on a device, as the evaluation builds it, with a state of its own."""
 
     def __init__(self, row: Row, device: torch.device) -> None:
         estimator = make_estimator(row, device)
         assert isinstance(estimator, Pointwise | Gaussians), f"{row.label} has no multiview part"
         self.row, self.device, self.module = row, device, estimator.ufm
-        self.kept: list[dict[str, float]] = []
-        self._estimator = estimator
+        self.memory = estimator.memory
 
     def __call__(self, prediction: DepthPrediction, T_world_cam: Tensor, K: Tensor, *, first: bool = False) -> Any:
         """A frame: its maps to the device, and the step; the ``first`` one begins with an empty state."""
@@ -55,23 +48,9 @@ class MultiviewStep:
         used = (prediction.depth, T_world_cam, K, *(own if self.row.method.uses_aleatoric else (None, None)))
         return [None if value is None else value.to(self.device) for value in used]
 
-    def note(self) -> None:
-        """Record what is kept now."""
-        self.kept.append(self._estimator.memory())
-
-    def memory(self) -> dict[str, float]:
-        """Bytes and points or components after the noted frames: at the end, on average, at most; and of the
-        map that is kept for smoothing [bytes]."""
-        figures = {"smoothing_bytes": self.kept[-1]["smoothing_bytes"]}
-        for name in ("bytes", "count"):
-            values = [kept[name] for kept in self.kept]
-            mean = sum(values) / len(values)
-            figures |= {f"{name}_end": values[-1], f"{name}_mean": mean, f"{name}_max": max(values)}
-        return figures
-
 
 @dataclass
-class Race:
+class TimedParts:
     """What was run and its times.
 
     Attributes:
@@ -79,6 +58,7 @@ class Race:
         timed: the clocks, after the warm-up.
         calls: the parts that were run, one call per frame, which can be repeated in this order.
         steps, staged: by row's label, the state after the last frame, and the stages of UfM*.
+        memory: by row's label, what the multiview step keeps after the last frame (``Estimator.memory``).
     """
 
     warm_up: int
@@ -86,15 +66,12 @@ class Race:
     calls: dict[Part, list[Callable[[], Any]]] = field(default_factory=dict)
     steps: dict[str, MultiviewStep] = field(default_factory=dict)
     staged: dict[str, StagedStep] = field(default_factory=dict)
+    memory: dict[str, dict[str, float]] = field(default_factory=dict)
 
-    def ms(self, owner: str, part: str, clock: str = WALL) -> list[float]:
-        """Times of a part by a clock [ms], one per frame; none if it was not run."""
-        times = self.timed.times.wall if clock == WALL else self.timed.times.cpu
-        return times.get((owner, part), [])
-
-    def added_ms(self, base: str, part: str, clock: str = WALL) -> list[float]:
-        """What a network's inference takes beyond that of depth alone [ms], frame by frame."""
-        return [a - b for a, b in zip(self.ms(base, part, clock), self.ms(base, DEPTH, clock), strict=True)]
+    def ms(self, owner: str, part: str, clock: str = "wall") -> list[float]:
+        """Times of a part by a clock, "wall" or "cpu" [ms], one per frame; none if it was not run."""
+        times: list[float] = getattr(self.timed.times, clock).get((owner, part), [])
+        return times
 
     def run(self, calls: Mapping[Part, Callable[[], Any]], device: torch.device) -> dict[Part, Any]:
         """Time the parts of a frame on a device; what they return."""
@@ -103,18 +80,12 @@ class Race:
         return self.timed.call(calls, device=device)
 
 
-def parts_of(base: str, rows: Iterable[Row]) -> tuple[str, ...]:
-    """What has to be run of a base's networks for the rows on it; depth alone always."""
-    needed = {inference_of(row) for row in rows if row.method.base == base}
-    return (DEPTH, *(part for part in (ONCE, EVERY) if part in needed))
-
-
 def inference_of(row: Row) -> str:
     """The form of inference that a row gets its prediction from."""
     return EVERY if row.method.every_member else ONCE
 
 
-def run_race(
+def time_parts(
     rows: Sequence[Row],
     networks: Mapping[str, TimedNetwork],
     frames: Sequence[Frame],
@@ -122,7 +93,7 @@ def run_race(
     warm_up: int,
     device: torch.device,
     multiview_device: torch.device,
-) -> Race:
+) -> TimedParts:
     """Run every part of every row on every frame.
 
     Args:
@@ -133,29 +104,30 @@ def run_race(
     Raises:
         FrameError: a frame has no image.
     """
-    race = Race(warm_up)
-    parts = {base: parts_of(base, rows) for base in networks if any(row.method.base == base for row in rows)}
+    parts = TimedParts(warm_up)
+    forms = {row.method.base: {DEPTH} for row in rows}
     for row in rows:
+        forms[row.method.base].add(inference_of(row))
         if row.method.fusion != ALONE:
-            race.steps[row.label], twin = (MultiviewStep(row, multiview_device) for _ in range(2))
+            parts.steps[row.label], twin = (MultiviewStep(row, multiview_device) for _ in range(2))
             if isinstance(twin.module, UfMStar):
-                race.staged[row.label] = StagedStep(twin.module, multiview_device)
-    for turn, frame in enumerate(race.timed.frames(frames, warm_up=warm_up)):
-        given = {base: networks[base].prepare(frame, device) for base in parts}
+                parts.staged[row.label] = StagedStep(twin.module, multiview_device)
+    for turn, frame in enumerate(parts.timed.frames(frames, warm_up=warm_up)):
+        prepared = {base: networks[base].prepare(frame, device) for base in forms}
         inferences: dict[Part, Callable[[], DepthPrediction]] = {
-            (base, part): partial(networks[base].predict, part, *given[base], turn=turn)
-            for base, needed in parts.items()
-            for part in needed
+            (base, form): partial(networks[base].predict, form, *prepared[base], turn=turn)
+            for base, needed in forms.items()
+            for form in (DEPTH, ONCE, EVERY)
+            if form in needed
         }
-        predicted, T = race.run(inferences, device), torch.from_numpy(frame.T_world_cam)[None]
-        inputs = {}
-        for label, step in race.steps.items():
-            base = step.row.method.base
-            inputs[label] = predicted[base, inference_of(step.row)], T, given[base][1]
-        steps = {(label, MULTIVIEW): partial(race.steps[label], *inputs[label], first=turn == 0) for label in inputs}
-        race.run(steps, multiview_device)
-        for label, step in race.steps.items():
-            step.note()
-            if label in race.staged:
-                race.staged[label](*step.arguments(*inputs[label]))
-    return race
+        predicted, T = parts.run(inferences, device), torch.from_numpy(frame.T_world_cam)[None]
+        inputs = {
+            label: (predicted[step.row.method.base, inference_of(step.row)], T, prepared[step.row.method.base][1])
+            for label, step in parts.steps.items()
+        }
+        steps = {(label, MULTIVIEW): partial(parts.steps[label], *inputs[label], first=turn == 0) for label in inputs}
+        parts.run(steps, multiview_device)
+        for label, staged in parts.staged.items():
+            staged(*parts.steps[label].arguments(*inputs[label]))
+    parts.memory = {label: step.memory() for label, step in parts.steps.items()}
+    return parts
