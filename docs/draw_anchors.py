@@ -30,7 +30,7 @@ from ufmstar_torch.eval.report.outputs import field_of_view
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.load import load_network
 from ufmstar_torch.models.network import DepthNetwork
 

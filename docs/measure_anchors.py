@@ -19,7 +19,7 @@ from clips import Clip, add_sources, clips, judge, line, shown
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.sequences.frame import Frame
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 
 STRIDE = 4  # judged are every fourth pixel of every fourth row
 ANCHORED: Mapping[str, Any] = {"anchored": True}

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.engine.load import NetworkChoice
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.sequences.frame import FrameSequence
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 
 
 def in_memory(seed: int, frames: int) -> FrameSequence:

@@ -166,7 +166,7 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
 
 def test_a_standing_camera_has_no_anchors_and_says_so():
     from ufmstar_torch.anchors.tracker import LandmarkTracker
-    from ufmstar_torch.eval.tour.open import open_sequence
+    from ufmstar_torch.eval.sequences.open import open_sequence
 
     frame = open_sequence("tour:5?frames=2&size=180x240")[0]
     tracker, plain, anchored = LandmarkTracker(), UfMStar(), UfMStar(ON)

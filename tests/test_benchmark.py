@@ -34,7 +34,7 @@ from ufmstar_torch.eval.commands import bench_command
 from ufmstar_torch.eval.engine.clock import CallTimes, paired_ratio, spread
 from ufmstar_torch.eval.report.figures_cost import draw_growth
 from ufmstar_torch.eval.report.style import save_figure
-from ufmstar_torch.eval.results.machine import available_cores, cpu_model, versions
+from ufmstar_torch.eval.run.machine import available_cores, cpu_model, versions
 from ufmstar_torch.eval.tour import box_room as synthetic
 from ufmstar_torch.models import MonodepthResNet
 

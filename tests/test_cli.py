@@ -21,7 +21,7 @@ from shared_data import require_shared
 from ufmstar_torch import SPGFConfig, UfMStarConfig, cli
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.engine import load as sources
-from ufmstar_torch.eval.results import writers
+from ufmstar_torch.eval.run import writers
 from ufmstar_torch.models import Preprocess
 
 

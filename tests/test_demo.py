@@ -28,7 +28,7 @@ from ufmstar_torch.eval.report.colours import colour_table
 from ufmstar_torch.eval.report.figures_curves import write_curves
 from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.text import demo_explanation, demo_table
-from ufmstar_torch.eval.results.folder import FolderError, OutputFolder
+from ufmstar_torch.eval.run.folder import FolderError, OutputFolder
 from ufmstar_torch.eval.sequences.frame import Frame
 from ufmstar_torch.eval.tour import make_tour, render, tour_sequence
 from ufmstar_torch.models import NetworkSpec, save_trained

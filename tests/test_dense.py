@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ufmstar_torch.anchors.dense import DenseConfig, DenseEvidence
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.engine.anchors import landmark_digests, landmarks_of
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
 from ufmstar_torch.eval.methods.setting import setting_from
 from ufmstar_torch.eval.report.text import run_table
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:5?frames=6&size=96x128&sensor=0"

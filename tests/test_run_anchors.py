@@ -19,10 +19,10 @@ from ufmstar_torch.eval.report.outputs import Finished
 from ufmstar_torch.eval.report.panels import map_columns
 from ufmstar_torch.eval.report.text import run_table
 from ufmstar_torch.eval.report.video import preview_frame
-from ufmstar_torch.eval.results.folder import FolderError
-from ufmstar_torch.eval.results.journal import why_none
-from ufmstar_torch.eval.results.writers import read_frame
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.journal import why_none
+from ufmstar_torch.eval.run.writers import read_frame
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models import Preprocess
 
 TOUR = "tour:5?frames=8&size=120x160"

@@ -18,7 +18,7 @@ from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.engine.stream import FrameSink, FrameStream, Stopped, drive_together
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.sequences import FrameError
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 from ufmstar_torch.models import Preprocess
 from ufmstar_torch.state import UfMStarState
 

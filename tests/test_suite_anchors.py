@@ -23,7 +23,7 @@ from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.report.data import setting_of
 from ufmstar_torch.eval.report.names import row_label
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
-from ufmstar_torch.eval.tour.open import open_tour
+from ufmstar_torch.eval.tour.sequence import open_tour
 
 NAME = "UfM*-DepthOnly"
 ON = UfMStarConfig(on_bad_frame="skip", anchored=True)

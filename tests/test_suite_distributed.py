@@ -22,9 +22,8 @@ from ufmstar_torch.eval.commands.eval_command import job_from, launch_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.methods.suite import suite_named
 from ufmstar_torch.eval.report.data import load_results
-from ufmstar_torch.eval.results import launch, machine
+from ufmstar_torch.eval.results import launch
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.launch import (
     ClusterTask,
     LaunchOptions,
@@ -37,6 +36,8 @@ from ufmstar_torch.eval.results.launch import (
 )
 from ufmstar_torch.eval.results.work import WorkerTask
 from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.eval.run import machine
+from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
 

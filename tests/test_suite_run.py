@@ -21,10 +21,10 @@ from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequences
 from ufmstar_torch.eval.report.data import load_results
 from ufmstar_torch.eval.results.cache import CacheError
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.folder import FolderError
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.work import DIED, with_references
 from ufmstar_torch.eval.results.worklist import Shard, content_digest
+from ufmstar_torch.eval.run.folder import FolderError
 
 
 def folder_of(job):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ufmstar_torch.anchors import landmark_source
 from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.camera import resize_intrinsics
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.kernels.triangulate_cpu import triangulate
 
 HERE = np.array([1000.0, -500.0, 20.0])  # far from the world's origin

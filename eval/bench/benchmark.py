@@ -25,7 +25,7 @@ from ufmstar_torch.eval.bench.memory import state_memory
 from ufmstar_torch.eval.bench.settings import BenchSettings
 from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls, most_threads, pinned_threads
 from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
-from ufmstar_torch.eval.results import machine
+from ufmstar_torch.eval.run import machine
 from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, load_network
 from ufmstar_torch.models.inference import Inference, runtime_of
 from ufmstar_torch.models.network import DepthNetwork

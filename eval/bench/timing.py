@@ -18,7 +18,7 @@ import torch
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synchronize
-from ufmstar_torch.eval.results.machine import available_cores
+from ufmstar_torch.eval.run.machine import available_cores
 
 F = TypeVar("F")
 Name = TypeVar("Name", bound=Hashable)

@@ -20,7 +20,7 @@ def main(options: BenchSettings) -> int:
     from ufmstar_torch.eval.bench.text import format_report
     from ufmstar_torch.eval.report.figures_cost import draw_growth
     from ufmstar_torch.eval.report.style import save_figure
-    from ufmstar_torch.eval.results.files import write_json_atomic
+    from ufmstar_torch.eval.run.files import write_json_atomic
 
     try:
         report = run_benchmark(options, progress=lambda text: print(text, file=sys.stderr, flush=True))

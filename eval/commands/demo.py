@@ -44,9 +44,9 @@ from ufmstar_torch.eval.methods.ufm import UfMConfig
 from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR, panel, write_pictures
 from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
-from ufmstar_torch.eval.results.files import to_json, write_json_atomic
-from ufmstar_torch.eval.results.folder import FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.results.summary import versions
+from ufmstar_torch.eval.run.files import to_json, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.summary import versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest
 from ufmstar_torch.eval.tour import Tour, make_tour, tour_sequence

@@ -27,14 +27,14 @@ from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
 from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
-from ufmstar_torch.eval.results.files import write_json_atomic
-from ufmstar_torch.eval.results.journal import Journal
-from ufmstar_torch.eval.results.run_folder import RunFolder
-from ufmstar_torch.eval.results.run_job import RunJob
-from ufmstar_torch.eval.results.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
+from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.journal import Journal
+from ufmstar_torch.eval.run.run_folder import RunFolder
+from ufmstar_torch.eval.run.run_job import RunJob
+from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary
 from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_slice
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
-from ufmstar_torch.eval.tour.open import open_sequence
+from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import beside, named, read_recalibration
 

@@ -182,8 +182,8 @@ def main(options: RunOptions) -> int:
     """Run, and print the results' table; the exit code."""
     from ufmstar_torch.eval.commands.run import job_from, run
     from ufmstar_torch.eval.commands.terminal import Bars, stop_signals
-    from ufmstar_torch.eval.results.folder import FolderError
-    from ufmstar_torch.eval.results.machine import share_threads
+    from ufmstar_torch.eval.run.folder import FolderError
+    from ufmstar_torch.eval.run.machine import share_threads
 
     if options.threads is None:
         share_threads()
@@ -227,7 +227,7 @@ def _check_depth(options: Mapping[str, Any]) -> None:
 def _report(summary: Mapping[str, Any], out: str) -> int:
     """Print the table and where the outputs are; the exit code."""
     from ufmstar_torch.eval.report.text import run_table
-    from ufmstar_torch.eval.results.summary import FINISHED, INTERRUPTED
+    from ufmstar_torch.eval.run.summary import FINISHED, INTERRUPTED
 
     if summary["frames"]["done"]:
         print(run_table(summary))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.optional import optional
 
 # Depth and uncertainty get different maps, so that the two pictures cannot be confused.

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ufmstar_torch.eval.report.colours import ERROR_MAP, ColourScale, robust_range
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.mixture import GaussianMixture
 
 # Below this standard deviation [m] an axis is drawn as if it had it: log(0) has no place in a file, and

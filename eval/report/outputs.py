@@ -24,8 +24,8 @@ from ufmstar_torch.eval.report.colours import INVALID_GREY, known_where
 from ufmstar_torch.eval.report.gaussians import write_ellipsoids_ply, write_mixture_npz, write_mixture_ply
 from ufmstar_torch.eval.report.panels import FramePanel, MapColumn, contact_sheet, map_columns
 from ufmstar_torch.eval.report.video import preview_frame, write_video
-from ufmstar_torch.eval.results.files import write_json_atomic
-from ufmstar_torch.eval.results.writers import read_frame
+from ufmstar_torch.eval.run.files import write_json_atomic
+from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.frame import Frame, FrameError, FrameSequence, Size
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest, truth_at
 from ufmstar_torch.eval.sequences.intrinsics import pinhole

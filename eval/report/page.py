@@ -22,7 +22,7 @@ from ufmstar_torch.eval.report.names import DIFFERENCES, count, row_label
 from ufmstar_torch.eval.report.pictures import Picture
 from ufmstar_torch.eval.report.table import Table
 from ufmstar_torch.eval.report.tables import overview, sequence_tables
-from ufmstar_torch.eval.results.files import write_atomic
+from ufmstar_torch.eval.run.files import write_atomic
 
 PAGE = "report.html"
 TEMPLATES = Path(__file__).parent / "templates"

@@ -14,7 +14,7 @@ from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, ENSEMBLE, NETW
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import NLL_OF_FEW, main_table
 from ufmstar_torch.eval.report.write import Report
-from ufmstar_torch.eval.results.summary import NEAR_ZERO
+from ufmstar_torch.eval.run.summary import NEAR_ZERO
 
 _CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}
 _DEMO_COLUMNS = {"delta1": "delta1", **_CALIBRATION, "ause_rmse": "AUSE [m]"}

@@ -25,9 +25,9 @@ import torch
 
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.machine import available_cores, device_of
 from ufmstar_torch.eval.results.work import EvalJob, Evaluate, Worker, WorkerTask
 from ufmstar_torch.eval.results.worklist import Shard
+from ufmstar_torch.eval.run.machine import available_cores, device_of
 from ufmstar_torch.optional import optional
 
 _TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK")

@@ -24,9 +24,9 @@ from ufmstar_torch.eval.results.cache import PredictionCache
 from ufmstar_torch.eval.results.claim import Claim
 from ufmstar_torch.eval.results.eval_folder import CACHE, EvalFolder
 from ufmstar_torch.eval.results.examples import ExampleWriter
-from ufmstar_torch.eval.results.machine import hardware, versions
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest
+from ufmstar_torch.eval.run.machine import hardware, versions
 from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.recalibrate import read_recalibration
 

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.engine.judge import UFM
 from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.rows import RowRunner
 from ufmstar_torch.eval.methods.setting import TRACKED, Setting
-from ufmstar_torch.eval.results.run_folder import Checkpoint
+from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.recalibrate import read_recalibration, split_name
 from ufmstar_torch.ufmstar import UfMStar

@@ -1,7 +1,4 @@
-"""Sequences by path or name: recordings on disk, and tours, ``tour:SEED?style=mixed&frames=150&size=160x224``.
-
-Tours are sequences, so that everything that reads a dataset reads a tour.
-"""
+"""Tours as sequences, by name: ``tour:SEED?style=mixed&frames=150&size=160x224``."""
 
 from __future__ import annotations
 
@@ -13,9 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ufmstar_torch.eval.sequences import layout as on_disk
 from ufmstar_torch.eval.sequences.frame import Entry, FrameSequence, Size, make_sequence, parse_size
-from ufmstar_torch.eval.sequences.poses import OURS
 from ufmstar_torch.eval.tour.box_room import intrinsics
 from ufmstar_torch.eval.tour.path import tour_path
 from ufmstar_torch.eval.tour.style import STYLES, TourStyle
@@ -26,19 +21,6 @@ PREFIX = "tour:"
 _FORM = "tour:SEED or tour:SEED?option=value&..., with the options style, frames, size, fov, path and sensor"
 FPS = 15.0  # of the timestamps
 _KEPT = 4  # rendered frames kept, so that a frame's image and depth come from one rendering
-
-
-def open_sequence(path: str | Path, layout: str = "auto", *, poses: str = OURS, **options: Any) -> FrameSequence:
-    """Opens a recording, as :func:`ufmstar_torch.eval.sequences.open_sequence` with its arguments and errors, or a
-    tour, whose frames are rendered when they are indexed: ``tour:SEED``, with the options of :func:`open_tour` in the
-    name. Raises ValueError: also a layout or an option for a tour."""
-    if not str(path).startswith(PREFIX):
-        return on_disk.open_sequence(path, layout, poses=poses, **options)
-    if layout != "auto":
-        raise ValueError(f"layout must be auto for {path!r}, got {layout!r}")
-    if options:
-        raise ValueError(f"{path!r} takes no {', '.join(options)}: a tour's options stand in its name")
-    return on_disk.convert_poses(open_tour(str(path)), poses)
 
 
 def open_tour(name: str) -> FrameSequence:

@@ -9,10 +9,10 @@ from statistics import mean, median
 from typing import Any
 
 from ufmstar_torch.eval.engine.judge import ALONE, POSTERIOR, UFM, RunMetrics
-from ufmstar_torch.eval.results import machine
-from ufmstar_torch.eval.results.files import to_json
-from ufmstar_torch.eval.results.run_folder import RUN, RunFolder
-from ufmstar_torch.eval.results.run_job import RunJob
+from ufmstar_torch.eval.run import machine
+from ufmstar_torch.eval.run.files import to_json
+from ufmstar_torch.eval.run.run_folder import RUN, RunFolder
+from ufmstar_torch.eval.run.run_job import RunJob
 from ufmstar_torch.eval.sequences import FrameSequence
 from ufmstar_torch.mixture import GaussianMixture
 

@@ -12,9 +12,9 @@ from ufmstar_torch.eval.engine.estimators import Estimate
 from ufmstar_torch.eval.engine.judge import UFM, RunMetrics
 from ufmstar_torch.eval.engine.rows import RowFrame
 from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
-from ufmstar_torch.eval.results.run_folder import Checkpoint, RunFolder
-from ufmstar_torch.eval.results.run_job import RunJob, saved_state
-from ufmstar_torch.eval.results.summary import GOING_ON, NEAR_ZERO, write_summary
+from ufmstar_torch.eval.run.run_folder import Checkpoint, RunFolder
+from ufmstar_torch.eval.run.run_job import RunJob, saved_state
+from ufmstar_torch.eval.run.summary import GOING_ON, NEAR_ZERO, write_summary
 
 _MAPS = ("depth", "variance", "disagreement", "anchored", "bias", "posterior_depth", "posterior_variance")
 _COUNTS = ("components", "segments", "matched", "pairs", "new", "dropped", "valid_pixels")

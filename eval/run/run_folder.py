@@ -28,9 +28,9 @@ import torch
 from torch import Tensor
 
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.results.files import to_json, write_atomic, write_json_atomic
-from ufmstar_torch.eval.results.folder import FolderError, FolderKind, OutputFolder, remover
-from ufmstar_torch.eval.results.writers import FrameWriter
+from ufmstar_torch.eval.run.files import to_json, write_atomic, write_json_atomic
+from ufmstar_torch.eval.run.folder import FolderError, FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.writers import FrameWriter
 from ufmstar_torch.eval.sequences.own_output import read_journal
 
 FORMAT = 1

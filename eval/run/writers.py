@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ufmstar_torch.eval.results.files import write_together
+from ufmstar_torch.eval.run.files import write_together
 from ufmstar_torch.eval.sequences.images import read_map
 
 # Metres per count that a run may choose from, finest first: up to 65.5 m, 256 m (KITTI's), 655 m, 6.6 km.

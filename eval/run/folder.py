@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ufmstar_torch.eval.results.files import remove_temporaries, to_json, write_json_atomic
+from ufmstar_torch.eval.run.files import remove_temporaries, to_json, write_json_atomic
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
