@@ -1,244 +1,142 @@
-"""``ufmstar bench``: the time of UfM*, alone, with anchors and with the posterior, beside a network's forward pass.
-
-Every call of a frame follows the others in alternating order, so that a busy machine slows all of them alike.
-"""
+"""``ufmstar bench``: UfM*, with anchors and with the posterior, beside a network's forward pass, on the same frames."""
 
 from __future__ import annotations
 
-import copy
-import json
-import os
-import subprocess
-import sys
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ufmstar_torch import UfMStarConfig, UncertainDepth
-from ufmstar_torch.eval.bench.frames import BenchFrame, read_frames
-from ufmstar_torch.eval.bench.memory import state_memory
-from ufmstar_torch.eval.bench.settings import BenchSettings
-from ufmstar_torch.eval.bench.timing import StagedStep, TimedCalls, most_threads, pinned_threads
-from ufmstar_torch.eval.methods.ufm import UfM, UfMConfig
-from ufmstar_torch.eval.run import machine
-from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, load_network
-from ufmstar_torch.models.inference import Inference, runtime_of
+from ufmstar_torch.eval.bench.measure import Plan, measure
+from ufmstar_torch.eval.bench.networks import ONCE, TimedNetwork
+from ufmstar_torch.eval.bench.parts import MULTIVIEW
+from ufmstar_torch.eval.bench.settings import ARCHITECTURES, TOUR, BenchSettings
+from ufmstar_torch.eval.methods.method import BASES, Method
+from ufmstar_torch.eval.methods.row import Row
+from ufmstar_torch.eval.methods.setting import Setting
+from ufmstar_torch.eval.run.machine import available_cores, require_device
+from ufmstar_torch.eval.sequences import open_sequence
+from ufmstar_torch.eval.sequences.frame import Frame, FrameError
+from ufmstar_torch.models import FastDepth, FastDepthWidths, MonodepthResNet, Preprocess, load_network
+from ufmstar_torch.models.ensemble import Ensemble
+from ufmstar_torch.models.inference import Inference
 from ufmstar_torch.models.network import DepthNetwork
-from ufmstar_torch.prediction import DepthPrediction, infer
+from ufmstar_torch.prediction import DepthPrediction
 
-STEP, STAGED, MEAN, CORNERS, POSTERIOR, UFM = "UfM*", "stages", "mean", "UfM*, corners", "posterior, dense", "UfM"
-POINTS = 100_000  # of UfM
-_PIXELS = 1000  # of the image average
-_SIZES = (224, 518)
-_MULTIPLE = 32  # [px] of the sides that the reference networks take
-_WARM_UP, _TORCH_FRAMES = 3, 3
-_COMPILE = """
-import json, time
-from ufmstar_torch import UfMStar
-start = time.perf_counter()
-UfMStar().warm_up(({0}, {0}))
-print(json.dumps(time.perf_counter() - start))
-"""
+_ERROR, _GRID = 0.03, 4  # [1] standard deviation of a network's smooth relative error, and its nodes per side
 Progress = Callable[[str], object]
 
 
 def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None) -> dict[str, Any]:
     """Measure what the options ask for.
 
-    Args:
-        options: see :class:`BenchSettings`.
-        progress: is called with a description of what is measured next.
-
     Returns:
-        The report: settings, versions, hardware, load, "results" per size and backend (:func:`_measure`), and
-        "compilation" (:func:`measure_compilation`), None where it was not measured.
+        "schema", "date", "options" and "results": what :func:`ufmstar_torch.eval.bench.measure.measure` returns, for
+        every size.
 
     Raises:
         ValueError: an option is out of range, or the sequence has too few frames.
         FileNotFoundError, ModuleNotFoundError: a file or a package is missing.
     """
-    load, device = machine.load_average(), torch.device(machine.require_device(options.device))
-    threads = most_threads() if options.threads is None else options.threads
-    compilation = None
-    if not options.skip_compile and device.type == "cpu":
-        progress("compilation")
-        compilation = measure_compilation()
+    device = torch.device(require_device(options.device))
+    threads = options.threads or available_cores()
+    # A window of energy for each part, where there is a meter.
+    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
+    networks = (
+        [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
+    )
     results = []
-    with pinned_threads(threads):
-        network = _network(options, device)
-        for size in options.sizes or _SIZES if network is None else (0,):
-            results += _of_size(options, network, size, device, progress)
-    return {
-        "schema": 2,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": machine.versions(),
-        "hardware": machine.hardware() | {"gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else None},
-        "load_average": {"before": load, "after": machine.load_average()},
-        "settings": {
-            "sequence": options.sequence, "device": str(device), "threads": threads, "history": options.history,
-            "config": UfMStarConfig().to_dict(),
-        },
-        "compilation": compilation,
-        "results": results,
-    }  # fmt: skip
-
-
-def measure_compilation(size: int = 64) -> dict[str, float]:
-    """Seconds of ``warm_up`` in a new process: "cold_s" compiles, "warm_s" loads the compiled code from disk.
-
-    Raises:
-        subprocess.CalledProcessError: the process failed; its messages are on standard error.
-    """
-    with tempfile.TemporaryDirectory() as cache:
-        command, environment = [sys.executable, "-c", _COMPILE.format(size)], os.environ | {"NUMBA_CACHE_DIR": cache}
-        cold, warm = (
-            json.loads(subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout)
-            for _ in range(2)
+    for network in networks:
+        height, width = network.preprocess.size or (0, 0)
+        progress(f"{network.label} {height} x {width}, {options.history + options.frames} frames")
+        name = f"{TOUR}?frames={options.history + options.frames}&size={height}x{width}"
+        sequence = open_sequence(name if options.sequence == TOUR else options.sequence)
+        rows = [Row(Method.parse(name), setting) for name, setting in _rows(network.base, options.backends)]
+        results.append(
+            measure(rows, {network.base: network}, sequence, device=device, multiview_device=device, plan=plan)
         )
-    return {"cold_s": cold, "warm_s": warm}
+    used = {name: str(value) for name, value in vars(options).items() if value is not None}
+    return {"schema": 2, "date": datetime.now(UTC).isoformat(timespec="seconds"), "options": used, "results": results}
 
 
-class _Replay(nn.Module):
-    """Stands for the network in ``UncertainDepth``: returns a frame's prediction without computing it.
-
-    Attributes:
-        frame: whose prediction is returned next.
-    """
-
-    frame: BenchFrame
-
-    def prepare(self, image: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-        """The network's input and its intrinsics."""
-        return self.frame.network_input, self.frame.map_intrinsics
-
-    def forward(self, x: Tensor) -> DepthPrediction:
-        return self.frame.prediction
+def _rows(base: str, backends: tuple[str, ...]) -> list[tuple[str, Setting]]:
+    """Methods and settings: UfM, and for every backend UfM*, with corners, and the posterior with dense anchors."""
+    alone = BASES[base][1]
+    rows = [(f"UfM-{alone}-100K", Setting())]
+    for backend in backends:
+        of = {} if backend == "auto" else {"backend": backend}
+        kinds: tuple[dict[str, Any], ...] = ({}, {"anchors": "tracked"}, {"anchors": "dense", "posterior": True})
+        rows += [(f"UfM*-{alone}", Setting(overrides=of, **kind)) for kind in kinds]
+    return rows
 
 
-def _network(options: BenchSettings, device: torch.device) -> DepthNetwork | None:
-    """The network of the options, as ``ufmstar run`` runs it; None without weights."""
-    if options.weights is None:
-        return None
-    inference = Inference(runtime=options.runtime)
+class _Random(TimedNetwork):
+    """An architecture with random weights, for its time; its depth is the sequence's with smooth errors of 3 %."""
+
+    def prepare(self, frame: Frame, device: torch.device) -> tuple[Tensor, Tensor]:
+        """See :class:`TimedNetwork`. Raises FrameError: no depth at the image's pixels."""
+        x, K = super().prepare(frame, device)
+        if frame.depth is None or frame.depth_intrinsics is not None:
+            raise FrameError(frame.name, "has no depth at the image's pixels: predict depth with --weights")
+        depth = self.preprocess.apply_depth(torch.from_numpy(frame.depth)[None])
+        noise = torch.randn(1, 1, _GRID, _GRID, generator=torch.Generator().manual_seed(frame.index))
+        smooth = nn.functional.interpolate(_ERROR * noise, depth.shape[-2:], mode="bicubic", align_corners=True)[0]
+        self._depth = (depth * (1 + smooth)).to(device)
+        return x, K
+
+    def predict(self, part: str, x: Tensor, intrinsics: Tensor, *, turn: int = 0) -> DepthPrediction:
+        super().predict(part, x, intrinsics, turn=turn)
+        return DepthPrediction(self._depth)
+
+
+def _random(options: BenchSettings, side: int, device: torch.device) -> TimedNetwork:
+    """One of the paper's architectures with random weights, as it runs fastest in torch."""
+    size = (side, side)
+    network: DepthNetwork = MonodepthResNet(size=size)
+    if options.model == ARCHITECTURES[0]:
+        network = FastDepth(FastDepthWidths.pruned(), size=size).eval().folded()
+    network.preprocess = Preprocess(resize_height=side, crop=size, size=size)
+    return _Random("depth_only", [network.eval().to(device, memory_format=torch.channels_last)], options.model)
+
+
+def _loaded(options: BenchSettings, threads: int, device: torch.device) -> TimedNetwork:
+    """The network of the options, as ``ufmstar run`` runs it."""
+    assert options.weights is not None
+    inference = Inference(runtime=options.runtime, threads=threads)
     spec = {} if options.spec is None else {"spec": options.spec}
     loaded = load_network(options.model, options.weights, **spec, **inference.options(options.model, device))
-    return inference.ready(loaded, options.weights, device).to(device)
+    members = list(loaded.members) if isinstance(loaded, Ensemble) else [loaded]
+    ready = [inference.ready(member, options.weights, device).to(device) for member in members]
+    return TimedNetwork("ensemble" if len(ready) > 1 else "depth_only", ready, options.model)
 
 
-def _reference_networks(size: int, device: torch.device) -> dict[str, tuple[DepthNetwork, Tensor]]:
-    """The paper's two architectures with random weights, as they run fastest in torch, and their inputs: FastDepth
-    (with the widths of its published weights), and ResNet50-Monodepth2 where torchvision is installed."""
-    side = max(2 * _MULTIPLE, _MULTIPLE * round(size / _MULTIPLE))
-    networks: dict[str, DepthNetwork] = {"FastDepth": FastDepth(FastDepthWidths.pruned()).eval().folded()}
-    if find_spec("torchvision") is not None:
-        networks["ResNet50-Monodepth2"] = MonodepthResNet().eval()
-    image = torch.rand(1, 3, side, side).to(device)
-    return {name: (one.to(device, memory_format=torch.channels_last), image) for name, one in networks.items()}
+def format_report(report: Mapping[str, Any]) -> str:
+    """The machine, and a table for every size."""
+    return "\n\n".join("\n".join(_lines(result)) for result in report["results"])
 
 
-def _of_size(
-    options: BenchSettings, network: DepthNetwork | None, size: int, device: torch.device, progress: Progress
-) -> list[dict[str, Any]]:
-    """The results of one size of depth map, by every backend."""
-    what = f"{size} x {size}" if network is None else options.model
-    progress(f"{what}: frames, and {options.history} of them before the clock starts")
-    count = options.history + _WARM_UP + options.frames
-    frames = read_frames(options.sequence, count, network=network, size=size, device=device)
-    models, ufm = _models(device), UfM(UfMConfig(max_points=POINTS), device=device)
-    for frame in frames[: options.history]:
-        for model in models.values():
-            _run(model, frame)
-        _baseline(ufm, frame)
-    results = []
-    for backend in options.backends:
-        progress(f"{what}: backend {backend}")
-        timed = min(options.frames, _TORCH_FRAMES) if backend == "torch" else options.frames
-        chosen = frames[options.history : options.history + _WARM_UP + timed]
-        copies = {name: copy.deepcopy(model) for name, model in models.items()}
-        for model in copies.values():
-            model.ufm.config = model.ufm.config.replace(backend=backend)
-        results.append(_measure(copies, copy.deepcopy(ufm), network, chosen, backend, device))
-    return results
-
-
-def _models(device: torch.device) -> dict[str, UncertainDepth]:
-    """What is timed of UfM*, each with a state of its own; with anchors where OpenCV is installed."""
-    config = UfMStarConfig()
-    models = {name: UncertainDepth(_Replay(), config) for name in (STEP, STAGED, MEAN)}
-    if find_spec("cv2") is not None:
-        models[CORNERS] = UncertainDepth(_Replay(), config.replace(anchored=True), anchors="corners")
-        models[POSTERIOR] = UncertainDepth(_Replay(), config, posterior=True, anchors="dense")
-    for model in models.values():
-        model.preprocess = model.networks[0].prepare
-        model.to(device)
-    return models
-
-
-def _run(model: UncertainDepth, frame: BenchFrame) -> Any:
-    """One frame, up to the variance or to the posterior's maps."""
-    model.networks[0].frame = frame
-    out = model(frame.image, frame.pose, frame.intrinsics)
-    return out.ufm.posterior() if model.ufm.config.posterior else out
-
-
-def _baseline(ufm: UfM, frame: BenchFrame) -> Any:
-    prediction = frame.prediction
-    variances = prediction.aleatoric_variance, prediction.epistemic_variance
-    return ufm(prediction.depth, frame.pose, frame.map_intrinsics, *variances)
-
-
-def _measure(
-    models: dict[str, UncertainDepth], ufm: UfM, network: DepthNetwork | None, frames: list[BenchFrame], backend: str,
-    device: torch.device,
-) -> dict[str, Any]:  # fmt: skip
-    """Time every call on every frame.
-
-    Returns:
-        "rows": by name the spread of its times [ms]; "ratios": of each over the first network's forward pass of the
-        same frame; "stages" of a step; "memory" of the state; "components", "segments" and "anchors" of the last frame;
-        what the frames and networks are.
-    """
-    height, width = frames[0].prediction.depth.shape[-2:]
-    references = {} if network is not None else _reference_networks(height, device)
-    staged = StagedStep(models[STAGED].ufm, device)
-
-    def average(frame: BenchFrame) -> Any:
-        model = models[MEAN]
-        model.networks[0].frame = frame
-        return model.mean_uncertainty(frame.image, frame.pose, frame.intrinsics, pixels=min(_PIXELS, height * width))
-
-    calls: dict[str, Callable[[BenchFrame], Any]] = {
-        name: (lambda frame, one=one, x=x: _forward(one, x, frame)) for name, (one, x) in references.items()
-    }
-    if network is not None:
-        calls["network"] = lambda frame: _forward(network, frame.network_input, frame)
-    calls |= {name: (lambda frame, m=model: _run(m, frame)) for name, model in models.items() if name != MEAN}
-    calls |= {f"mean of {_PIXELS} pixels": average, f"UfM, {POINTS} points": lambda frame: _baseline(ufm, frame)}
-    timed, results = TimedCalls(), {}
-    for frame in timed.frames(frames, warm_up=_WARM_UP):
-        results = timed.call(calls, frame, device=device)
-    first = next(iter(calls))
-    rows = {name: timed.times.spread(name) for name in calls if name != STAGED}
-    anchored = results.get(CORNERS)
-    return {
-        "size": [height, width],
-        "backend": backend,
-        "frames": len(frames) - _WARM_UP,
-        "network": {first: runtime_of(network, "float32")} if network is not None else {n: "torch" for n in references},
-        "rows": rows,
-        "ratios": {name: timed.times.ratio(name, first) for name in rows if name not in ("network", *references)},
-        **staged.summary(warm_up=_WARM_UP),
-        "memory": {name: state_memory(models[name].ufm) for name in (STEP, CORNERS, POSTERIOR) if name in models},
-        "segments": int(results[STEP].ufm.statistics.segments),
-        "anchors": None if anchored is None else int(anchored.ufm.statistics.anchors_used),
-    }
-
-
-def _forward(network: DepthNetwork, x: Tensor, frame: BenchFrame) -> DepthPrediction:
-    with torch.inference_mode():
-        return infer(network, x, frame.map_intrinsics)
+def _lines(result: Mapping[str, Any]) -> list[str]:
+    machine, ((base, network),) = result["machine"], result["networks"].items()
+    hardware, load = machine["hardware"], machine["load"]
+    where = hardware["cpu"] if machine["gpu"] is None else machine["gpu"]
+    versions = ", ".join(f"{name} {value}" for name, value in machine["versions"].items() if value)
+    lines = [
+        f"{where}, {hardware['cores']} cores, {result['plan']['threads']} threads; {versions}",
+        f"{result['sequence']['name']}, {result['plan']['frames']} frames of {result['map']}"
+        + (f"; load average {load:.1f}: compare ratios and minima" if load and load > hardware["cores"] / 2 else ""),
+        f"{'[ms]':52}{'median':>9}{'IQR':>8}{'minimum':>9}{'x network':>11}{'state':>11}",
+    ]
+    rows = [(f"{network['label']} ({base})", network["latency"][ONCE], None, None)]
+    for row in result["rows"]:
+        ratio, kept = row["ratios_to_depth"][MULTIVIEW]["wall"]["median"], row["memory"]["multiview"]["bytes_end"]
+        rows.append((row["row"], row["latency"][MULTIVIEW], ratio, kept))
+    for name, times, ratio, kept in rows:
+        tail = "" if ratio is None else f"{ratio:11.3f}{kept / 1e3:8.1f} kB"
+        lines.append(f"{name:52}{times['median_ms']:9.2f}{times['iqr_ms']:8.2f}{times['min_ms']:9.2f}{tail}")
+    for row in result["rows"]:
+        if row["stages"] is not None:
+            stages = row["stages"]["stages"].items()
+            lines.append(f"stages of {row['row']}: " + ", ".join(f"{n} {t['median_ms']:.2f}" for n, t in stages))
+    return [*lines, *(f"no energy of the {unit}: {why}" for unit, why in result["power"]["missing"].items())]

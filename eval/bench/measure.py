@@ -20,7 +20,7 @@ from ufmstar_torch.checked import Checked, number
 from ufmstar_torch.eval.bench.energy import CPU, GPU, EnergyMeter, PartEnergy, measure_energy
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
-from ufmstar_torch.eval.bench.parts import MULTIVIEW, Part, TimedParts, inference_of, time_parts
+from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
 from ufmstar_torch.eval.bench.timing import pinned_threads
 from ufmstar_torch.eval.engine.clock import paired_ratio, spread, synchronize
 from ufmstar_torch.eval.methods.method import ALONE
@@ -124,6 +124,7 @@ def measure(
         "plan": asdict(plan),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": len(broken)},
         "power": {"missing": meter.missing, "idle_watts": idle},
+        "map": parts.size,
         "networks": {b: _network_line(networks[b], parts, energy) for b in networks if parts.ms(b, DEPTH)},
         "rows": [_row_line(row, networks[row.method.base], parts, energy) for row in chosen],
         "left_out": left_out,
@@ -205,7 +206,7 @@ def _obstacle(row: Row, networks: Mapping[str, TimedNetwork]) -> str | None:
         return f"it runs several members, {networks[base].label} has one"
     if setting.skip or setting.pose_noise:
         return "left out frames and noise on poses are no matter of efficiency"
-    return "`ufmstar bench` times UfM* with anchors" if setting.anchors else None
+    return None if setting.anchors in ANCHORS else f"anchors of {setting.anchors!r} have no cost of their own"
 
 
 def _unit(device: torch.device) -> str:
@@ -263,7 +264,7 @@ def _row_line(row: Row, network: TimedNetwork, parts: TimedParts, energy: Energi
         "stages": parts.staged[name].summary(warm_up=parts.warm_up) if name in parts.staged else None,
         "energy": {part: value.to_dict() for part, value in energies.items()} | words,
         "energy_overhead_percent": None if "not_separable" in (unknown or {}) else _energy_overhead(energies),
-        "memory": _memory(network, parts.memory.get(name)),
+        "memory": _memory(network.memory(), parts.memory.get(name)),
     }
 
 
@@ -283,12 +284,8 @@ def _energy_overhead(energies: Mapping[str, PartEnergy]) -> dict[str, float] | N
     return overhead or None
 
 
-def _memory(network: TimedNetwork, kept: Mapping[str, float] | None) -> dict[str, Any]:
+def _memory(memory: Mapping[str, int] | None, state: Mapping[str, float] | None) -> dict[str, Any]:
     """Bytes of the network for depth, of what uncertainty adds to it, and of the multiview state; the share."""
-    state = None
-    if kept is not None:
-        state = {"bytes_end": kept["bytes"], "count_end": kept["count"], "smoothing_bytes": kept["smoothing_bytes"]}
-    memory = network.memory()
     if memory is None:
         return {"multiview": state, "not_measurable": "the weights are not torch's tensors"}
     uncertainty = memory["uncertainty"] + (0 if state is None else state["bytes_end"])

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from torch import nn
 
-from ufmstar_torch import UfMStar
 from ufmstar_torch.models.onnx_network import OnnxNetwork
 
 
@@ -21,19 +20,6 @@ def weight_bytes(*modules: nn.Module) -> int:
     return sum({(t.data_ptr(), t.nbytes): t.nbytes for t in tensors}.values()) + sum(
         Path(path).stat().st_size for path in graphs
     )
-
-
-def state_memory(ufm: UfMStar) -> dict[str, int]:
-    """Bytes of the components in use, of the slots allocated, and of the moving average's map."""
-    mixture = ufm.mixture
-    each, components = mixture.bytes_per_component(), int(mixture.components.sum())
-    return {
-        "components": components,
-        "bytes_per_component": each,
-        "in_use": each * components,
-        "allocated": each * mixture.streams * mixture.capacity,
-        "moving_average": ufm.smoothed.nbytes,
-    }
 
 
 def overhead_percent(uncertainty: float, depth: float) -> float:

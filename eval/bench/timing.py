@@ -18,7 +18,6 @@ import torch
 
 from ufmstar_torch import UfMStar
 from ufmstar_torch.eval.engine.clock import CallTimes, StageTimer, spread, synchronize
-from ufmstar_torch.eval.run.machine import available_cores
 
 F = TypeVar("F")
 Name = TypeVar("Name", bound=Hashable)
@@ -36,30 +35,21 @@ def pinned_threads(count: int) -> Iterator[None]:
         ValueError: ``count`` is not positive or more than numba has started.
     """
     numba: Any = import_module("numba")
-    most = numba.config.NUMBA_NUM_THREADS
-    if not 1 <= count <= most:
-        raise ValueError(f"threads must be at least 1 and at most numba's {most}, got {count}")
-    # torch first: where numba's loops run on OpenMP, setting its number sets torch's as well.
-    libraries: list[tuple[Callable[[], int], Callable[[int], Any]]] = [
-        (torch.get_num_threads, torch.set_num_threads),
-        (numba.get_num_threads, numba.set_num_threads),
-    ]
+    if not 1 <= count <= numba.config.NUMBA_NUM_THREADS:
+        raise ValueError(f"threads must be 1 to {numba.config.NUMBA_NUM_THREADS} (numba's), got {count}")
+    # torch last: where numba's loops run on OpenMP, setting its number sets torch's as well.
+    libraries = [(numba.get_num_threads, numba.set_num_threads), (torch.get_num_threads, torch.set_num_threads)]
     if find_spec("cv2") is not None:
         cv2: Any = import_module("cv2")
-        libraries.append((cv2.getNumThreads, cv2.setNumThreads))
+        libraries.insert(0, (cv2.getNumThreads, cv2.setNumThreads))
     before = [read() for read, _ in libraries]
     try:
-        for _, write in reversed(libraries):
+        for _, write in libraries:
             write(count)
         yield
     finally:
-        for (_, write), number in reversed(list(zip(libraries, before, strict=True))):
+        for (_, write), number in zip(libraries, before, strict=True):
             write(number)
-
-
-def most_threads() -> int:
-    """The cores of this process, or fewer where numba may start fewer threads (``NUMBA_NUM_THREADS``)."""
-    return min(available_cores(), import_module("numba").config.NUMBA_NUM_THREADS)
 
 
 class TimedCalls:
@@ -75,24 +65,20 @@ class TimedCalls:
 
     def frames(self, frames: Iterable[F], *, warm_up: int = 0) -> Iterator[F]:
         """The frames; after the last one, the times of the first ``warm_up`` are dropped."""
-        for number, frame in enumerate(frames):
-            self._number = number
+        for self._number, frame in enumerate(frames):
             yield frame
         self.times.drop(warm_up)
 
-    def call(
-        self, calls: Mapping[Name, Callable[..., Any]], *args: Any, device: torch.device = _CPU
-    ) -> dict[Name, Any]:
+    def call(self, calls: Mapping[Name, Callable[[], Any]], device: torch.device = _CPU) -> dict[Name, Any]:
         """Make every call on the current frame; the results by name.
 
         Args:
             calls: by name.
-            args: of every call.
-            device: where the calls compute; it is waited for before and within the timed span.
+            device: where they compute; it is waited for before and within the timed span.
         """
 
-        def finished(call: Callable[..., Any]) -> Any:
-            result = call(*args)
+        def finished(call: Callable[[], Any]) -> Any:
+            result = call()
             synchronize(device)
             return result
 
@@ -111,14 +97,12 @@ class StagedStep:
     """
 
     def __init__(self, module: UfMStar, device: torch.device = _CPU) -> None:
-        self.module, self._device = module, device
+        self.module, self._timer = module, StageTimer(device)
         self.stages: dict[str, list[float]] = {name: [] for name in STAGES}
-        self._timer = StageTimer(device)
         module.observer = self
 
     def __call__(self, *args: Any) -> Any:
         """One step of the module."""
-        synchronize(self._device)
         self._timer.take()
         return self.module(*args)
 
