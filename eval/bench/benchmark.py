@@ -42,8 +42,7 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
     """
     device = torch.device(require_device(options.device))
     threads = options.threads or available_cores()
-    # A window of energy for each part, where there is a meter.
-    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
+    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads)
     networks = (
         [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
     )
@@ -125,12 +124,12 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
     lines = [
         f"{where}, {hardware['cores']} cores, {result['plan']['threads']} threads; {versions}",
         f"{result['sequence']['name']}, {result['plan']['frames']} frames of {result['map']}"
-        + (f"; load average {load:.1f}: compare ratios and minima" if load and load > hardware["cores"] / 2 else ""),
+        + (f"; load average {load:.1f}" if load else ""),
         f"{'[ms]':52}{'median':>9}{'IQR':>8}{'minimum':>9}{'x network':>11}{'state':>11}",
     ]
     rows = [(f"{network['label']} ({base})", network["latency"][ONCE], None, None)]
     for row in result["rows"]:
-        ratio, kept = row["ratios_to_depth"][MULTIVIEW]["wall"]["median"], row["memory"]["multiview"]["bytes_end"]
+        ratio, kept = row["ratios_to_depth"][MULTIVIEW]["median"], row["memory"]["multiview"]["bytes_end"]
         rows.append((row["row"], row["latency"][MULTIVIEW], ratio, kept))
     for name, times, ratio, kept in rows:
         tail = "" if ratio is None else f"{ratio:11.3f}{kept / 1e3:8.1f} kB"

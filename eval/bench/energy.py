@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
@@ -27,10 +26,8 @@ _NO_METER = {
 _CHIP = {GPU: ("gpu_energy_mj", "gpu_mj"), CPU: ("cpu_energy_mj", "cpu_total_mj")}
 _TRIAL = 0.2  # [s] A window that only shows which meters there are.
 Key = TypeVar("Key")
-
-
-class EnergyError(Exception):
-    """A unit has no meter, or the meter did not move; the message is the reason."""
+# Of a part, per window and frame: what its unit's meter counted [J], and the time [s], [N, 2]; or why there is none.
+Energy = NDArray[np.float64] | str
 
 
 class EnergyMeter:
@@ -67,13 +64,6 @@ class EnergyMeter:
                 joules[unit] = 1e-3 * known[0]
         return window.time, joules
 
-    def idle(self, seconds: float) -> dict[str, float]:
-        """Power by unit [W] while this process does nothing; {} without a meter."""
-        if {GPU, CPU} <= self.missing.keys():
-            return {}
-        passed, joules = self.measure(lambda: time.sleep(seconds))
-        return {unit: spent / passed for unit, spent in joules.items() if unit not in self.missing}
-
 
 def _open(gpu: int | None) -> Any:
     """zeus's monitor of this machine; None where zeus is not installed."""
@@ -90,76 +80,51 @@ def _open(gpu: int | None) -> Any:
     return ZeusMonitor(gpu_indices=[gpu] if gpu is not None and gpu < gpus else [])
 
 
-@dataclass(frozen=True, eq=False)
-class PartEnergy:
-    """Of one part, on the unit that it runs on.
+def difference(part: Energy, other: Energy) -> Energy:
+    """What a part takes beyond another one, window by window."""
+    return part if isinstance(part, str) else other if isinstance(other, str) else part - other
 
-    Attributes:
-        windows: [N, 3] per window and frame: all that the meter counted [J]; the same, less what it counts in the same
-            time while the process is idle [J]; and the time [s].
-        reason: why nothing was measured; there are no windows then.
-    """
 
-    windows: NDArray[np.float64]
-    reason: str | None = None
-
-    def minus(self, other: PartEnergy) -> PartEnergy:
-        """What this part takes beyond another one, window by window."""
-        reason = self.reason or other.reason
-        return PartEnergy(np.empty((0, 3)), reason) if reason else PartEnergy(self.windows - other.windows)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: medians and quartiles per frame [mJ], the time that goes with them [s], and power while the part
-        runs [W]; or the reason."""
-        if self.reason is not None:
-            return {"not_measurable": self.reason}
-        low, middle, high = np.percentile(self.windows, (25, 50, 75), axis=0).tolist()
-        *joules, seconds = self.windows.sum(0).tolist()
-        figures: dict[str, Any] = {"windows": len(self.windows)}
-        for column, name in enumerate(("gross", "net")):
-            figures[name] = {
-                "millijoules": 1e3 * middle[column], "q1": 1e3 * low[column], "q3": 1e3 * high[column],
-                # The time of a difference may be negative: there is no power then.
-                "seconds": middle[2], "watts": joules[column] / seconds if seconds > 0 else None,
-            }  # fmt: skip
-        return figures
+def summary(energy: Energy) -> dict[str, Any]:
+    """For JSON: median and quartiles per frame [mJ], and the time that goes with them [s]; or the reason."""
+    if isinstance(energy, str):
+        return {"not_measurable": energy}
+    low, middle, high = np.percentile(energy, (25, 50, 75), axis=0).tolist()
+    joules = {"millijoules": 1e3 * middle[0], "q1": 1e3 * low[0], "q3": 1e3 * high[0]}
+    return {"gross": {**joules, "seconds": middle[1]}, "windows": len(energy)}
 
 
 def measure_energy(
     meter: EnergyMeter,
     work: Mapping[Key, tuple[str, Sequence[Callable[[], object]]]],
-    idle: Mapping[str, float],
     *,
     seconds: float,
     windows: int,
-) -> dict[Key, PartEnergy]:
+) -> dict[Key, Energy]:
     """Measure every part.
 
     Args:
         meter: of this machine.
         work: by part: the unit whose meter counts ("gpu" or "cpu"), and a call for each frame, which returns when its
             device has finished; a window makes them over and over.
-        idle: power by unit [W].
         seconds: that a window lasts, at least [s].
         windows: per part.
     """
     results: dict[Key, list[list[float]]] = {key: [] for key in work}
-    reasons: dict[Key, str] = {}
+    reasons = {key: meter.missing[unit] for key, (unit, _) in work.items() if unit in meter.missing}
     for turn in range(windows):
-        for key in list(work)[:: 1 if turn % 2 == 0 else -1]:
-            try:
-                results[key].append(_window(meter, *work[key], idle, seconds))
-            except EnergyError as error:
-                reasons[key] = str(error)
-    return {key: PartEnergy(np.array(rows).reshape(-1, 3), reasons.get(key)) for key, rows in results.items()}
+        for key in [key for key in work if key not in reasons][:: 1 if turn % 2 == 0 else -1]:
+            unit, calls = work[key]
+            frames, (passed, joules) = _window(meter, calls, seconds)
+            if joules.get(unit, 0) <= 0:
+                reasons[key] = f"the meter of the {unit} did not move in {passed:.2g} s"
+            else:
+                results[key].append([joules[unit] / frames, passed / frames])
+    return {key: reasons.get(key) or np.array(rows) for key, rows in results.items()}
 
 
-def _window(
-    meter: EnergyMeter, unit: str, calls: Sequence[Callable[[], object]], idle: Mapping[str, float], seconds: float
-) -> list[float]:
-    """Joules, net joules and seconds per frame of one window. Raises EnergyError: there are none."""
-    if unit in meter.missing:
-        raise EnergyError(meter.missing[unit])
+def _window(meter: EnergyMeter, calls: Sequence[Callable[[], object]], seconds: float) -> tuple[int, Any]:
+    """Frames, and what ``measure`` returns, of one window."""
     frames = 0
 
     def work() -> None:
@@ -169,7 +134,5 @@ def _window(
             calls[frames % len(calls)]()
             frames += 1
 
-    passed, joules = meter.measure(work)
-    if joules.get(unit, 0) <= 0:
-        raise EnergyError(f"the meter of the {unit} did not move in {passed:.2g} s")
-    return [joules[unit] / frames, (joules[unit] - idle[unit] * passed) / frames, passed / frames]
+    measured = meter.measure(work)
+    return frames, measured

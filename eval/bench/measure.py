@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ufmstar_torch.checked import Checked, number
-from ufmstar_torch.eval.bench.energy import CPU, GPU, EnergyMeter, PartEnergy, measure_energy
+from ufmstar_torch.eval.bench.energy import CPU, GPU, Energy, EnergyMeter, difference, measure_energy, summary
 from ufmstar_torch.eval.bench.memory import overhead_percent
 from ufmstar_torch.eval.bench.networks import DEPTH, EVERY, ONCE, TimedNetwork, timed_networks
 from ufmstar_torch.eval.bench.parts import ANCHORS, MULTIVIEW, Part, TimedParts, inference_of, time_parts
@@ -31,12 +31,10 @@ from ufmstar_torch.eval.run.machine import available_cores, device_of, hardware,
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 
 EFFICIENCY = "efficiency.json"
-FORMAT = 1
 NETWORK = "network_uncertainty"
 NOT_NEEDED = "the method needs only depth of the network"
-_CLOCKS = {"wall": "wall", "processor": "cpu"}  # by the name in the result: the clock of ``TimedParts.ms``
 
-Energies = Mapping[Part, PartEnergy]
+Energies = Mapping[Part, Energy]
 
 
 @dataclass(frozen=True)
@@ -48,8 +46,7 @@ class Plan(Checked):
         warm_up: frames before them, which are run but not counted.
         threads: of torch and numba on the CPU; None = all cores that this process may use.
         seconds: a window of energy lasts at least so long [s].
-        windows: of energy per part.
-        idle: for so long nothing is done, for the idle power [s].
+        windows: of energy per part and sequence.
 
     Raises:
         ValueError: a number out of range.
@@ -59,8 +56,7 @@ class Plan(Checked):
     warm_up: int = number(5, "", "1", 0)
     threads: int | None = number(None, "", "1", 1)
     seconds: float = number(3.0, "", "s", 0.0, open_low=True)
-    windows: int = number(3, "", "1", 1)
-    idle: float = number(10.0, "", "s", 0.0, open_low=True)
+    windows: int = number(1, "", "1", 1)
 
 
 def measure(
@@ -99,14 +95,12 @@ def measure(
     if not chosen:
         raise ValueError(f"rows must hold one that can be measured: {left_out or 'none was given'}")
     broken: list[FrameError] = []
-    wanted = plan.warm_up + plan.frames
-    frames = list(islice(sequence.readable(broken.append), wanted))
+    frames = list(islice(sequence.readable(broken.append), wanted := plan.warm_up + plan.frames))
     if len(frames) < wanted:
         raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
     meter = meter or EnergyMeter(None if on_gpu is None else on_gpu.index or 0)
     with pinned_threads(plan.threads or 1):
-        idle = meter.idle(plan.idle)
         parts = time_parts(
             chosen, networks, frames, warm_up=plan.warm_up, device=device, multiview_device=multiview_device
         )
@@ -114,16 +108,16 @@ def measure(
         for (owner, part), calls in parts.calls.items():
             where = multiview_device if part == MULTIVIEW else device
             work[owner, part] = (_unit(where), [partial(_finished, call, where) for call in calls])
-        energy = measure_energy(meter, work, idle, seconds=plan.seconds, windows=plan.windows)
+        energy = measure_energy(meter, work, seconds=plan.seconds, windows=plan.windows)
     units = {DEPTH: _unit(device), NETWORK: _unit(device), MULTIVIEW: _unit(multiview_device)}
     gpu = None if on_gpu is None else torch.cuda.get_device_name(on_gpu)
     return {
-        "format": FORMAT,
+        "format": 1,
         "machine": {"hardware": hardware(), "versions": versions(), "load": load_average(), "gpu": gpu},
         "devices": {"networks": str(device), "multiview": str(multiview_device), "units": units},
         "plan": asdict(plan),
         "sequence": {"name": sequence.name, "layout": sequence.layout, "unreadable": len(broken)},
-        "power": {"missing": meter.missing, "idle_watts": idle},
+        "power": {"missing": meter.missing},
         "map": parts.size,
         "networks": {b: _network_line(networks[b], parts, energy) for b in networks if parts.ms(b, DEPTH)},
         "rows": [_row_line(row, networks[row.method.base], parts, energy) for row in chosen],
@@ -134,15 +128,14 @@ def measure(
 def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json.
 
-    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Of sequences with fewer frames
-    than the plan has, all are taken; windows of energy are divided among the sequences, at least one for each.
+    UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Sequences may have fewer frames
+    than the plan.
 
     Raises:
         ValueError: no sequence can be opened, none has frames enough, or no row can be measured.
         OSError: the file cannot be written.
     """
     plan = plan or Plan()
-    plan = replace(plan, windows=-(-plan.windows // max(1, len(job.items))))
     device = device_of(job.device, 0)
     networks = timed_networks(job.load(torch.device(device)), job.suite.rows)
     measured: dict[tuple[str, str], dict[str, Any]] = {}
@@ -191,8 +184,6 @@ def _mean(values: Sequence[Any]) -> Any:
     first = values[0]
     if isinstance(first, Mapping) and all(isinstance(v, Mapping) and v.keys() == first.keys() for v in values):
         return {name: _mean([value[name] for value in values]) for name in first}
-    if isinstance(first, list) and all(isinstance(v, list) and len(v) == len(first) for v in values):
-        return [_mean(parts) for parts in zip(*values, strict=True)]
     numbers = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
     return sum(values) / len(values) if numbers and any(v != first for v in values) else first
 
@@ -231,7 +222,7 @@ def _network_line(network: TimedNetwork, parts: TimedParts, energy: Energies) ->
         "whole": network.why_whole,
         "memory": network.memory(),
         "latency": {form: spread(parts.ms(network.base, form)) for form in forms},
-        "energy": {form: energy[network.base, form].to_dict() for form in forms},
+        "energy": {form: summary(energy[network.base, form]) for form in forms},
     }
 
 
@@ -243,15 +234,14 @@ def _row_line(row: Row, network: TimedNetwork, parts: TimedParts, energy: Energi
         unknown = {"none": NOT_NEEDED}
     elif network.why_whole is not None and not row.method.every_member:
         unknown = {"not_separable": network.why_whole}
-    depth = {name: np.array(parts.ms(base, DEPTH, clock)) for name, clock in _CLOCKS.items()}
-    times: dict[str, dict[str, np.ndarray]] = {}
+    depth = parts.ms(base, DEPTH)
+    times: dict[str, list[float]] = {}
     energies = {DEPTH: energy[base, DEPTH]}
     if unknown is None:
-        times[NETWORK] = {c: parts.ms(base, form, clock) - depth[c] for c, clock in _CLOCKS.items()}
-        energies[NETWORK] = energy[base, form].minus(energy[base, DEPTH])
+        times[NETWORK] = [a - b for a, b in zip(parts.ms(base, form), depth, strict=True)]
+        energies[NETWORK] = difference(energy[base, form], energy[base, DEPTH])
     if row.method.fusion != ALONE:
-        times[MULTIVIEW] = {c: np.array(parts.ms(name, MULTIVIEW, clock)) for c, clock in _CLOCKS.items()}
-        energies[MULTIVIEW] = energy[name, MULTIVIEW]
+        times[MULTIVIEW], energies[MULTIVIEW] = parts.ms(name, MULTIVIEW), energy[name, MULTIVIEW]
     words = {} if unknown is None else {NETWORK: unknown}
     return {
         "method": row.method.name,
@@ -259,29 +249,22 @@ def _row_line(row: Row, network: TimedNetwork, parts: TimedParts, energy: Energi
         "row": name,
         "base": base,
         "network": network.label,
-        "latency": {part: spread(ms["wall"].tolist()) for part, ms in ({DEPTH: depth} | times).items()} | words,
-        "ratios_to_depth": {part: {c: paired_ratio(ms[c], depth[c]) for c in ms} for part, ms in times.items()},
+        "latency": {part: spread(ms) for part, ms in ({DEPTH: depth} | times).items()} | words,
+        "ratios_to_depth": {part: paired_ratio(ms, depth) for part, ms in times.items()},
         "stages": parts.staged[name].summary(warm_up=parts.warm_up) if name in parts.staged else None,
-        "energy": {part: value.to_dict() for part, value in energies.items()} | words,
+        "energy": {part: summary(value) for part, value in energies.items()} | words,
         "energy_overhead_percent": None if "not_separable" in (unknown or {}) else _energy_overhead(energies),
         "memory": _memory(network.memory(), parts.memory.get(name)),
     }
 
 
-def _energy_overhead(energies: Mapping[str, PartEnergy]) -> dict[str, float] | None:
-    """Share of uncertainty in all energy [%], gross and net; None unless all of it was measured.
-
-    A difference that the noise makes negative counts as nothing.
-    """
-    if any(part.reason is not None for part in energies.values()):
-        return None
-    overhead: dict[str, float] = {}
-    for column, kind in enumerate(("gross", "net")):
-        middle = {key: float(np.median(part.windows[:, column])) for key, part in energies.items()}
-        depth = middle.pop(DEPTH)
-        if depth > 0:
-            overhead[kind] = overhead_percent(sum(max(0.0, value) for value in middle.values()), depth)
-    return overhead or None
+def _energy_overhead(energies: Mapping[str, Energy]) -> dict[str, float] | None:
+    """Share of uncertainty in all energy [%], negative differences as nothing; None unless all of it was measured."""
+    joules = {key: max(0.0, float(np.median(e[:, 0]))) for key, e in energies.items() if not isinstance(e, str)}
+    depth = joules.pop(DEPTH, 0.0)
+    return (
+        {"gross": overhead_percent(sum(joules.values()), depth)} if depth and len(joules) + 1 == len(energies) else None
+    )
 
 
 def _memory(memory: Mapping[str, int] | None, state: Mapping[str, float] | None) -> dict[str, Any]:

@@ -96,16 +96,18 @@ class MultiviewStep:
 
     def memory(self) -> dict[str, float]:
         """Bytes and number of the points or components, what anchors add included; bytes of the map for smoothing."""
-        if isinstance(self.ufm, UfM):
+        if self._model is None:
             cloud = self.ufm.clouds()[0]
-            return {"bytes_end": len(cloud.count) * cloud.bytes_per_point, "count_end": len(cloud.count),
-                    "smoothing_bytes": 0}  # fmt: skip
-        mixture = self.ufm.mixture
-        count, plain = int(mixture.components.sum()), {f"ufm.{name}" for name in UfMStar().state_dict()}
-        state = self._model.state_dict() if self._model is not None else {}
-        added = sum(v.nbytes for name, v in state.items() if name not in plain and isinstance(v, Tensor))
-        kept = count * mixture.bytes_per_component() + (added if self._row.setting.anchors else 0)
-        return {"bytes_end": kept, "count_end": count, "smoothing_bytes": self.ufm.smoothed.nbytes}
+            count, each, smoothing = len(cloud.count), cloud.bytes_per_point, 0
+        else:
+            count, each = int(self.ufm.mixture.components.sum()), self.ufm.mixture.bytes_per_component()
+            smoothing = self.ufm.smoothed.nbytes
+        kept = count * each
+        if self._model is not None and self._row.setting.anchors:
+            plain = {f"ufm.{name}" for name in UfMStar().state_dict()}
+            state = self._model.state_dict().items()
+            kept += sum(v.nbytes for name, v in state if name not in plain and isinstance(v, Tensor))
+        return {"bytes_end": kept, "count_end": count, "smoothing_bytes": smoothing}
 
 
 @dataclass
@@ -128,16 +130,15 @@ class TimedParts:
     memory: dict[str, dict[str, float]] = field(default_factory=dict)
     size: str = ""
 
-    def ms(self, owner: str, part: str, clock: str = "wall") -> list[float]:
-        """Times of a part by a clock, "wall" or "cpu" [ms], one per frame; none if it was not run."""
-        times: list[float] = getattr(self.timed.times, clock).get((owner, part), [])
-        return times
+    def ms(self, owner: str, part: str) -> list[float]:
+        """Times of a part [ms], one per frame; none if it was not run."""
+        return self.timed.times.wall.get((owner, part), [])
 
     def run(self, calls: Mapping[Part, Callable[[], Any]], device: torch.device) -> dict[Part, Any]:
         """Time the parts of a frame on a device; what they return."""
         for part, call in calls.items():
             self.calls.setdefault(part, []).append(call)
-        return self.timed.call(calls, device=device)
+        return self.timed.call(calls, device)
 
 
 def inference_of(row: Row) -> str:
