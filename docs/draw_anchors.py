@@ -26,7 +26,7 @@ from scipy.stats import spearmanr
 
 from ufmstar_torch import UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import LandmarkTracker
-from ufmstar_torch.eval.report.outputs import field_of_view
+from ufmstar_torch.eval.run.pictures import field_of_view
 from ufmstar_torch.eval.sequences.frame import FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import truth_at
 from ufmstar_torch.eval.sequences.images import image_tensor

@@ -20,10 +20,8 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics import NLL
 from ufmstar_torch.eval.report import pictures as pictures_module
-from ufmstar_torch.eval.report.colours import INVALID_GREY
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, RowMaps, find_examples
-from ufmstar_torch.eval.report.panels import break_name
 from ufmstar_torch.eval.report.pictures import (
     BREAKDOWN,
     COMPARE,
@@ -56,6 +54,8 @@ from ufmstar_torch.eval.report.rooms import (
 from ufmstar_torch.eval.report.write import write_report
 from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.results.worklist import WorkItem
+from ufmstar_torch.eval.run.colours import INVALID_GREY
+from ufmstar_torch.eval.run.panels import break_name
 
 K = np.array([[20.0, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])
 

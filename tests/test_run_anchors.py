@@ -15,12 +15,12 @@ from ufmstar_torch.anchors.tracker import LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.commands.run import job_from, run
 from ufmstar_torch.eval.commands.run_command import read
 from ufmstar_torch.eval.engine.maps import MapSource, PredictedMap
-from ufmstar_torch.eval.report.outputs import Finished
-from ufmstar_torch.eval.report.panels import map_columns
 from ufmstar_torch.eval.report.text import run_table
-from ufmstar_torch.eval.report.video import preview_frame
 from ufmstar_torch.eval.run.folder import FolderError
 from ufmstar_torch.eval.run.journal import why_none
+from ufmstar_torch.eval.run.panels import map_columns
+from ufmstar_torch.eval.run.pictures import Finished
+from ufmstar_torch.eval.run.video import preview_frame
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models import Preprocess

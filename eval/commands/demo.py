@@ -42,10 +42,10 @@ from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.ufm import UfMConfig
 from ufmstar_torch.eval.report.outputs import DEMO_FILES, ENSEMBLE, NETWORK, POSTERIOR, panel, write_pictures
-from ufmstar_torch.eval.report.panels import FramePanel
 from ufmstar_torch.eval.report.text import demo_names
 from ufmstar_torch.eval.run.files import to_json, write_json_atomic
 from ufmstar_torch.eval.run.folder import FolderKind, OutputFolder, remover
+from ufmstar_torch.eval.run.panels import FramePanel
 from ufmstar_torch.eval.run.summary import versions
 from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 from ufmstar_torch.eval.sequences.ground_truth import resample_nearest

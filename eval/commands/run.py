@@ -26,9 +26,9 @@ from ufmstar_torch.eval.engine.predictions import DepthSource
 from ufmstar_torch.eval.engine.progress import Progress, ProgressSink
 from ufmstar_torch.eval.engine.stream import FrameStream, Stopped
 from ufmstar_torch.eval.engine.warm_up import warm_up_command
-from ufmstar_torch.eval.report.outputs import Finished, common_columns, draw_sheet, draw_video, mixture_writers
 from ufmstar_torch.eval.run.files import write_json_atomic
 from ufmstar_torch.eval.run.journal import Journal
+from ufmstar_torch.eval.run.pictures import Finished, common_columns, draw_sheet, draw_video, mixture_writers
 from ufmstar_torch.eval.run.run_folder import RunFolder
 from ufmstar_torch.eval.run.run_job import RunJob
 from ufmstar_torch.eval.run.summary import FAILED, FINISHED, GOING_ON, INTERRUPTED, write_summary

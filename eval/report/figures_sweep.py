@@ -19,11 +19,11 @@ from ufmstar_torch.eval.methods.method import ALONE, BASES, Method
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import DEFAULTS, DENSE, TRACKED, TRUTH, default_of
 from ufmstar_torch.eval.report import names, style
-from ufmstar_torch.eval.report.colours import FAINT, INK, plain
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.means import Mean, difference, mean_of
 from ufmstar_torch.eval.report.style import Look
 from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.run.colours import FAINT, INK, plain
 
 COUNT = "anchor_count"
 Rest = tuple[tuple[str, Any], ...]

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from ufmstar_torch.eval.methods.method import ALONE, UFM, UFM_STAR, Method
 from ufmstar_torch.eval.methods.row import Row, plain_rows
-from ufmstar_torch.eval.report.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.examples import Example, find_examples
 from ufmstar_torch.eval.report.names import row_label
-from ufmstar_torch.eval.report.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 from ufmstar_torch.eval.report.rooms import Snapshot, choose_times, draw_room, find_rooms
 from ufmstar_torch.eval.results.worklist import WorkItem
+from ufmstar_torch.eval.run.colours import DEPTH_MAP, ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.panels import Bar, Box, GridRow, Panel, PanelScales, draw_grid
 
 STRIP, BREAKDOWN, COMPARE, ROOM = "strip", "breakdown", "compare", "room"
 # So that a report of a hundred sequences stays one that can be read, and mailed.

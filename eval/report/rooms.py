@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import ERROR_MAP, FAINT, INK, ColourScale, plain, robust_range, save_png
 from ufmstar_torch.eval.report.examples import load_arrays
-from ufmstar_torch.eval.report.panels import Bar, axes_at, draw_bar, new_sheet, say
+from ufmstar_torch.eval.run.colours import ERROR_MAP, FAINT, INK, ColourScale, plain, robust_range, save_png
+from ufmstar_torch.eval.run.panels import Bar, axes_at, draw_bar, new_sheet, say
 
 Array = NDArray[np.float64]
 # A patch that is evenly covered from -a to a has sigma = a / sqrt(3): so drawn, an ellipse is as large as its patch.

@@ -10,10 +10,11 @@ from typing import Any
 
 from ufmstar_torch.eval.methods.method import UFM, UFM_STAR
 from ufmstar_torch.eval.report.data import Results
-from ufmstar_torch.eval.report.outputs import CURVES, ELLIPSOIDS, ENSEMBLE, NETWORK, PLY, POSTERIOR, SHEET
+from ufmstar_torch.eval.report.outputs import CURVES, ENSEMBLE, NETWORK, POSTERIOR
 from ufmstar_torch.eval.report.table import markdown
 from ufmstar_torch.eval.report.tables import NLL_OF_FEW, main_table
 from ufmstar_torch.eval.report.write import Report
+from ufmstar_torch.eval.run.pictures import ELLIPSOIDS, PLY, SHEET
 from ufmstar_torch.eval.run.summary import NEAR_ZERO
 
 _CALIBRATION = {"nll": "NLL", "ece_delta": "ECE_delta", "ece_q": "ECE_q"}

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report.colours import FAINT, INK, colour_table, require_matplotlib
-from ufmstar_torch.eval.report.panels import FramePanel, MapColumn
+from ufmstar_torch.eval.run.colours import FAINT, INK, colour_table, require_matplotlib
+from ufmstar_torch.eval.run.panels import FramePanel, MapColumn
 
 GAP, HEAD, FOOT, BAR = 4, 22, 36, 8  # pixels
 

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ufmstar_torch.eval.report import colours
-from ufmstar_torch.eval.report.colours import FAINT, INK, ColourScale
+from ufmstar_torch.eval.run import colours
+from ufmstar_torch.eval.run.colours import FAINT, INK, ColourScale
 
 # (left, top, width, height) in pixels of the map.
 Box = tuple[int, int, int, int]

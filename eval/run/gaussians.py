@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ufmstar_torch.eval.report.colours import ERROR_MAP, ColourScale, robust_range
+from ufmstar_torch.eval.run.colours import ERROR_MAP, ColourScale, robust_range
 from ufmstar_torch.eval.run.files import write_atomic
 from ufmstar_torch.mixture import GaussianMixture
 
