@@ -42,7 +42,7 @@ def run_benchmark(options: BenchSettings, progress: Progress = lambda text: None
     """
     device = torch.device(require_device(options.device))
     threads = options.threads or available_cores()
-    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads)
+    plan = Plan(frames=options.frames, warm_up=options.history, threads=threads, windows=1)
     networks = (
         [_loaded(options, threads, device)] if options.weights else (_random(options, s, device) for s in options.sizes)
     )

@@ -46,7 +46,7 @@ class Plan(Checked):
         warm_up: frames before them, which are run but not counted.
         threads: of torch and numba on the CPU; None = all cores that this process may use.
         seconds: a window of energy lasts at least so long [s].
-        windows: of energy per part and sequence.
+        windows: of energy per part.
 
     Raises:
         ValueError: a number out of range.
@@ -56,7 +56,7 @@ class Plan(Checked):
     warm_up: int = number(5, "", "1", 0)
     threads: int | None = number(None, "", "1", 1)
     seconds: float = number(3.0, "", "s", 0.0, open_low=True)
-    windows: int = number(1, "", "1", 1)
+    windows: int = number(3, "", "1", 1)
 
 
 def measure(
@@ -94,13 +94,13 @@ def measure(
     chosen = [row for row in rows if row.label not in left_out]
     if not chosen:
         raise ValueError(f"rows must hold one that can be measured: {left_out or 'none was given'}")
-    broken: list[FrameError] = []
-    frames = list(islice(sequence.readable(broken.append), wanted := plan.warm_up + plan.frames))
-    if len(frames) < wanted:
-        raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
     on_gpu = next((d for d in (device, multiview_device) if d.type == "cuda"), None)
     meter = meter or EnergyMeter(None if on_gpu is None else on_gpu.index or 0)
     with pinned_threads(plan.threads or 1):
+        broken: list[FrameError] = []
+        frames = list(islice(sequence.readable(broken.append), wanted := plan.warm_up + plan.frames))
+        if len(frames) < wanted:
+            raise ValueError(f"{sequence.name} has {len(frames)} readable frames, the plan needs {wanted}")
         parts = time_parts(
             chosen, networks, frames, warm_up=plan.warm_up, device=device, multiview_device=multiview_device
         )
@@ -129,13 +129,14 @@ def measure_job(job: EvalJob, plan: Plan | None = None) -> None:
     """Measure the rows on the sequences of an evaluation, and write their means to OUT/efficiency.json.
 
     UfM and UfM* run on the CPU, as the paper's do, the networks on the job's device. Sequences may have fewer frames
-    than the plan.
+    than the plan; its windows of energy are divided among them.
 
     Raises:
         ValueError: no sequence can be opened, none has frames enough, or no row can be measured.
         OSError: the file cannot be written.
     """
     plan = plan or Plan()
+    plan = replace(plan, windows=-(-plan.windows // max(1, len(job.items))))
     device = device_of(job.device, 0)
     networks = timed_networks(job.load(torch.device(device)), job.suite.rows)
     measured: dict[tuple[str, str], dict[str, Any]] = {}
