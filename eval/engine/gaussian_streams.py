@@ -137,7 +137,6 @@ def _padded(each: Sequence[Anchors | None]) -> Anchors | None:
     if not given:
         return None
     room = max(anchors.depth.shape[1] for anchors in given)
-    confirmed = all(anchors.confirmed is not None for anchors in given)
 
     def part(name: str, anchors: Anchors | None) -> Tensor:
         like = getattr(given[0], name)
@@ -150,5 +149,5 @@ def _padded(each: Sequence[Anchors | None]) -> Anchors | None:
             out[:, : value.shape[1]] = value
         return out
 
-    names = ("pixel", "depth", "variance", "valid", *(("confirmed",) if confirmed else ()))
+    names = ("pixel", "depth", "variance", "valid")
     return Anchors(**{name: torch.cat([part(name, anchors) for anchors in each]) for name in names})
