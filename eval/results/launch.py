@@ -23,7 +23,7 @@ from typing import Any
 
 import torch
 
-from ufmstar_torch.eval.engine.evaluate import evaluate_sequences
+from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.results.eval_folder import EvalFolder
 from ufmstar_torch.eval.results.work import EvalJob, Evaluate, Worker, WorkerTask
 from ufmstar_torch.eval.results.worklist import Shard
@@ -124,7 +124,7 @@ def evaluate_suite(
     stop: Stop,
     report: Report,
     progress: Callable[[str, int, int], None],
-    evaluate: Evaluate = evaluate_sequences,
+    evaluate: Evaluate = evaluate_sequence,
 ) -> EvalOutcome:
     """Evaluate a job; ``progress`` and ``evaluate`` (see ``Worker``) are of this process's own work.
 

@@ -20,7 +20,7 @@ from ufmstar_torch.eval.engine.stream import FrameResult, FrameSink, FrameStream
 _WAITING = 4
 
 
-class Behind(FrameSink):
+class WriterThread(FrameSink):
     """A sink that hands the results to other sinks in a thread of its own, with the stream's state after each frame.
 
     Use it as a context: at the end of the block, whatever ended it, all results taken have gone through the sinks. The
@@ -38,7 +38,7 @@ class Behind(FrameSink):
         self._waiting: deque[Future[None]] = deque()
         self._intact = True
 
-    def __enter__(self) -> Behind:
+    def __enter__(self) -> WriterThread:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -11,7 +11,7 @@ from ufmstar_torch.eval.sequences.frame import Frame, FrameSequence
 _AHEAD = 2  # frames; decoding releases Python's lock
 
 
-class FramesAhead:
+class Prefetch:
     """The frames of a sequence at some indices, in order, read by one thread that is at most two frames ahead and calls
     ``prepare`` with each. Use it as a context; the thread ends with the block."""
 
@@ -22,7 +22,7 @@ class FramesAhead:
         self._thread = ThreadPoolExecutor(1)
         self._reading: deque[Future[Frame]] = deque()
 
-    def __enter__(self) -> FramesAhead:
+    def __enter__(self) -> Prefetch:
         return self
 
     def __exit__(self, *_: object) -> None:
