@@ -19,8 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ufmstar_torch.checked import Checked
-from ufmstar_torch.models.aligned import AlignedNetwork
-from ufmstar_torch.models.alignment import KINDS, Alignment
+from ufmstar_torch.models.alignment import KINDS, AlignedNetwork, Alignment
 from ufmstar_torch.models.checkpoints import DAMAGE, CheckpointError, some
 from ufmstar_torch.models.network import DepthNetwork, require_image
 from ufmstar_torch.models.outputs import METRIC, as_map
