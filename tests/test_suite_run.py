@@ -19,12 +19,12 @@ from tiny_suite import evaluate, rows_of
 from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError, evaluate_sequence
 from ufmstar_torch.eval.report.data import load_results
-from ufmstar_torch.eval.results.cache import CacheError
-from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.record import Record
-from ufmstar_torch.eval.results.work import DIED, with_references
-from ufmstar_torch.eval.results.worklist import Shard, content_digest
 from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.suite.cache import CacheError
+from ufmstar_torch.eval.suite.folder import EvalFolder
+from ufmstar_torch.eval.suite.record import Record
+from ufmstar_torch.eval.suite.work import DIED, with_references
+from ufmstar_torch.eval.suite.work_items import Shard, content_digest
 
 
 def folder_of(job):

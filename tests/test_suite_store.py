@@ -20,10 +20,10 @@ from suite_runs import NAMES, go, job_on, write_rooms
 from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.metrics.packed_sums import pack, unpack
-from ufmstar_torch.eval.results.claim import ABANDONED_SECONDS
-from ufmstar_torch.eval.results.eval_folder import EvalFolder
-from ufmstar_torch.eval.results.worklist import Shard, WorkItem, content_digest, find_work, read_names
 from ufmstar_torch.eval.run.folder import FolderError, differences, hold
+from ufmstar_torch.eval.suite.claim import ABANDONED_SECONDS
+from ufmstar_torch.eval.suite.folder import EvalFolder
+from ufmstar_torch.eval.suite.work_items import Shard, WorkItem, content_digest, find_work, read_names
 
 # ---- work list ----
 

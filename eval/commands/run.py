@@ -36,7 +36,7 @@ from ufmstar_torch.eval.sequences.frame import FrameSequence, parse_size, parse_
 from ufmstar_torch.eval.sequences.intrinsics import parse_intrinsics
 from ufmstar_torch.eval.sequences.open import open_sequence
 from ufmstar_torch.models.inference import Inference
-from ufmstar_torch.recalibrate import beside, named, read_recalibration
+from ufmstar_torch.recalibrate import Recalibration, beside
 
 
 def run(
@@ -183,8 +183,8 @@ def job_from(chosen: RunOptions) -> RunJob:
     )
 
 
-def _recalibration(chosen: RunOptions, source: DepthSource) -> str:
-    """FILE@DIGEST of the map that is named or lies beside the weights; "" = none.
+def _recalibration(chosen: RunOptions, source: DepthSource) -> Recalibration | None:
+    """The map that is named or lies beside the weights; None = none.
 
     Raises:
         FileNotFoundError: the named file does not exist.
@@ -192,14 +192,14 @@ def _recalibration(chosen: RunOptions, source: DepthSource) -> str:
     """
     name, weights = chosen.uncertainty.recalibration, chosen.network.weights
     if name == "none" or (name is None and not (weights and beside(weights[0]).is_file())):
-        return ""
+        return None
     file = beside(weights[0]) if name is None else Path(name)
     try:
-        files = source.identity.get("weights", ())
-        read_recalibration(str(file)).require(chosen.config, [one["sha256"] for one in files])
+        recalibration = Recalibration.from_json(file)
+        recalibration.require(chosen.config, ", ".join(one["name"] for one in source.identity.get("weights", ())))
     except ValueError as error:
         raise ValueError(f"{file}: {error}; --recalibration none runs without it") from error
-    return named(file)
+    return recalibration
 
 
 def _landmarks(value: str | bool, sequence: FrameSequence) -> Callable[[], LandmarkSource]:

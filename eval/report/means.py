@@ -11,7 +11,7 @@ from ufmstar_torch.eval.methods.row import Row
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.report.data import Results
 from ufmstar_torch.eval.report.names import LOWER, Quantity
-from ufmstar_torch.eval.results.record import Record
+from ufmstar_torch.eval.suite.record import Record
 
 # With fewer sequences there is neither an interval nor a verdict: Student's interval of two to four values assumes a
 # normal distribution, which was not checked.

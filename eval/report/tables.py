@@ -20,8 +20,8 @@ from ufmstar_torch.eval.report.means import MIN_SEQUENCES, Mean, better, has_var
 from ufmstar_torch.eval.report.names import DIFFERENCES, ENERGY, EXTRA, MAIN, MEMORY, Quantity, row_labels, shared_words
 from ufmstar_torch.eval.report.paper import PaperTable, paper_table_of
 from ufmstar_torch.eval.report.table import Cell, Column, Line, Table, csv_text, latex, mark_best, markdown, table_csv
-from ufmstar_torch.eval.results.record import Record
 from ufmstar_torch.eval.run.files import to_json, write_atomic, write_json_atomic
+from ufmstar_torch.eval.suite.record import Record
 
 METHOD = "Method"
 # [nats] A mean NLL above it is that of a few pixels: sigma = .25 d of a room makes about 1.
