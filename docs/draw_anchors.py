@@ -24,7 +24,7 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors import LandmarkTracker
 from ufmstar_torch.eval.run.pictures import field_of_view
 from ufmstar_torch.eval.sequences.frame import FrameSequence
@@ -70,7 +70,7 @@ class Shot:
 
 def last_shot(sequence: FrameSequence, network: DepthNetwork) -> Shot:
     """What is said of the last frame, after all those before it; frames that cannot be read are left out."""
-    plain, anchored, tracker = UfMStar(), UfMStar(UfMStarConfig(anchored=True)), LandmarkTracker()
+    plain, anchored, tracker = UfMStar(), UfMStar(UfMStarConfig(anchors=AnchorConfig())), LandmarkTracker()
     for frame in readable(sequence):
         image, intrinsics = image_tensor(frame), torch.from_numpy(frame.intrinsics)
         with torch.no_grad():

@@ -8,14 +8,14 @@ import torch
 from torch import nn
 
 import scenes
-from ufmstar_torch import DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
+from ufmstar_torch import AnchorConfig, DepthPrediction, UfMStar, UfMStarConfig, UncertainDepth
 from ufmstar_torch.anchors.given import Anchors, check_anchors
 from ufmstar_torch.anchors.tracker import Landmarks
 from ufmstar_torch.camera import resize_intrinsics
 from ufmstar_torch.frame import check_frame
 
 H, W = 48, 64
-ON = UfMStarConfig(anchored=True)
+ON = UfMStarConfig(anchors=AnchorConfig())
 K = torch.tensor([[60.0, 0.5, 31.5], [0, 58.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 NAN, INF = float("nan"), float("inf")
 
@@ -157,7 +157,7 @@ def test_the_pipeline_takes_anchors_in_the_images_pixels(preprocess):
         assert 38 <= given <= 40, "but for those that a pixel without depth takes at half the size"
         assert 23 <= fewer <= 25
     assert float(out.ufm.anchored[out.ufm.valid].mean()) > 0.05
-    with pytest.raises(ValueError, match="anchored=True"):
+    with pytest.raises(ValueError, match="AnchorConfig"):
         UncertainDepth(Biased())(image, pose, intrinsics, anchors=anchors)
 
 
@@ -199,7 +199,7 @@ def test_kept_evidence_makes_the_first_frame_see():
     assert not ufm.evidence.any()
     out = ufm(*frame)
     relative = (out.anchored / out.depth.square())[out.valid]
-    expected = (overall[:, 2] / (overall[:, 0] + ON.anchor_shrinkage)).clamp_min(0)
+    expected = (overall[:, 2] / (overall[:, 0] + ON.anchors.shrinkage)).clamp_min(0)
     torch.testing.assert_close(relative.min(), expected.min(), rtol=1e-4, atol=0)
     assert 0.5 < float(relative.mean()) / (1 / 1.2 - 1) ** 2 < 1.2
     ufm.reset()

@@ -9,7 +9,7 @@ from oracle_anchors import AnchoredOracle
 from walks import HEIGHT, SPGF, WIDTH, oracle_settings
 
 import scenes
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.evidence import Evidence, inliers
 from ufmstar_torch.anchors.given import AnchorInput, Anchors, check_anchors, check_values
 from ufmstar_torch.anchors.hook import anchored_term, learn
@@ -20,7 +20,7 @@ from ufmstar_torch.regress import distribute
 
 pytestmark = pytest.mark.numerics
 
-ANCHORED = UfMStarConfig(segment=SPGF, regression="exact", anchored=True, anchor_shrinkage=3.0, anchor_half_life=4.0)
+ANCHORED = UfMStarConfig(segment=SPGF, regression="exact", anchors=AnchorConfig(shrinkage=3.0, half_life=4.0))
 
 
 def taken(truth, rng, count):

@@ -19,7 +19,7 @@ from ufmstar_torch.stateful import flat
 
 SCALAR, ISOTONIC = "scalar", "isotonic"
 # Settings of UfM* that do not change what V means.
-_HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components", "spill")
+_HARMLESS = ("on_bad_frame", "backend", "initial_capacity", "max_components")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ufmstar_torch import UfMStar, UfMStarConfig
+from ufmstar_torch import AnchorConfig, PosteriorConfig, UfMStar, UfMStarConfig
 from ufmstar_torch.anchors.given import Anchors
 from ufmstar_torch.anchors.tracker import Landmarks, LandmarkTracker, TrackerConfig
 from ufmstar_torch.eval.bench.frames import FrameSource, PosedDepth
@@ -80,7 +80,7 @@ def measure_anchors(options: BenchSettings, source: FrameSource, config: UfMStar
     with pinned_threads(1, opencv=True):
         tracker = measure_tracker(tour.frames(_TRACKER_WARM_UP + frames), points)
         built, depths, _ = build_up(
-            source, config.replace(anchored=True), size=size, in_view=options.in_view, history=options.history,
+            source, config.replace(anchors=AnchorConfig()), size=size, in_view=options.in_view, history=options.history,
             rounds=_STEP_WARM_UP + frames,
         )  # fmt: skip
         step = measure_anchored_step(built, depths, points)
@@ -118,7 +118,7 @@ def measure_anchored_step(built: UfMStar, frames: Sequence[PosedDepth], points: 
     """Steps without anchors, with them and with the posterior, from one state, in turn.
 
     Args:
-        built: with ``config.anchored``; not modified.
+        built: with ``config.anchors``; not modified.
         frames: the first 3 are not counted.
         points: anchors of a frame, at random pixels.
 
@@ -127,8 +127,8 @@ def measure_anchored_step(built: UfMStar, frames: Sequence[PosedDepth], points: 
         rejected; "extra_bytes": what the state keeps of anchors, in all and per slot of the mixture.
     """
     plain, anchored, posterior = (copy.deepcopy(built) for _ in range(3))
-    plain.config = built.config.replace(anchored=False)
-    posterior.config = built.config.replace(posterior=True)
+    plain.config = built.config.replace(anchors=None)
+    posterior.config = built.config.replace(posterior=PosteriorConfig())
     posterior.posterior = torch.zeros(len(built.mean), POSTERIOR_SIZE, dtype=torch.float64)
     calls: dict[str, Callable[[PosedDepth, Anchors], Any]] = {
         "plain": lambda frame, _: plain(*frame),

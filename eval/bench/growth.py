@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from ufmstar_torch.eval.bench.frames import FrameSource
 from ufmstar_torch.eval.bench.memory import state_memory
 from ufmstar_torch.eval.bench.step import frame_counts
 from ufmstar_torch.eval.bench.timing import TimedCalls
-from ufmstar_torch.spill import Spilled
 
 _MEANS = ("in_view", "segments", "matched", "new")
 
@@ -34,8 +32,7 @@ def measure_long_run(
 
     Returns:
         "ratio" and "cpu_ratio": median time of the last ``window`` steps over the median of the early ones; and a row
-        per ``window`` frames with times and numbers of components: "components" in memory, "out" in pages, and
-        "pages_read" back within the window.
+        per ``window`` frames with times and numbers of components.
 
     Raises:
         ValueError: the early and the last window would overlap, or the source has fewer frames.
@@ -47,13 +44,10 @@ def measure_long_run(
         raise ValueError(f"a long run of {frames} frames was asked for, there are {source.available}")
     ufm, timed = UfMStar(config), TimedCalls()
     counts: list[dict[str, int]] = []
-    kept, out, read = [], [], [0]
+    kept = []
     for frame in timed.frames(source.frames(size, frames)):
         counts.append(frame_counts(timed.call({"step": ufm}, *frame)["step"].statistics, ufm, frame))
-        spilled = ufm.spilled or Spilled(pages=0, components=0, read=0)
         kept.append(int(ufm.mixture.components))
-        out.append(spilled.components)
-        read.append(spilled.read)
     wall, cpu = timed.times.wall["step"], timed.times.cpu["step"]
 
     def at(low: int) -> dict[str, Any]:
@@ -63,8 +57,6 @@ def measure_long_run(
             "step_median_ms": float(np.median(wall[part])),
             "step_cpu_median_ms": float(np.median(cpu[part])),
             "components": kept[end],
-            "out": out[end],
-            "pages_read": read[low + window] - read[low],
             **{f"{name}_mean": float(np.mean([count[name] for count in counts[part]])) for name in _MEANS},
         }
 
@@ -97,8 +89,8 @@ def measure_growth(
 
     Args:
         worlds: frames and config by name.
-        merge: values of ``UfMStarConfig.merge``.
-        limits: values of ``max_components``, the others in a temporary folder; 0 = all in memory.
+        merge: values of ``MergeConfig.loss``; 0 = no merging.
+        limits: values of ``max_components``; 0 = no limit.
         size, frames, window: see :func:`measure_long_run`.
         progress: is called with a description of what is measured next.
 
@@ -108,9 +100,8 @@ def measure_growth(
     runs = []
     for (world, (source, config)), limit, most in product(worlds.items(), merge, limits):
         progress(f"long run, {world}, {frames} frames, merge {limit:g}, at most {most or 'all'} components in memory")
-        with TemporaryDirectory() as folder:
-            spill = {"max_components": most, "spill": folder} if most else {}
-            settings = config.replace(merge=limit, **spill)
-            run = measure_long_run(source, settings, size=size, frames=frames, window=window)
+        merging = config.with_values({"merge.loss": limit}) if limit else config.replace(merge=None)
+        settings = merging.replace(max_components=most or None)
+        run = measure_long_run(source, settings, size=size, frames=frames, window=window)
         runs.append({"world": world, "merge": limit, "max_components": most or None, **run})
     return runs

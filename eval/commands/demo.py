@@ -26,7 +26,7 @@ from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import DENSE
 from ufmstar_torch.camera import unproject
-from ufmstar_torch.config import UfMStarConfig
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig, UfMStarConfig
 from ufmstar_torch.eval.commands.demo_command import DemoOptions
 from ufmstar_torch.eval.engine.anchors import AnchorSource, Tracks, landmarks_of
 from ufmstar_torch.eval.engine.estimators import Alone, Gaussians, Pointwise
@@ -57,7 +57,7 @@ from ufmstar_torch.pipeline import NetworksInTurn
 KINDS = {"home": "familiar", "hall": "unfamiliar"}
 STYLE = "mixed"
 SHEET_ROWS = 6
-_POSTERIOR = UfMStarConfig(anchored=True, posterior=True)
+_POSTERIOR = UfMStarConfig(anchors=AnchorConfig(), posterior=PosteriorConfig())
 _WEIGHTS = ("weights", "demo.safetensors")
 SUMMARY = "summary.json"
 DEMO = FolderKind(program="ufmstar demo", noun="demo", manifest=SUMMARY, clear=remover(*DEMO_FILES))

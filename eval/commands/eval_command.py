@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from ufmstar_torch.config import AnchorConfig, PosteriorConfig
 from ufmstar_torch.eval.commands.opening import OpeningOptions
 from ufmstar_torch.eval.commands.options import UsageError, as_dict, option, parse
 from ufmstar_torch.eval.sequences.frame import parse_slice
@@ -233,7 +234,10 @@ def _evaluate(options: EvalOptions) -> int:
         rows = [row for row in job.suite.rows if row.method.fusion == UFM_STAR]
         if rows and slurm is None:
             anchors = {row.setting.anchors for row in rows}
-            config = UfMStarConfig(anchored=anchors != {""}, posterior=any(row.setting.posterior for row in rows))
+            config = UfMStarConfig(
+                anchors=AnchorConfig() if anchors != {""} else None,
+                posterior=PosteriorConfig() if any(row.setting.posterior for row in rows) else None,
+            )
             shown = partial(bars.frames, "kernels, compiled on the first run")
             warm_up_command(config, torch.device("cpu"), shown, dense=DENSE in anchors)
         if slurm is None:

@@ -94,7 +94,7 @@ def _frames(job: RunJob, folder: RunFolder, progress: Callable[[Progress], None]
     def compiling(done: int, total: int) -> None:
         progress(Progress("kernels", done, total))
 
-    dense = job.config.anchored and isinstance(job.landmarks(), DenseEvidence)
+    dense = job.config.anchors is not None and isinstance(job.landmarks(), DenseEvidence)
     warm_up_command(job.config, job.device, compiling, images=job.source.needs_image, dense=dense)
     row, metrics = job.row(folder.checkpoint), RunMetrics(UFM, folder.checkpoint.metrics)
     stream = FrameStream(job.sequence, job.indices, [row], device=job.device, start=folder.checkpoint.position)
@@ -163,7 +163,9 @@ def job_from(chosen: RunOptions) -> RunJob:
     sequence = open_sequence(chosen.sequence, **chosen.opening.given())
     if not sequence.posed:
         raise ValueError(f"{sequence.name!r} holds single images without poses, which UfM* needs to compare views")
-    landmarks = _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchored else LandmarkTracker
+    landmarks = (
+        _landmarks(chosen.uncertainty.anchors or DENSE, sequence) if config.anchors is not None else LandmarkTracker
+    )
     indices = range(len(sequence))[parse_slice(options["frames"])]
     if not indices:
         raise ValueError(f"--frames {options['frames']} selects none of the {len(sequence)} frames")

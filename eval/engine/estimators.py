@@ -239,7 +239,7 @@ class Gaussians(Estimator):
             "count": count,
             "smoothing_bytes": self.ufm.smoothed.nbytes,
         }
-        if self.ufm.config.anchored:
+        if self.ufm.config.anchors is not None:
             kept["bytes"] += (count + 1) * self.ufm.overall_evidence.nbytes + self.ufm.posterior.nbytes
             kept["anchors"] = self._anchors
         return kept

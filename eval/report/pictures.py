@@ -155,9 +155,9 @@ def _room(folder: Path, name: str, label: str, sequence: str, snapshots: Sequenc
         f"{sequence}: the Gaussians of {label} at {times}",
         "Each Gaussian is an ellipse as large as the patch it stands for, painted from far to near; what lies "
         "above the camera (the ceiling) is left out. Black: seen from one view only, or with no disagreement. "
-        "Blue: the camera, its path and where it looks.",
-        f"The room of {sequence} from above and obliquely, {' then '.join(map(str, counts))} Gaussians, coloured "
-        f"by disagreement from 0 to {scale.high:.2g} m.",
+        "Blue: the camera's path.",
+        f"The room of {sequence}, {' then '.join(map(str, counts))} Gaussians, coloured by disagreement from 0 to "
+        f"{scale.high:.2g} m.",
     )
 
 

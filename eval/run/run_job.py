@@ -43,7 +43,7 @@ class RunJob:
     every: bool = False  # all members predict on every image, instead of one in turn
     video: bool = True  # whether to make preview.mp4
     sheet: bool = True  # whether to make contact_sheet.png
-    # makes the source of the anchors, in its initial state; for ``config.anchored``.
+    # makes the source of the anchors, in its initial state; for ``config.anchors``.
     landmarks: Callable[[], LandmarkSource] = LandmarkTracker
 
     def row(self, checkpoint: Checkpoint) -> RowRunner:
@@ -53,7 +53,9 @@ class RunJob:
             self.source,
             Gaussians(self.config, self.device, recalibration=self.recalibration),
             every=self.every,
-            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks())) if self.config.anchored else None,
+            anchors=AnchorSource(Setting(anchors=TRACKED), Tracks(self.landmarks()))
+            if self.config.anchors is not None
+            else None,
             skips_faults=True,
             device=self.device,
         )
@@ -71,7 +73,7 @@ class RunJob:
     @property
     def source_identity(self) -> dict[str, Any]:
         """Plain values on which depth and anchors depend."""
-        return {**self.source.identity, **(self.landmarks().identity if self.config.anchored else {})}
+        return {**self.source.identity, **(self.landmarks().identity if self.config.anchors is not None else {})}
 
     def identity(self) -> dict[str, Any]:
         """Plain values on which the results depend: a run can only go on with the same ones."""
