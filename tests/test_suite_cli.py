@@ -15,6 +15,7 @@ from ufmstar_torch.eval.commands import dry_run as dry
 from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.methods.setting import Setting
 from ufmstar_torch.eval.methods.suite import names
+from ufmstar_torch.eval.suite import shards
 
 
 @pytest.fixture

@@ -5,17 +5,16 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from pool_tasks import pool
 from suite_runs import NAMES, TRUTH, Stub, go, job_on, kept
 from trainings import SPEC
 
@@ -23,7 +22,7 @@ from ufmstar_torch.eval.commands.eval_command import job_from, read
 from ufmstar_torch.eval.engine.evaluate import evaluate_sequence
 from ufmstar_torch.eval.run import machine
 from ufmstar_torch.eval.run.folder import FolderError
-from ufmstar_torch.eval.suite.shards import KILLED, Slurm, evaluate_on_slurm, evaluate_suite, rank_of, run_pool
+from ufmstar_torch.eval.suite.shards import KILLED, Slurm, evaluate_on_slurm, evaluate_suite, rank_of
 from ufmstar_torch.eval.suite.work_items import Shard
 from ufmstar_torch.models.spec import build_network
 from ufmstar_torch.models.trained import save_trained
@@ -65,23 +64,6 @@ def test_one_process_and_two_give_the_same_bits(rooms, tmp_path):
     assert kept(one.out) == kept(two.out)
 
 
-def task(folder, item):
-    """Writes the process that does it, ends it where the item is "kill", and waits where it is "wait"."""
-    Path(folder, f"{item}-{os.getpid()}").touch()
-    if item == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
-    while item.startswith("wait"):
-        time.sleep(0.02)
-    if item == "fail":
-        raise OSError("disk full")
-    return f"{item} done"
-
-
-def pool(folder, items, stop=lambda: False):
-    lines: list[str] = []
-    return run_pool(partial(task, str(folder)), items, 2, 1, stop=stop, report=lines.append), lines
-
-
 def at_work(folder):
     """The numbers of the processes that have begun to wait."""
     return [int(path.name.rpartition("-")[2]) for path in folder.glob("wait*-*")]
@@ -116,7 +98,7 @@ def test_a_pool_ends_in_good_order_by_a_stop_by_an_error_and_by_a_kill(tmp_path)
 
 @pytest.mark.slow
 def test_processes_end_with_a_parent_that_is_killed(tmp_path):
-    code = f"from test_suite_distributed import pool; pool({str(tmp_path)!r}, ['wait1', 'wait2'])"
+    code = f"from pool_tasks import pool; pool({str(tmp_path)!r}, ['wait1', 'wait2'])"
     parent = subprocess.Popen(
         [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     )
