@@ -19,7 +19,7 @@ from runs import Brightness, outputs, read_summary
 from shared_data import require_shared
 
 from ufmstar_torch import MergeConfig, SPGFConfig, UfMStarConfig, cli
-from ufmstar_torch.eval.commands.run_command import read
+from ufmstar_torch.eval.commands.run import read
 from ufmstar_torch.eval.engine import load as sources
 from ufmstar_torch.eval.run import writers
 from ufmstar_torch.models import Preprocess
@@ -63,8 +63,8 @@ QUICK = ("--no-video", "--no-sheet")
 def test_help_lists_the_commands(ufmstar):
     code, out, err = ufmstar("--help")
     assert (code, err) == (0, "")
-    assert "\n  run     " in out
-    assert "\n  bench   " in out
+    assert "\n  run          " in out
+    assert "\n  bench        " in out
     assert ufmstar()[0] == 2
     assert ufmstar("--version")[:2] == (0, "0.1.0\n")
 

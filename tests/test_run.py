@@ -16,12 +16,12 @@ from layouts import truncate, write_depth_png, write_generic
 from runs import CONFIG, Brightness, job_of, network_job, networks, outputs, own_depth_job, read_summary
 
 from ufmstar_torch import UfMStar, UncertainDepth, cli
-from ufmstar_torch.eval.commands.run import run
 from ufmstar_torch.eval.engine.maps import folder_source, own_depth
 from ufmstar_torch.eval.engine.progress import Progress
 from ufmstar_torch.eval.metrics import SequenceMetrics
 from ufmstar_torch.eval.run import run_folder, writers
 from ufmstar_torch.eval.run.folder import FolderError
+from ufmstar_torch.eval.run.run import run
 from ufmstar_torch.eval.run.writers import read_frame
 from ufmstar_torch.eval.sequences import open_sequence
 from ufmstar_torch.models import Preprocess
@@ -269,11 +269,10 @@ def test_a_run_reads_back_what_another_left_and_skips_what_it_skipped(path, tmp_
         folder_source(sequence, tmp_path / "first")
 
 
-def test_a_journal_of_other_lines_is_refused_in_one_line(path, tmp_path):
+def test_records_of_other_lines_are_refused_in_one_line(path, tmp_path):
     job = own_depth_job(path, frames=slice(0, 2))
     run(job, tmp_path / "out")
-    journal = tmp_path / "out" / "frames.jsonl"
-    journal.write_bytes(b"{}\n" * (len(journal.read_bytes()) // 3 + 1))
+    (tmp_path / "out" / "frames.jsonl").write_bytes(b"{}\n" * 2)
     with pytest.raises(FolderError, match=r"cannot be read \(.*frames.jsonl, line 1 is not the record of a frame"):
         run(job, tmp_path / "out", resume=True)
 
@@ -299,7 +298,7 @@ def test_an_ensemble_alternates(path, tmp_path):
 
 
 def at_state(count):
-    """Crash when the state is to be replaced for the ``count``-th time, after every frame."""
+    """Crash when the checkpoint is to be replaced for the ``count``-th time, after every frame."""
 
     def break_(monkeypatch):
         calls = []
@@ -312,7 +311,7 @@ def at_state(count):
             write(file, *rest, **options)
 
         monkeypatch.setattr(run_folder, "write_atomic", broken)
-        monkeypatch.setattr(run_folder, "STATE_EVERY", 0.0)
+        monkeypatch.setattr(run_folder, "CHECKPOINT_EVERY", 0.0)
 
     return break_
 
@@ -396,10 +395,8 @@ def test_an_error_of_the_network_is_in_the_summary(path, tmp_path):
     assert summary["reason"] == "RuntimeError: out of memory"
 
 
-def test_a_full_disk_leaves_finished_frames_and_a_summary(path, tmp_path, uninterrupted, monkeypatch):
-    out, reserve = tmp_path / "out", tmp_path / "out" / "resume" / "reserve"
-    calls = []
-    write, write_json = writers.write_together, run_folder.write_json_atomic
+def test_a_full_disk_leaves_finished_frames_and_resume_continues(path, tmp_path, uninterrupted, monkeypatch):
+    calls, write = [], writers.write_together
 
     def full(files, **options):
         calls.append(1)
@@ -407,17 +404,11 @@ def test_a_full_disk_leaves_finished_frames_and_a_summary(path, tmp_path, uninte
             raise OSError(errno.ENOSPC, "No space left on device")
         write(files, **options)
 
-    def full_json(file, data):
-        if len(calls) > 4 and reserve.exists():
-            raise OSError(errno.ENOSPC, "No space left on device")
-        write_json(file, data)
-
     monkeypatch.setattr(writers, "write_together", full)
-    monkeypatch.setattr(run_folder, "write_json_atomic", full_json)
+    out = tmp_path / "out"
     summary = run(network_job(path, *pair()), out)
     assert (summary["state"], summary["frames"]["done"]) == ("failed", 4)
     assert "No space left on device" in summary["reason"]
-    assert read_summary(out)["reason"] == summary["reason"]
     monkeypatch.undo()
     run(network_job(path, *pair()), out, resume=True)
     assert outputs(out) == uninterrupted
@@ -427,7 +418,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from runs import Brightness, network_job
-from ufmstar_torch.eval.commands.run import run
+from ufmstar_torch.eval.run.run import run
 
 def kill():
     os.kill(os.getpid(), signal.SIGKILL)
@@ -438,7 +429,7 @@ run(network_job(Path(sys.argv[1]), *networks), sys.argv[2])
 
 
 @pytest.mark.slow
-def test_sigkill_loses_the_last_second_only(path, tmp_path, uninterrupted):
+def test_sigkill_loses_the_last_seconds_only(path, tmp_path, uninterrupted):
     out = tmp_path / "out"
     ended = subprocess.run([sys.executable, "-c", KILLED, str(path), str(out)], cwd=TESTS, check=False)
     assert ended.returncode == -9

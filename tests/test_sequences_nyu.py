@@ -10,8 +10,7 @@ from layouts_more import write_h5, write_nyu
 from tiny_suite import evaluate
 
 from ufmstar_torch.eval.check.check import check_sequence
-from ufmstar_torch.eval.commands.run import job_from
-from ufmstar_torch.eval.commands.run_command import read
+from ufmstar_torch.eval.commands.run import job_from, read
 from ufmstar_torch.eval.engine.evaluate import SequenceError
 from ufmstar_torch.eval.methods.method import Method
 from ufmstar_torch.eval.methods.row import Row
