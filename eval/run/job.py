@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ufmstar_torch.anchors.landmarks import LandmarkSource
 from ufmstar_torch.anchors.tracker import LandmarkTracker
@@ -24,9 +23,6 @@ from ufmstar_torch.eval.run.run_folder import Checkpoint
 from ufmstar_torch.eval.sequences.frame import FrameError, FrameSequence
 from ufmstar_torch.recalibrate import read_recalibration, split_name
 from ufmstar_torch.ufmstar import UfMStar
-
-# A run on maps saves UfM*'s tensors under their own names, and no turn: its files have done so since the first version.
-_TURN, _UFM = "image_index", "ufm."
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +56,12 @@ class RunJob:
             skips_faults=True,
             device=self.device,
         )
-        if checkpoint.module:
-            images = torch.tensor(checkpoint.position)
-            row.load_state(row_state(checkpoint.module, bare=not self.source.needs_image, images=images))
+        if checkpoint.state:
+            row.load_state(checkpoint.state)
         return row
 
     def ufm(self, checkpoint: Checkpoint) -> UfMStar:
-        """UfM* in the state of a checkpoint. A frame in hand may have changed the running one already."""
+        """UfM* in the state of a checkpoint; the running one may be some frames ahead."""
         estimator = self.row(checkpoint).estimator
         assert isinstance(estimator, Gaussians)
         return estimator.ufm
@@ -106,15 +101,3 @@ class RunJob:
             return None
         maps = [array for array in (frame.image, frame.depth) if array is not None]
         return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in maps)).hexdigest()
-
-
-def saved_state(state: Mapping[str, Tensor], *, bare: bool) -> dict[str, Tensor]:
-    """The state of a run's row as state.pt holds it; ``bare``: of a run on maps."""
-    return {k.removeprefix(_UFM): v for k, v in state.items() if k != _TURN} if bare else dict(state)
-
-
-def row_state(saved: Mapping[str, Tensor], *, bare: bool, images: Tensor) -> dict[str, Tensor]:
-    """The row's state from what :func:`saved_state` returned; ``images`` that a run on maps has seen."""
-    if not bare:
-        return dict(saved)
-    return {_TURN: images, **{k if k.startswith("tracker.") else _UFM + k: v for k, v in saved.items()}}
