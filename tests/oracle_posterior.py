@@ -197,9 +197,9 @@ def y_variance(shape, node, y, noise, used, centre):
 
 
 def tail(share, offset, around):
-    """.035 (1 + 2 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 100."""
+    """.03 (1 + 2 share) E[(e^(n - offset) - 1)^2], n normal; e^-offset at most 100."""
     a, q = 2 * around, min(math.exp(-offset), 100)
-    return 0.035 * (1 + 2 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
+    return 0.03 * (1 + 2 * share) * (q * q * math.exp(2 * a) - 2 * q * math.exp(a / 2) + 1)
 
 
 def discs(state, logs, Q, mean0, H, y, weight, noise, node, u, v, claimed):

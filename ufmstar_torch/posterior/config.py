@@ -50,6 +50,6 @@ class PosteriorConfig(Checked):
     reach: float = number(1.0, "l", "width", 0.0, open_low=True)
     discs: int = number(3, "", "1", 0, 16)
     radius: float = number(5 / 28, "r", "width", 0.0, open_low=True)
-    wrong: float = number(0.035, "p", "1", 0.0, 1 / 3)
+    wrong: float = number(0.03, "p", "1", 0.0, 1 / 3)
     spread: float = number(2.0, "a", "1", 0.0, 4.0)
     edge_contrast: float = number(0.1, "delta", "1", 0.0, open_low=True)
