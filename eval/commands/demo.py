@@ -110,6 +110,8 @@ def run_demo(options: DemoOptions, progress: Callable[[Progress], None] = lambda
     device = torch.zeros((), device=options.device).device
     with _weights(options.weights) as file:
         info, members, digest = read_info(file), load_trained(file), sha256(file)
+    if info.spec.method == "depth":
+        raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
     kind = FolderKind(program="ufmstar demo", noun="demo", manifest="summary.json", clear=remover(*DEMO_FILES))
     OutputFolder.open(options.out, kind, {}, overwrite=options.overwrite).close()
     tour = {"seed": options.seed, "style": "mixed", "frames": options.frames, "size": info.spec.size}

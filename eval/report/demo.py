@@ -56,7 +56,7 @@ class DemoFrames(FrameSink):
         self._runners = {self._names[runner.key]: runner for runner in stream.rows}
 
     def take(self, result: FrameResult) -> None:
-        """Add a frame. Raises ValueError: the networks predict no variance."""
+        """Add a frame."""
         rows = {self._names[slug]: row for slug, row in result.rows.items()}
         for name, row in rows.items():
             self._add(name, row, result)
@@ -66,8 +66,7 @@ class DemoFrames(FrameSink):
 
     def _add(self, name: str, row: RowFrame, result: FrameResult) -> None:
         estimate = row.estimate
-        if estimate.variance is None:
-            raise ValueError("the demo needs networks with a variance of their own (an aleatoric or evidential head)")
+        assert estimate.variance is not None
         assert result.frame is not None
         assert row.truth is not None
         K, size = row.prediction.intrinsics.numpy(), row.prediction.size
