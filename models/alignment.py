@@ -1,4 +1,4 @@
-"""Relative depth made metric, on purpose: scale and shift fitted to sparse measurements.
+"""Scale and shift that make relative depth metric, fitted to sparse measurements.
 
 Relative networks (MiDaS, Depth Anything without "Metric") predict inverse depth up to a scale and a shift,
 1/d = scale x + shift; others predict depth itself so, d = scale x + shift (scale alone: shift = 0). Either
@@ -32,7 +32,7 @@ _TRIMMED = 15
 _HUBER, _CUT = 1.345, 3.0
 # Standard deviation of a normal residual per median of its magnitude.
 _MAD_TO_STD = 1.4826
-# Of the size of the values: exact data leave residuals of float64 rounding, which are no outliers.
+# [1] Share of the median value: exact data leave residuals of float64 rounding, which are no outliers.
 _ROUNDING = 1e-9
 # Smallest variance of x per mean square: a relative spread of 1e-5, where what float32 predictions resolve (1e-7)
 # still determines a slope to 1 %.
@@ -41,7 +41,7 @@ _RANK = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Alignment(Checked):
-    """What makes a relative prediction x metric: 1/d or d is scale x + shift.
+    """Scale and shift that make a relative prediction x metric: 1/d or d is scale x + shift.
 
     Attributes:
         kind: "inverse" (1/d, units 1/m) or "affine" (d, units m).
@@ -108,7 +108,7 @@ class Alignment(Checked):
 
 @dataclass(frozen=True, eq=False)
 class AlignmentFit:
-    """An alignment with what supports it; [] instead of [B] where the images were pooled."""
+    """An alignment and its statistics; [] instead of [B] where the images were pooled."""
 
     alignment: Alignment  # the result
     points: Tensor  # [B] usable measurements
@@ -163,7 +163,7 @@ class AlignedNetwork(DepthNetwork):
 
     @property
     def max_depth(self) -> float | None:
-        """[m] Of the alignment: what is farther is no prediction."""
+        """[m] The alignment's: farther pixels have no prediction."""
         return self.alignment.max_depth
 
     def forward(self, image: Tensor, intrinsics: Tensor | None = None) -> DepthPrediction:

@@ -39,7 +39,7 @@ _PADDING = 3.0  # [sqrt(px)] ZoeDepth pads each border by this times the square 
 
 @dataclass(frozen=True)
 class HuggingFaceSpec(Checked):
-    """What is declared about a checkpoint.
+    """The user's declarations about a checkpoint.
 
     Attributes:
         kind: what it predicts: "metric" (GLPN, DPT trained on NYU or KITTI; Depth Pro and ZoeDepth always), "inverse"

@@ -11,7 +11,6 @@ import torch
 from layouts import truth, write_generic
 from training_data import PLAIN, TINY, Numbered, loader, numbers, nyu_frame, truncated, write_nyu
 
-from ufmstar_torch.models import Preprocess
 from ufmstar_torch.train import (
     Augmentation,
     AugmentationConfig,
@@ -119,18 +118,6 @@ def test_parts_must_not_overlap(tmp_path):
         module(tmp_path, paths=(str(path),), validation_paths=(str(other), str(other / ".." / "walk")), **overlapping)
     apart = module(tmp_path, paths=(str(path),), validation_paths=(str(other),), **overlapping)
     assert apart.validation_set.source.name(0) == "other/12"
-
-
-def test_nyu_and_tours_as_data_modules(tmp_path, tours):
-    data = module(tmp_path, kind="nyu", paths=(str(write_nyu(tmp_path / "nyu")),), preprocess=Preprocess(size=(32, 40)))
-    assert (len(data.train_set), len(data.validation_set)) == (6, 3)
-    assert data.train_set[0]["image"].shape == (3, 32, 40)
-    folder, frames = tours
-    tiny = {"tour_frames": 3, "tour_stride": 4, "tour_size": (24, 32), "first_tour": 5, "cache": str(folder)}
-    data = module(tmp_path, tours=1, validation_tours=1, batch_size=3, **tiny)
-    assert data.train_set.source.seeds == (5,)
-    assert data.validation_set.source.seeds == (6,)
-    np.testing.assert_array_equal(data.validation_set[1]["depth"].numpy(), frames.load(4).depth)
 
 
 def test_a_data_module_gives_each_process_its_share_and_tells_broken_files(tmp_path):

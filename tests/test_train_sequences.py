@@ -11,8 +11,6 @@ from layouts import write_generic, write_scannet, write_tum
 from training_data import PLAIN, TINY, truncated
 
 from ufmstar_torch.eval.sequences import open_sequence
-from ufmstar_torch.eval.sequences.generic import open_unposed
-from ufmstar_torch.eval.sequences.options import Options
 from ufmstar_torch.train import SampleDataset, SampleError, SequenceFrames, TourSettings, tour_frames
 from ufmstar_torch.train.data_config import Part
 from ufmstar_torch.train.sequence_data import open_rgbd
@@ -104,22 +102,6 @@ def test_images_and_depth_without_poses(tmp_path):
         for name in ("image", "depth", "intrinsics"):
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     np.testing.assert_allclose(unposed.load(0).intrinsics, scene.K)
-
-
-def test_what_is_missing_in_an_unposed_folder_is_named(tmp_path):
-    path, scene = write_generic(tmp_path)
-    (path / "poses.txt").unlink()
-    shutil.move(path / "K.txt", tmp_path / "K.txt")
-    with pytest.raises(ValueError, match="pass intrinsics"):
-        open_unposed(path, Options())
-    np.testing.assert_allclose(open_unposed(path, Options(intrinsics=tmp_path / "K.txt")).intrinsics, scene.K)
-    for i, file in enumerate(sorted((path / "depth").iterdir())):
-        file.rename(file.with_name(f"map{i + 500}.png"))
-    with pytest.raises(ValueError, match=r"no depth map .* is named like"):
-        open_unposed(path, Options(intrinsics=tmp_path / "K.txt"))
-    shutil.rmtree(path / "depth")
-    with pytest.raises(ValueError, match="must hold one of"):
-        open_unposed(path, Options(intrinsics=tmp_path / "K.txt"))
 
 
 @pytest.fixture(scope="module")
