@@ -25,7 +25,7 @@ _WEIGHTS = ("weights", "demo.safetensors")
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions:
-    """The main job on rendered rooms, with nothing but this package.
+    """The method on rendered rooms, without data or weights.
 
     Walks through rendered rooms with small depth networks that come with the package, compares their own variance with
     UfM's and UfM*'s, and saves pictures. Nothing else is needed; a minute on two cores.
