@@ -7,7 +7,7 @@ the same, from the same weights and with as many steps; views of the same rooms 
 
     python examples/active_learning.py --out out/active_learning
 
-Read `run_strategy` first. What came out of it: docs/results/active_learning.md.
+Read `run_strategy` first. What came out of it: docs/results/accuracy.md.
 """
 
 from __future__ import annotations
