@@ -19,10 +19,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from numba import njit
-from numba.core import codegen, compiler, typed_passes, untyped_passes
+from numba import njit, types
+from numba.core import cgutils, codegen, compiler, typed_passes, untyped_passes
 from numba.core.compiler_machinery import PassManager, register_pass
-from numba.extending import register_jitable
+from numba.extending import intrinsic, register_jitable
+from numba.np.arrayobj import get_itemsize, make_array, populate_array
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _PASSES = (
@@ -179,3 +180,54 @@ contracted = _inner(_nrt=False, fastmath={"contract"})
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
 reordered = kept(fastmath=_ANY_ORDER)
 reordered_leaf = _inner(_nrt=False, fastmath=_ANY_ORDER)
+
+
+@intrinsic
+def empty(typing, shape, dtype):
+    """``np.empty(shape, dtype)``, which itself takes .1 s to compile for every kind of array, ``np.zeros`` .3 s."""
+    return _array_type(shape, dtype)(shape, dtype), _allocated
+
+
+@intrinsic
+def zeros(typing, shape, dtype):
+    """``np.zeros(shape, dtype)``."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value = _allocated(context, builder, signature, arguments)
+        array = make_array(signature.return_type)(context, builder, value)
+        size = builder.mul(array.nitems, array.itemsize)
+        cgutils.memset(builder, builder.bitcast(array.data, cgutils.voidptr_t), size, 0)
+        return value
+
+    return _array_type(shape, dtype)(shape, dtype), generate
+
+
+def _array_type(shape: Any, dtype: Any) -> types.Array:
+    return types.Array(dtype.dtype, len(shape) if isinstance(shape, types.BaseTuple) else 1, "C")
+
+
+def _allocated(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """A new array of the signature's type, whose shape is the first argument."""
+    kind, shape = signature.return_type, signature.args[0]
+    several = isinstance(shape, types.BaseTuple)
+    given = cgutils.unpack_tuple(builder, arguments[0]) if several else [arguments[0]]
+    sizes = [
+        context.cast(builder, size, of, types.intp)
+        for size, of in zip(given, shape.types if several else [shape], strict=True)
+    ]
+    itemsize = context.get_constant(types.intp, get_itemsize(context, kind))
+    strides = [itemsize]
+    for size in reversed(sizes):
+        strides.insert(0, builder.mul(strides[0], size))
+    align = context.get_constant(types.uint32, context.get_preferred_array_alignment(kind.dtype))
+    memory = context.nrt.meminfo_alloc_aligned(builder, strides.pop(0), align)
+    array, number = make_array(kind)(context, builder), context.get_value_type(types.intp)
+    populate_array(
+        array,
+        data=builder.bitcast(context.nrt.meminfo_data(builder, memory), context.get_data_type(kind.dtype).as_pointer()),
+        shape=cgutils.pack_array(builder, sizes, ty=number),
+        strides=cgutils.pack_array(builder, strides, ty=number),
+        itemsize=itemsize,
+        meminfo=memory,
+    )
+    return array._getvalue()
